@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from xdist.scheduler import LoadGroupScheduling
+from xdist.scheduler import LoadScopeScheduling
 
 # There is no deadline, because a slow machine must not fail a property that holds. The examples are
 # the same in every run, so that luck never decides how a change is judged. `explore` looks for new
@@ -48,42 +48,57 @@ if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
-TIMED = {"bench": "timed", "firmware": "timed", "system": "timed", "systemd": "systemd"}
-"""Directories whose tests depend on real time, and the group of each.
+LIVE = ("bench", "firmware", "system", "systemd")
+"""Directories whose tests run real processes in real time. They run before the computed tests."""
 
-The tests of one group run one after the other. Waiting for a container tolerates a busy machine as
-well as pure computation does, so the systemd group runs in parallel with the others. A mark on a
-single test puts that test into a group.
+LOUD = (
+    "test_bad_commands.py", "test_bus.py", "test_daemon.py", "test_faults.py", "test_faults_bus.py",
+    "test_isolation.py", "test_page_lets_go.py", "test_period.py", "test_record_disks.py",
+    "test_strangers.py", "test_web_attacks.py", "test_web_lets_go.py",
+)  # fmt: skip
+"""Live modules that load the machine on purpose, or that count missed periods.
+
+One worker runs all of them and `bench`, one after the other: they would disturb each other.
 """
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Use two processes for the suite that `.ci/run` runs, and one for any other call.
+    """Use three processes for the suites that `.ci/run` runs, and one for any other call.
 
-    A single process shows the output that tests print.
+    Tests of real processes mostly wait, so two workers leave two cores half idle. A single process
+    shows the output that tests print.
     """
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
     other = (
         config.option.capture == "no" or "soak" not in config.option.markexpr.partition("not")[2]
     )
-    return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 2
+    return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 3
 
 
-class _ByFile(LoadGroupScheduling):  # type: ignore[misc]
-    """Distribute groups, and every other test by whole files.
+def _unit(nodeid: str) -> str:
+    """Return the unit of work that contains a test: its file, or a group of files."""
+    file = nodeid.partition("::")[0]
+    directory, name = file.split("/")[-2:]
+    if directory == "bench" or (directory in LIVE and name in LOUD):
+        return "loud"
+    return "systemd" if directory == "systemd" else file
 
-    After each test xdist counts every test that the worker was ever given. Handing out 10,000 tests
-    one by one therefore costs as much time as many tests.
+
+class _ByUnit(LoadScopeScheduling):  # type: ignore[misc]
+    """Distribute whole units of tests.
+
+    After each test xdist counts every test that the worker was ever given. Handing out 7,000 tests
+    one by one therefore costs as much time as many tests. The unit follows from the path alone,
+    because with pytest 9.2 the main process no longer learns a test's mark `xdist_group`.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        scope: str = super()._split_scope(nodeid)
-        return nodeid.partition("::")[0] if scope == nodeid else scope
+        return _unit(nodeid)
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
-    config.option.loadscopereorder = False  # the longest group already comes first
-    return _ByFile(config, log)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByUnit:
+    config.option.loadscopereorder = False  # pytest_collection_modifyitems chose the order
+    return _ByUnit(config, log)
 
 
 def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
@@ -100,13 +115,16 @@ def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(tryfirst=True)  # runs before `-m` selects tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    here = Path(__file__).parent
     _all_but_some_are_slow(items)
-    for item in items:
-        group = TIMED.get(item.path.relative_to(here).parts[0])
-        if group and not item.get_closest_marker("xdist_group"):
-            item.add_marker(pytest.mark.xdist_group(group))
-    items.sort(key=lambda item: item.path.relative_to(here).parts[0] not in TIMED)
+    items.sort(key=_rank)
+
+
+def _rank(item: pytest.Item) -> int:
+    """Return the place of a test's unit in the order, because the longest units come first."""
+    unit = _unit(item.nodeid)
+    if unit in ("loud", "systemd"):
+        return 0 if unit == "loud" else 1
+    return 2 if unit.split("/")[-2] in LIVE else 3
 
 
 def pytest_collection_finish() -> None:

@@ -21,7 +21,7 @@ PAGES = tuple(
 
 _FENCED = re.compile(r"^```([a-z0-9]*)\n(.*?)^```$", re.M | re.S)
 
-LANGUAGES = {"", "console", "json5", "python", "sh", "toml", "yaml"}
+LANGUAGES = {"", "console", "html", "js", "json5", "python", "sh", "toml", "yaml"}
 
 
 class Block(NamedTuple):

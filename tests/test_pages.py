@@ -204,6 +204,12 @@ def test_python_is_on_the_page_whose_examples_are_run() -> None:
     assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
+@each("language", ["html", "js"])
+def test_javascript_is_on_the_page_whose_examples_are_run(language: str) -> None:
+    """`tests/system/test_web_dashboard.py` runs these blocks."""
+    assert {block.page for block in blocks(language)} == {"deploy/web/README.md"}
+
+
 def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
     """`tests/system/test_languages.py` runs these blocks with a key of its own."""
     calls = re.findall(r"`(session\.declare\w+\([^`]+)`", prose("README.md"))

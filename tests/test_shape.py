@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import LIVE, LOUD
 from tests.each import each
 
 ROOT = Path(__file__).parents[1]
@@ -134,3 +135,8 @@ def test_the_daemon_does_not_load_numpy() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
     )
     assert done.stdout.strip() == "False"
+
+
+@each("name", LOUD)
+def test_a_module_that_runs_one_after_the_other_is_a_live_one(name: str) -> None:
+    assert [place for place in LIVE if (ROOT / "tests" / place / name).is_file()]

@@ -183,8 +183,10 @@ def main_add(args: argparse.Namespace) -> int:
 
 
 def main_renew(args: argparse.Namespace) -> int:
-    names = certificates.renew(args.directory, args.address, args.days)
+    names, warning = certificates.renew(args.directory, args.address, args.days)
     print(_certified(names))
+    if warning:
+        print(f"{warning}\n")
     print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
     return 0
 
@@ -244,7 +246,8 @@ tls = "{directory}"
 _NEXT = """\
 Wrote {directory}:
   {ca}, {certificate}, {key}   the robot's
-  ca-key.pem                       the authority: a person who has it can admit anyone; keep it safe
+  ca-key.pem                       the authority's key: a person who has it can admit anyone.
+                                   Move it off the robot; `tls add` and `tls renew` need it
   clients/<role>/                  one directory each for viewer, operator, maintainer
 
 {lines}The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`.

@@ -14,8 +14,8 @@ from acsard.client.follower import FIRST_S
 from acsard.core.config.settings import TLS
 from acsard.core.formatting import printable
 from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.quiet import Around, why
-from acsard.daemon.bus.robot_discovery import around
+from acsard.daemon.bus.robot_discovery import presence
+from acsard.daemon.bus.silent_key import Presence, explain_silence
 from acsard.daemon.bus.tls import trouble
 
 
@@ -64,11 +64,11 @@ def silence_explained(robot: Client, key: str = "") -> AbstractContextManager[Ca
 
 def _none_yet(robot: Client, key: str) -> str:
     where = robot.where
-    seen = around(robot.session, where.robot_id, where.endpoint)
+    seen = presence(robot.session, where.robot_id, where.endpoint)
     if seen is None:
         return ""
     reason = "" if seen.linked else _of_link(where)
-    reason = reason or why(key, where.robot_id, where.endpoint, seen)
+    reason = reason or explain_silence(key, where.robot_id, where.endpoint, seen)
     return f"waiting for {robot.key(key)}: {reason}"
 
 
@@ -79,8 +79,8 @@ def _ceased(robot: Client) -> str:
             return ""
     except zenoh.ZError:
         return ""  # the session is being closed
-    where, gone = robot.where, Around(linked=False, here=False)
-    return _of_link(where) or why("", where.robot_id, where.endpoint, gone)
+    where, gone = robot.where, Presence(linked=False, here=False)
+    return _of_link(where) or explain_silence("", where.robot_id, where.endpoint, gone)
 
 
 def _of_link(where: Address) -> str:

@@ -1,6 +1,6 @@
 """Serve the robot's page for a running daemon until Ctrl-C. `acsard run` in a terminal starts this
-by itself. A browser on the robot's machine has every permission. A browser on another machine needs
-HTTPS with the robot's certificate, and a token.
+by itself. A browser on the robot's machine needs no token and has the role of web.local. A browser
+on another machine needs HTTPS with the robot's certificate, and a token.
 """
 
 from __future__ import annotations

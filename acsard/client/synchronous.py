@@ -33,8 +33,8 @@ from acsard.core.messages.topics import (
 from acsard.core.values import Plain, Pose
 from acsard.daemon.bus.address import Address, address_by_environment
 from acsard.daemon.bus.identity import Identity, identity
-from acsard.daemon.bus.quiet import why as why_quiet
-from acsard.daemon.bus.robot_discovery import around
+from acsard.daemon.bus.robot_discovery import presence
+from acsard.daemon.bus.silent_key import explain_silence
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.daemon.bus.tls import shown_at
 from acsard.daemon.bus.zenoh_sessions import client_session
@@ -282,14 +282,21 @@ class Client:
         except zenoh.ZError:
             raise _no_key(name) from None
 
-    def put(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
-        """Send one command with a signature, for a program that forwards another sender's."""
-        self._puts.wait()
-        self._publish(twist, signature)
+    def put(
+        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
+    ) -> None:
+        """Send one command with a signature, for a program that forwards another sender's.
 
-    def _publish(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
+        `source` is the client's own by default.
+        """
+        self._puts.wait()
+        self._publish(twist, signature, source or self.source)
+
+    def _publish(
+        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str
+    ) -> None:
         self.session.put(
-            self.key(self.command_key(self.source)),
+            self.key(self.command_key(source)),
             encode(twist, "msgpack"),
             encoding=encoding_name("msgpack", type(twist).__name__),
             express=True,
@@ -306,7 +313,7 @@ class Client:
             schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
-        self._publish(message, self._sender.sign(stamp_ns, steady=steady))
+        self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         """Return the first reply. A stranger may send any number of further ones."""
@@ -353,13 +360,15 @@ class Client:
             if why := us.lacks(key):
                 return NotPermittedError(why)
         where = self.where
-        seen = around(self.session, where.robot_id, where.endpoint)
+        seen = presence(self.session, where.robot_id, where.endpoint)
         if seen is None or seen.here or not where.endpoint:
             return NoAnswerError(
                 f"{no_answer}; is the daemon of robot.id {where.robot_id!r} stuck, does it have "
                 "this key (`acsard topics`), and may you query it?"
             )
-        return NoAnswerError(f"{no_answer}: {why_quiet(key, where.robot_id, where.endpoint, seen)}")
+        return NoAnswerError(
+            f"{no_answer}: {explain_silence(key, where.robot_id, where.endpoint, seen)}"
+        )
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Convert the error to its documented type, and add the role of the certificate in it."""

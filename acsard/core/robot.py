@@ -171,7 +171,8 @@ class Robot:
             self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
-        news = self._news()
+        # A newer command or mode than that of the last line may go at once.
+        news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
         applied = self._limiter.twist
@@ -199,10 +200,6 @@ class Robot:
             news,
             self._life.latches,
         )
-
-    def _news(self) -> bool:
-        """Return whether the next line has a newer command or mode, so that it may go at once."""
-        return (self._choice.arrived_ns, self._life.mode) != self._made_of
 
     # The fate of the line before.
 

@@ -21,7 +21,7 @@ from typing import Self
 
 from msgspec import Struct
 
-from acsard.daemon.pacing import Period
+from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.host.timerfd import TimerFd
 
 
@@ -94,14 +94,15 @@ class Ticker(_Timer):
 
     def take(self, now_ns: int) -> Period:
         """Return the periods that have ended by `now_ns` since the last call."""
+        if not self._rang and now_ns < self._due_ns:
+            return NO_PERIOD
         # This uses the daemon's clock. While NTP slews the timer's clock, the timer goes off up to
         # a tenth of a period early.
         early_ns = self._period_ns // 10 if self._rang else 0
         expired = max(0, (now_ns - self._due_ns + early_ns) // self._period_ns + 1)
         due_ns = self._due_ns
         self._due_ns += expired * self._period_ns
-        if expired or self._rang:
-            self._timer.set(self._due_ns)
+        self._timer.set(self._due_ns)
         self._rang = False
         return Period(expired, due_ns)
 

@@ -1,13 +1,15 @@
 """Certificates and their authority as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
 
-The keys are P-256 keys, in files that only their owner can read.
+The keys are P-256 keys, in files that only their owner can read. People trust the authority on
+their phones, so its certificate limits the names that it may sign: a thief of its key can pose as
+no web site.
 """
 
 from __future__ import annotations
 
 import ipaddress
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -19,6 +21,17 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.machine.certificates import CA_KEY
 
+LOCAL = ("local", "localhost")
+"""Host names that every authority may sign, with all names below them."""
+
+PRIVATE = (
+    "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
+    "192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10",
+)  # fmt: skip
+"""Networks whose addresses every authority may sign, because nobody has them on the Internet."""
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+
 
 class Authority:
     """Certificate authority that signs certificates."""
@@ -27,8 +40,14 @@ class Authority:
         self._certificate, self._key = certificate, key
 
     @classmethod
-    def make(cls, directory: Path, name: str, days: int) -> Authority:
-        """Create an authority in `directory`, valid five times as long as its certificates."""
+    def make(
+        cls, directory: Path, name: str, days: int, addresses: Sequence[str] = ()
+    ) -> Authority:
+        """Create an authority in `directory`, valid five times as long as its certificates.
+
+        It may sign for `addresses` (host names with all names below them, and IP addresses, of IPv6
+        the whole /64 network), for `LOCAL` and for `PRIVATE`, and for nothing else.
+        """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name[:64])])
@@ -36,6 +55,7 @@ class Authority:
             _builder(subject, subject, key.public_key(), 5 * days)
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(_usage(signs=True), critical=True)
+            .add_extension(_constraints(addresses), critical=True)
             .sign(key, hashes.SHA256())
         )
         _write(directory / CA, _pem(certificate), 0o644)
@@ -58,6 +78,37 @@ class Authority:
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise ValueError(f"{CA_KEY} is not a P-256 key")
         return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
+
+    @property
+    def limited(self) -> bool:
+        """Whether the authority may sign for some names only. One from an earlier version may sign
+        for any.
+        """
+        return bool(self._permitted())
+
+    def permits(self, address: str) -> bool:
+        """Return whether a certificate for this host name or IP address would be valid."""
+        permitted = self._permitted()
+        if not permitted:
+            return True
+        named = _general_name(address)
+        if isinstance(named, x509.IPAddress):
+            networks = (one.value for one in permitted if isinstance(one, x509.IPAddress))
+            own = ipaddress.ip_address(address)
+            return any(own in ipaddress.ip_network(str(one)) for one in networks)
+        name = address.lower()
+        return any(
+            name == one.value or name.endswith(f".{one.value}")
+            for one in permitted
+            if isinstance(one, x509.DNSName)
+        )
+
+    def _permitted(self) -> Sequence[x509.GeneralName]:
+        try:
+            found = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
+        except x509.ExtensionNotFound:
+            return ()
+        return found.value.permitted_subtrees or ()
 
     def names_in(self, directory: Path) -> list[str]:
         """Return the host names and IP addresses in the certificate of `directory`, if it
@@ -130,6 +181,26 @@ def _usage(signs: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
+
+
+def _constraints(addresses: Sequence[str]) -> x509.NameConstraints:
+    """Return the constraints of an authority that signs for these host names and IP addresses."""
+    hosts, networks = list(LOCAL), [ipaddress.ip_network(one) for one in PRIVATE]
+    for address in addresses:
+        named = _general_name(address)
+        if not isinstance(named, x509.IPAddress):
+            hosts.append(address.lower())
+        elif not any(named.value in one for one in networks):
+            networks.append(_network_of(address))
+    # A name below another one needs no entry of its own.
+    own = [one for one in dict.fromkeys(hosts) if not any(one.endswith(f".{h}") for h in hosts)]
+    return x509.NameConstraints([*map(x509.DNSName, own), *map(x509.IPAddress, networks)], None)
+
+
+def _network_of(address: str) -> Network:
+    # The address of a host changes within its /64 network of IPv6.
+    length = 64 if ":" in address else 32
+    return ipaddress.ip_network((address, length), strict=False)
 
 
 def _general_name(address: str) -> x509.GeneralName:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from acsard.core.config.settings import Config
 from acsard.core.values import ROLES
 from acsard.daemon.bus.tls import CA
-from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
+from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.host.extras import missing
 from acsard.host.own_identity import own_addresses
 
@@ -29,6 +29,13 @@ PORT = 7449
 CA_KEY = "ca-key.pem"
 """Key of the authority. Clients do not get it."""
 
+
+UNLIMITED = (
+    "The authority was made by an earlier version and may sign for any web site. If browsers trust "
+    "it, run `acsard tls init --force`, make all certificates again, and remove the old authority "
+    "from the phones."
+)
+"""Warning about an authority without name constraints."""
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 """Matches a host name or an IP address."""
@@ -47,8 +54,8 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
         )
     maker = _maker()
     _writable(directory)
-    authority = maker.make(directory, f"acsard at {socket.gethostname()}", days)
     names = _robot_names(addresses)
+    authority = maker.make(directory, f"acsard at {socket.gethostname()}", days, names)
     authority.issue(directory, "robot", names, days)
     for role in ROLES:
         authority.issue(directory / "clients" / role, role, [], days)
@@ -61,20 +68,48 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
     place = directory / "clients" / name
     if place.exists():
         raise MendableError(f"{place} exists; remove it, or choose another name")
-    named = [name] if ADDRESS.match(name) else []
+    _require_permitted(authority, addresses)
+    named = [one for one in _names_of(name) if authority.permits(one)]
     authority.issue(place, name, [*named, *addresses], days)
     return place
 
 
-def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
+def renew(directory: Path, addresses: Sequence[str], days: int) -> tuple[list[str], str]:
     """Replace the robot's own certificate.
 
-    Returns its names and addresses, with those of the old one.
+    Returns its names and addresses, with those of the old one, and a warning or "".
     """
     authority = _load(directory)
-    names = [*_robot_names(authority.names_in(directory)), *addresses]
+    _require_permitted(authority, addresses)
+    known = _robot_names(authority.names_in(directory))
+    # The machine may have another name or address than when the authority was made.
+    names = [*filter(authority.permits, known), *addresses]
     authority.issue(directory, "robot", names, days)
-    return list(dict.fromkeys(names))
+    return list(dict.fromkeys(names)), "" if authority.limited else UNLIMITED
+
+
+def _names_of(name: str) -> list[str]:
+    """Return the host names under which the holder of a certificate is reached.
+
+    The name in mDNS is needed for a common name like `anna.meyer` too: without any host name TLS
+    would take that for one, and compare it with the names that the authority may sign.
+    """
+    if not ADDRESS.match(name):
+        return []
+    numeric = ":" in name or name.replace(".", "").isdigit()
+    return [name] if numeric or name.endswith(".local") else [name, f"{name}.local"]
+
+
+def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
+    """Raise `MendableError` if the authority may not sign for one of the addresses."""
+    barred = [one for one in addresses if not authority.permits(one)]
+    if barred:
+        named = " ".join(f"--address {one}" for one in barred)
+        raise MendableError(
+            f"the authority may not sign for {', '.join(barred)}: its certificate permits only "
+            "the names and addresses of `tls init`, .local and private networks. `acsard tls init "
+            f"--force {named}` makes a new authority; then every client needs a new certificate",
+        )
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
@@ -107,7 +142,11 @@ def _load(directory: Path) -> Authority:
     try:
         return maker.load(directory, _password)
     except FileNotFoundError:
-        raise MendableError(f"{directory} has no authority: run `acsard tls init` first") from None
+        if (directory / CA).exists():
+            text = f"{directory} has no {CA_KEY}: bring the authority's key back for this command"
+        else:
+            text = f"{directory} has no authority: run `acsard tls init` first"
+        raise MendableError(text) from None
     except (OSError, ValueError) as error:
         raise MendableError(f"cannot use the authority in {directory}: {error}") from None
 
@@ -115,8 +154,7 @@ def _load(directory: Path) -> Authority:
 def _password() -> str:
     """Ask for the password of an encrypted authority key."""
     if not sys.stdin.isatty():
-        raise ExitError(
-            Exit.USAGE,
+        raise UsageError(
             "the authority's key is encrypted: run this in a terminal, where it asks for the "
             "password",
         )

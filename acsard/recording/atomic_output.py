@@ -16,8 +16,7 @@ from typing import BinaryIO
 
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
-
-METADATA = "metadata.yaml"
+from acsard.recording.ros_bag import METADATA
 
 BAG_SUFFIXES = (".mcap", ".db3")
 """Suffixes of the data files of a ROS bag."""

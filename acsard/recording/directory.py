@@ -138,9 +138,9 @@ class Run(Struct):
 
 
 class Ring:
-    """The directory of recordings: begins and ends files, and deletes old ones.
+    """The directory of recordings: begins and ends files, and deletes old ones to make room.
 
-    Every method may raise `OSError`.
+    Only one process at a time can have a `Ring` of a directory. Every method may raise `OSError`.
     """
 
     def __init__(
@@ -281,7 +281,7 @@ class Ring:
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
-        """Delete the files to delete if the disk is nearly full, or ten minutes have passed.
+        """Call `trim` if the disk is nearly full, and every ten minutes.
 
         Call this method once a second.
         """

@@ -176,7 +176,7 @@ def export(
             file = part / f"{new.name}_0.mcap"
             with file.open("wb") as stream:
                 write(bag := message_writer(stream), stream)
-            with (part / "metadata.yaml").open("wb") as stream:
+            with (part / ros_bag.METADATA).open("wb") as stream:
                 stream.write(ros_bag.metadata(file.name, bag.topics, *bag.times).encode())
                 synced(stream)
             return ExportResult(bag.count, run.trouble)

@@ -127,7 +127,7 @@ class EndRecordBuilder:
 
 
 class Index:
-    """Statistics and index of a file, for the summary at its end."""
+    """Collects the statistics and the index for the summary section at the end of an MCAP file."""
 
     def __init__(self) -> None:
         self._places: list[McapRecord] = []
@@ -158,7 +158,7 @@ class Index:
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Take a record of any kind. `at` is its offset in the file and `length` its size, bytes.
+        """Take a record. `at` is its offset in the file and `length` its size, both in bytes.
 
         Only metadata and attachments are indexed.
         """

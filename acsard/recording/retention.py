@@ -20,7 +20,11 @@ from acsard.core.values import NS_PER_S, Instant
 File = TypeVar("File")
 
 Kind = Literal["plain", "near", "kept"]
-"""Retention class: `kept` had an incident in it, `near` was written within a minute of one."""
+"""Retention class of a recording.
+
+An incident happened in a `kept` recording. A `near` recording was written within a minute of an
+incident. All others are `plain`.
+"""
 
 AROUND_NS = 60 * NS_PER_S
 """Time before and after an incident within which recordings are retained."""

@@ -14,6 +14,9 @@ from msgspec import Struct
 
 from acsard.core.ros.names import Qos
 
+METADATA = "metadata.yaml"
+"""Name of the file that describes a ROS bag."""
+
 VERSION = 5
 
 _RELIABLE, _BEST_EFFORT = 1, 2

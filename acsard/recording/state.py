@@ -39,7 +39,7 @@ OTHER_PARTS: dict[tuple[str, str], type] = {
 PROTOCOL = 5
 """Version of the pickle format that `unpickling.py` reads."""
 
-MOST_TEXT = 200
+MAX_TEXT = 200
 """Largest number of characters of an error's text."""
 
 TABLE = copyreg.dispatch_table | {
@@ -90,7 +90,7 @@ def thaw(data: bytes) -> State:
 
 def short(error: Exception) -> str:
     """Return the error's text, shortened and printable, because it may quote a forged file."""
-    return printable(str(error))[:MOST_TEXT]
+    return printable(str(error))[:MAX_TEXT]
 
 
 def part_class(module: str, name: str) -> type:

@@ -1,12 +1,14 @@
 """`acsard recording report`: turns a recording into the text of one HTML file.
 
-All modules here are pure, except `page.drawn`, which replays the recording.
+All modules of this package are pure, except `page.drawn`, which replays the recording.
 
-`course` processes the steps one by one and keeps the data to draw, limited as it arrives
-(`acsard.core.thinning`), so a day takes no more memory than a minute. `command_sources` keeps the
-data of the command sources. `account` describes the recording in words. `figures` draws it, with
-the elements and the path in `drawing`. `page` assembles the file.
+- `report_data` takes the steps one by one and keeps the data to draw. It thins the data while they
+  arrive (`acsard.core.thinning`), so a day takes no more memory than a minute.
+- `command_sources`, `serial_counts` and `loop_lateness` keep parts of these data.
+- `report_text` describes the recording in words.
+- `time_figures` and `path_figure` draw it, with the elements of `plot_elements`.
+- `page` assembles the file.
 
-The plotly library's code is passed in as an argument. Text of unknown origin (names, sentences)
-must always pass `page.escaped` or `drawing.label`.
+The caller passes the code of the library plotly as an argument. Each text of unknown origin, such
+as a name or the text of an event, must pass `page.escaped` or `plot_elements.label`.
 """

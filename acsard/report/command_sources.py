@@ -1,4 +1,4 @@
-"""The command sources over time: which one drove, and why the others waited or were refused."""
+"""Shows over time which command source drove, and why the others waited or were refused."""
 
 from __future__ import annotations
 
@@ -13,85 +13,90 @@ from acsard.core.thinning import Band
 from acsard.core.values import NS_PER_S, Command, Outputs, Twist
 from acsard.recording.recorded_steps import Step
 
-DOES = ("refused", "waits", "sends", "drives")
-"""States of a source that is not silent, in the order in which they win when short spans are
-merged.
+STATES = ("refused", "waits", "sends", "drives")
+"""States of a source that is not silent. If short spans must be merged, the first of them wins.
 
-`sends` means that its commands are accepted but the robot stands for another reason.
+`sends` means that the robot accepts the source's commands, but stands for another reason.
 """
 
 MOVES = ("ready", "driving")
-"""Modes in which a source decides whether the robot moves. In the other modes the robot follows
-none."""
+"""Modes in which the robot follows a source. In the other modes it follows no source."""
 
 OTHERS = "others"
-"""Collective name of sources that are not in the configuration."""
+"""Common name of all sources that are not in the configuration."""
 
-LOOK_S = 0.1
-"""Interval in s at which the sources are sampled, unless the mode or the driving source changes."""
+SAMPLE_S = 0.1
+"""Time between two samples of the sources, s. A change of mode or source is sampled at once."""
 
-MOST_TEXT = 300
-"""Maximum number of characters that are kept of a sentence or a name."""
+MAX_TEXT = 300
+"""Largest number of characters that are kept of a sentence or a name."""
+
+MAX_SENDERS = 256
+"""Largest number of senders whose last command is kept."""
 
 
 class CommandSources:
-    """The states of all sources over the steps."""
+    """The states of all sources, one band of time for each source."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
         self._timeouts = {
             source.name: source.timeout for source in sorted(sources, key=lambda s: -s.priority)
         }
-        self.bands = {name: Band(DOES) for name in (*self._timeouts, OTHERS)}
-        """The states of each source, highest priority first."""
+        self.bands = {name: Band(STATES) for name in (*self._timeouts, OTHERS)}
+        """The states of each source over time. The source with the highest priority comes first."""
         self._newest: dict[tuple[str, str], Command] = {}
-        """Last command by (source, sender), the newest last."""
+        """The last command of each source and sender, the newest last."""
         self._counted: Counter[str] = Counter()
+        """The robot's numbers of refused commands after the last step, for each reason."""
         self._refused: dict[str, tuple[float, str]] = {}
-        """Time until which a source counts as refused, and the reason."""
+        """For each refused source: the time until which it counts as refused, s, and the reason."""
 
     def name(self, source: str) -> str:
         """Return the name of a configured source, or `OTHERS`."""
         return source if source in self._timeouts else OTHERS
 
-    def hear(self, step: Step, t: float, robot: Robot) -> bool:
-        """Take the commands of a step; return whether the set of refused sources changed."""
+    def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
+        """Take the commands of a step at time `t`, s; `robot` is the robot after the step.
+
+        Returns whether the refused sources have changed.
+        """
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
             self._newest.pop((command.source, command.sender), None)
             self._newest[command.source, command.sender] = command
-        while len(self._newest) > 256:
+        while len(self._newest) > MAX_SENDERS:
             del self._newest[next(iter(self._newest))]
         for refusal in step.inputs.refusals:
             if refusal.source:
                 self._refuse(refusal.source, t, refusal.text)
         if commands:
-            self._objections(step, t, robot)
+            self._find_refused(step, t, robot)
         return before != self._refused
 
-    def _objections(self, step: Step, t: float, robot: Robot) -> None:
-        """Find the commands of this step that the robot refused, by its counters.
+    def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
+        """Find the commands of this step that the robot refused.
 
-        A counter does not name the source, so the command of each source is compared with the last
-        accepted one.
+        The robot's counters give the reasons, but not the sources. A source was refused if its last
+        accepted command is older than its command of this step.
         """
         counted = Counter({name: robot.counters[f"command_{name}"] for name in REFUSED})
-        news, self._counted = counted - self._counted, counted
-        if not news:
+        new, self._counted = counted - self._counted, counted
+        if not new:
             return
-        words = "; ".join(REFUSED[reason] for reason in news)
+        words = "; ".join(REFUSED[reason] for reason in new)
         now_ns = step.inputs.now.mono_ns
-        ages = {one.name: one.age_s for one in robot.snapshot(now_ns).sources}
+        ages = {source.name: source.age_s for source in robot.snapshot(now_ns).sources}
         for command in step.inputs.commands:
             age_s = ages.get(command.source)
             if age_s is None or age_s * NS_PER_S > now_ns - command.arrived_ns + 1:
-                self._refuse(command.source, t, words)  # otherwise the robot accepted it
+                self._refuse(command.source, t, words)
 
     def _refuse(self, source: str, t: float, words: str) -> None:
-        until = t + self._timeouts.get(source, LOOK_S)
-        self._refused[self.name(source)] = until, words[:MOST_TEXT]
+        until = t + self._timeouts.get(source, SAMPLE_S)
+        self._refused[self.name(source)] = until, words[:MAX_TEXT]
 
-    def wish(self, outputs: Outputs) -> Twist | None:
-        """Return the twist of the command that the robot follows, or None."""
+    def commanded(self, outputs: Outputs) -> Twist | None:
+        """Return the twist of the command that the robot follows, or None if it follows none."""
         if outputs.command_ns is None:
             return None
         for command in reversed(self._newest.values()):
@@ -99,28 +104,30 @@ class CommandSources:
                 return command.twist
         return None
 
-    def look(self, step: Step, t: float, robot: Robot) -> None:
-        for name, does, words in self._do(step, t, robot):
-            self.bands[name].add(t, does, words)
+    def sample(self, step: Step, t: float, robot: Robot) -> None:
+        """Add the state of each source at time `t`, s, to its band."""
+        for name, state, words in self._states(step, t, robot):
+            self.bands[name].add(t, state, words)
 
-    def _do(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
-        mode, reason, _, holder = step.recorded.status
-        for one in robot.snapshot(step.inputs.now.mono_ns).sources:
-            lately, wait = self._lately(one.name, t), one.waits_for
-            if mode == "driving" and one.name == holder:
-                yield one.name, "drives", waiting(wait)
-            elif lately:
-                yield one.name, "refused", lately
+    def _states(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
+        """Yield the name of each source, its state and the reason in words."""
+        mode, reason, _, driver = step.recorded.status
+        for source in robot.snapshot(step.inputs.now.mono_ns).sources:
+            refusal, wait = self._refusal(source.name, t), source.waits_for
+            if mode == "driving" and source.name == driver:
+                yield source.name, "drives", waiting(wait)
+            elif refusal:
+                yield source.name, "refused", refusal
             elif wait.what == "command":
-                yield one.name, "", ""
+                yield source.name, "", ""
             elif mode not in MOVES or wait.what in ("nothing", "senders"):
-                yield one.name, "sends", f"{mode}: {reason}"[:MOST_TEXT]
+                yield source.name, "sends", f"{mode}: {reason}"[:MAX_TEXT]
             else:
-                yield one.name, "waits", waiting(wait)
-        lately = self._lately(OTHERS, t)
-        yield OTHERS, "refused" if lately else "", lately
+                yield source.name, "waits", waiting(wait)
+        refusal = self._refusal(OTHERS, t)
+        yield OTHERS, "refused" if refusal else "", refusal
 
-    def _lately(self, name: str, t: float) -> str:
-        """Return why commands of a source were refused within its timeout, or ""."""
+    def _refusal(self, name: str, t: float) -> str:
+        """Return why a command of a source was refused within the source's timeout, or ""."""
         until, words = self._refused.get(name, (-math.inf, ""))
         return words if t < until else ""

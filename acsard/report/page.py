@@ -1,8 +1,9 @@
-"""A report as one self-contained HTML file, in which no text of unknown origin can become code.
+"""Makes the report: one HTML file that needs no other file.
 
-Texts pass `escaped`. The pictures are JSON in a block that browsers do not execute, without any
-`<`. As a second barrier, the page's security policy allows only its two scripts, by their hashes,
-and forbids all loading.
+No text of unknown origin can become code in it. Each text passes `escaped`. The pictures are JSON
+without any `<`, in a block that browsers do not execute. As a second barrier, the security policy
+of the page allows only its two scripts, which it names with their hashes, and forbids to load
+anything.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from acsard.recording.file import Recording
 from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
 from acsard.recording.replay_text import verdict
 from acsard.recording.time_span import WHOLE, Span, clock
-from acsard.report.account import Clock, Origin, differences, notes, reasons, rows, summary
-from acsard.report.course import Course
-from acsard.report.drawing import Figure
-from acsard.report.figures import Pictures
+from acsard.report.plot_elements import Figure
+from acsard.report.report_data import ReportData
+from acsard.report.report_text import Clock, Origin, differences, notes, reasons, rows, summary
+from acsard.report.time_figures import TimeFigures
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2127; --soft: #59636e; --paper: #fff; --card: #f5f7f9;
@@ -116,36 +117,43 @@ addEventListener("afterprint", () => paper(false));
 """
 
 
-MOST_OPEN = 40
-"""Number of events up to which the list is open at first."""
+MAX_OPEN = 40
+"""Largest number of events with which the list of events is open at first."""
 
 
 def escaped(text: str) -> str:
-    """Return any text as safe HTML."""
+    """Return any text as HTML that shows the text and nothing else."""
     return html.escape(printable(text))
 
 
-def page(course: Course, origin: Origin, library: str, clock: Clock, offset_s: float = 0.0) -> str:
-    """Return the text of the file.
+def page(
+    data: ReportData, origin: Origin, library: str, clock: Clock, offset_s: float = 0.0
+) -> str:
+    """Return the text of the HTML file.
 
-    `library` is the code of plotly, `offset_s` the local time's offset from UTC.
+    Args:
+        data: the data of the recording.
+        origin: the robot and the program that made the recording.
+        library: the code of plotly.
+        clock: formats the times.
+        offset_s: offset of the local time from UTC, s.
     """
-    figures = Pictures(course, offset_s).all()
-    title = escaped(f"{origin.robot}, {clock(course.began or 0.0, True)}")
+    figures = TimeFigures(data, offset_s).all()
+    title = escaped(f"{origin.robot}, {clock(data.began or 0.0, True)}")
     body = [
         f"<h1>{title}</h1>",
-        f'<p class="lead">{escaped(summary(course))}</p>',
-        *[f'<p class="note">{escaped(note)}</p>' for note in notes(course, origin)],
-        _rows(course, origin, clock),
+        f'<p class="lead">{escaped(summary(data))}</p>',
+        *[f'<p class="note">{escaped(note)}</p>' for note in notes(data, origin)],
+        _rows(data, origin, clock),
         "<noscript><p class=note>The pictures need JavaScript.</p></noscript>",
-        *[_figure(one) + (_reasons(course) if one.name == "who" else "") for one in figures],
-        _settings(course),
-        _events(course, clock),
+        *[_figure(f) + (_reasons(data) if f.name == "sources" else "") for f in figures],
+        _settings(data),
+        _events(data, clock),
     ]
-    data = msgspec.json.encode(
+    encoded = msgspec.json.encode(
         [{"name": f.name, "data": f.data, "layout": f.layout, "timed": f.timed} for f in figures]
     )
-    inside = data.decode().replace("<", "\\u003c")
+    pictures = encoded.decode().replace("<", "\\u003c")
     policy = (
         f"default-src 'none'; script-src {_hash(library)} {_hash(PROGRAM)}; "
         "style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'"
@@ -157,7 +165,7 @@ def page(course: Course, origin: Origin, library: str, clock: Clock, offset_s: f
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{title}</title><style>{STYLE}</style></head><body>",
             *body,
-            f'<script type="application/json" id="pictures">{inside}</script>',
+            f'<script type="application/json" id="pictures">{pictures}</script>',
             f"<script>{library}</script>",
             f"<script>{PROGRAM}</script>",
             "</body></html>\n",
@@ -173,32 +181,32 @@ def drawn(
     `progress` is called with the wall-clock time reached, in ns. Raises `RecordingError` if nothing
     was recorded in that time.
     """
-    about, looked = recording.about, DisplayReplay(recording)
+    about, replayed = recording.about, DisplayReplay(recording)
     began = about.wall_ns / NS_PER_S
-    course = Course(looked.config, began + span.begin, began + span.end)
-    for number, (step, outputs, robot) in enumerate(looked.steps()):
+    data = ReportData(replayed.config, began + span.begin, began + span.end)
+    for number, (step, outputs, robot) in enumerate(replayed.steps()):
         if number % PROGRESS_STEPS == 0:
             progress(step.inputs.now.wall_ns)
-        course.step(step, outputs, robot)
-        if course.over:
+        data.step(step, outputs, robot)
+        if data.over:
             # Read the rest, so that the notes count every damaged place.
             deque(recording.messages(), maxlen=0)
             break
-    if course.began is None:
+    if data.began is None:
         raise RecordingError(
             f"{recording.path} has no step in that span of time, so there is nothing to draw"
         )
-    course.end()
-    said = [*filter(None, [recording.missing]), *looked.notes]
-    comparison = looked.replay.comparison
-    if not (comparison.same or looked.notes or course.missing):
-        said.append(
+    data.end()
+    remarks = [*filter(None, [recording.missing]), *replayed.notes]
+    comparison = replayed.replay.comparison
+    if not (comparison.same or replayed.notes or data.missing):
+        remarks.append(
             "this version of acsard computes other results than the recorded ones: "
             f"{verdict(comparison)}"
         )
-    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
-    offset_s = time.localtime(course.began).tm_gmtoff
-    return page(course, origin, library, clock, offset_s), notes(course, origin)
+    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(remarks))
+    offset_s = time.localtime(data.began).tm_gmtoff
+    return page(data, origin, library, clock, offset_s), notes(data, origin)
 
 
 def _hash(program: str) -> str:
@@ -206,9 +214,9 @@ def _hash(program: str) -> str:
     return f"'sha256-{binascii.b2a_base64(digest, newline=False).decode()}'"
 
 
-def _rows(course: Course, origin: Origin, clock: Clock) -> str:
-    told = rows(course, origin, clock)
-    return f"<dl>{''.join(f'<dt>{escaped(k)}</dt><dd>{escaped(v)}</dd>' for k, v in told)}</dl>"
+def _rows(data: ReportData, origin: Origin, clock: Clock) -> str:
+    pairs = rows(data, origin, clock)
+    return f"<dl>{''.join(f'<dt>{escaped(k)}</dt><dd>{escaped(v)}</dd>' for k, v in pairs)}</dl>"
 
 
 def _figure(figure: Figure) -> str:
@@ -222,21 +230,21 @@ def _figure(figure: Figure) -> str:
     return f"<figure><h2>{escaped(figure.title)}</h2>{caption}{legend}{box}</figure>"
 
 
-def _reasons(course: Course) -> str:
+def _reasons(data: ReportData) -> str:
     cells = [
         (
             f'<td class="name">{escaped(name)}</td>',
-            f'<td class="time">{escaped(does)}</td>',
+            f'<td class="time">{escaped(state)}</td>',
             f"<td>{escaped(words)}</td>",
             f'<td class="time">{lasting(seconds)}</td>',
         )
-        for name, does, words, seconds in reasons(course)
+        for name, state, words, seconds in reasons(data)
     ]
     return _table(["source", "", "why it did not drive", "duration"], cells) if cells else ""
 
 
-def _events(course: Course, clock: Clock) -> str:
-    began, left_out, marks = course.began or 0.0, course.marks.left_out, course.marks.all()
+def _events(data: ReportData, clock: Clock) -> str:
+    began, left_out, marks = data.began or 0.0, data.marks.left_out, data.marks.all()
     cells = [
         (
             f'<td class="time">{escaped(clock(began + mark.t, False))}</td>',
@@ -253,13 +261,13 @@ def _events(course: Course, clock: Clock) -> str:
         else ""
     )
     table = _table(["time", "event", "what", "by"], cells)
-    shown = " open" if len(marks) <= MOST_OPEN else ""
+    shown = " open" if len(marks) <= MAX_OPEN else ""
     heading = f"<summary><h2>All {len(marks)} events</h2></summary>"
     return f"<details{shown}>{heading}{table}</details>{more}"
 
 
-def _settings(course: Course) -> str:
-    changed = differences(course.config)
+def _settings(data: ReportData) -> str:
+    changed = differences(data.config)
     if not changed:
         return "<h2>Configuration</h2><p>Every key has its default.</p>"
     cells = [tuple(f"<td>{escaped(part)}</td>" for part in setting) for setting in changed]

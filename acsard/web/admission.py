@@ -15,21 +15,24 @@ from functools import partial
 from aiohttp import web
 from msgspec.structs import replace
 
+from acsard.core.config.settings import WebConfig
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets
 from acsard.host.threads import in_thread
 from acsard.web.acceptor import Acceptor
 from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
 from acsard.web.callers import (
-    MAINTAINER,
+    HERE,
     Asked,
     Reason,
     RefusedError,
     Who,
+    by_listed_page,
     network_of,
     place,
     require_own_origin,
     tokens_in,
+    tokens_offered,
     unmapped,
 )
 from acsard.web.counts import Counts
@@ -49,6 +52,13 @@ REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 """Refusal reason per HTTP status that aiohttp raises by itself. Every other status counts as
 `malformed`."""
 
+PREFLIGHT = {
+    "Access-Control-Allow-Methods": "GET, HEAD, POST",
+    "Access-Control-Allow-Headers": "Authorization, Content-Type",
+    "Access-Control-Max-Age": "600",
+}
+"""Headers of the answer to a browser that asks what a page of another origin may send."""
+
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
     413: f"over {MAX_BYTES} bytes",
@@ -64,13 +74,21 @@ class Admission:
     """Finds the row of each request, and refuses the request or hands it to the row's handler."""
 
     def __init__(
-        self, robot: str, names: frozenset[str], vault: Vault, acceptor: Acceptor, counts: Counts
+        self,
+        robot: str,
+        names: frozenset[str],
+        vault: Vault,
+        acceptor: Acceptor,
+        counts: Counts,
+        rules: WebConfig,
     ) -> None:
         """Store how clients are known.
 
         `names` are the host names and addresses, in lower case, by which other machines reach the
-        robot.
+        robot. `rules` name the role of a client on the robot itself, and the origins of other web
+        pages that may send requests.
         """
+        self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
         self._guesses, self._paces = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(REQUESTS)
@@ -80,6 +98,7 @@ class Admission:
         """Return the application that serves these rows; `page` is what their handlers work on."""
         app = web.Application(middlewares=[self._serve], client_max_size=MAX_BYTES)
         app.on_response_prepare.append(secured)
+        app.on_response_prepare.append(self._shared)
         for row in rows:
             for method in ("GET", "HEAD") if row.method == "GET" else (row.method,):
                 added = app.router.add_route(method, row.pattern, partial(row.handler, page))
@@ -111,6 +130,8 @@ class Admission:
     async def _serve(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         self._acceptor.spoke(request.transport)
         try:
+            if request.method == "OPTIONS" and self._listed(request):
+                return self._preflight(request)
             await self._admit(request, self._rows.get(request.match_info.route))
             return await handler(request)
         except RefusedError as error:
@@ -139,13 +160,16 @@ class Admission:
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
         is_open = row is not None and row.least is None
-        if not is_open or request.method not in ("GET", "HEAD"):
+        listed = by_listed_page(said, self._origins)
+        if request.method not in ("GET", "HEAD") if is_open else not listed:
             require_own_origin(said)
         if is_open:
             return
-        who = replace(MAINTAINER, address=said.peer)
+        who = replace(self._local, address=said.peer)
         if not here:
-            who = await self.owner(said.peer, tokens_shown(request, self._robot))
+            # A cookie belongs to the robot's own page.
+            shown = tokens_sent(request) if listed else tokens_shown(request, self._robot)
+            who = await self.owner(said.peer, shown)
         request[WHO] = who
         self._acceptor.admitted(request.transport, who)
         # Clients on the robot itself have no token and no rate limit.
@@ -155,6 +179,22 @@ class Admission:
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:
             who.require(row.least, f"{row.method} {row.path}")
+
+    def _listed(self, request: web.Request) -> bool:
+        return by_listed_page(asked_of(request), self._origins)
+
+    def _preflight(self, request: web.Request) -> web.Response:
+        """Tell a browser that a page of a listed origin may send its request."""
+        place(asked_of(request), self._names | {own_address(request)})
+        return web.Response(status=204, headers=PREFLIGHT)
+
+    async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
+        """Let a page of a listed origin read the answer."""
+        if self._origins:
+            vary = response.headers.get("Vary", "")
+            response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"
+        if self._listed(request):
+            response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
 
 
 def asked_of(request: web.Request) -> Asked:
@@ -189,11 +229,16 @@ def own_port(request: web.Request) -> int:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return a program's bearer token, or a browser's cookie tokens, the likeliest first."""
+    """Return the tokens that a program sent, or a browser's cookies, the likeliest first."""
+    return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
+
+
+def tokens_sent(request: web.Request) -> list[str]:
+    """Return the bearer token, or for a WebSocket those in the names of its subprotocols."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]
-    return tokens_in(request.cookies, robot, own_port(request))
+    return tokens_offered(request.headers.get("Sec-WebSocket-Protocol", ""))
 
 
 def _reached(request: web.Request) -> tuple[str, int]:

@@ -19,6 +19,7 @@ from aiohttp import web
 from msgspec import Meta, Struct
 
 from acsard import __version__
+from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
 from acsard.core.values import Role
@@ -28,7 +29,7 @@ from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
 from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip
-from acsard.web.callers import RefusedError, cookie_name
+from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
@@ -40,7 +41,7 @@ from acsard.web.limits import Seats
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.reports import POLICY, Reports, ReportState, State
 from acsard.web.robots import Robots
-from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Route, services, values
+from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Problem, Route, services, values
 from acsard.web.settings_form import Setting, rows
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
@@ -59,10 +60,17 @@ DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 
 NO_TOKEN = "send the token as a form, token=..., or as JSON, both in UTF-8"
 
 
+DEFAULT = WebConfig()
+
+
 class TokenForm(Struct, frozen=True):
-    """The token of an invitation."""
+    """The token of an invitation.
+
+    With `replace`, it takes the place of a cookie that has more permissions.
+    """
 
     token: str
+    replace: bool = False
 
 
 class Caller(Struct, frozen=True):
@@ -88,14 +96,15 @@ class Page:
         acceptor: Acceptor,
         guide: Guide,
         page: Path = PAGE,
+        rules: WebConfig = DEFAULT,
     ) -> None:
-        """Make the application; `names` are those of `Admission`."""
+        """Make the application; `names` and `rules` are those of `Admission`."""
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
         self._guide, self._counts, self._vault = guide, counts, vault
         self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
         self._seats = Seats()
         self._viewers: set[Viewer] = set()
-        self._admission = Admission(robots.id, names, vault, acceptor, counts)
+        self._admission = Admission(robots.id, names, vault, acceptor, counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
@@ -142,26 +151,39 @@ class Page:
 
     async def token(self, request: web.Request) -> web.StreamResponse:
         """Exchange a posted token for an `HttpOnly` cookie, which scripts cannot read."""
-        text = await _token_posted(request)
+        form = await _token_posted(request)
         if not request.secure:
             raise RefusedError("plain", "no token is needed here")
-        who = await self._admission.owner(peer_of(request), [text])
+        who = await self._admission.owner(peer_of(request), [form.token])
+        cookie = cookie_name(self._robots.id, own_port(request))
+        shown = "" if form.replace else request.cookies.get(cookie, "")
+        present = await in_thread(lambda: self._vault.who(shown), READ_S)
+        if present is not None and not who.may(present.role):
+            raise TroubleError(
+                409,
+                f"this browser is {present.name} ({present.role}) here; the link makes it "
+                f"{who.name} ({who.role}), which may do less",
+            )
         left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
-            cookie_name(self._robots.id, own_port(request)), text, max_age=left_s, path="/",
-            secure=True, httponly=True, samesite="Strict",
+            cookie, form.token, max_age=left_s, path="/", secure=True, httponly=True,
+            samesite="Strict",
         )  # fmt: skip
         return response
 
     async def socket(self, request: web.Request) -> web.StreamResponse:
         """Serve a WebSocket until it ends."""
         who, peer = request[WHO], peer_of(request)
+        offered = request.headers.get("Sec-WebSocket-Protocol", "")
+        if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
+            # aiohttp would log the names of all protocols if it knew none of them.
+            raise RefusedError("malformed", f"offer the subprotocol {PROTOCOL} beside the token")
         if full := self._seats.enter(peer, who.token):
             raise RefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
-                max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False
+                max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False, protocols=[PROTOCOL]
             )
             await served.prepare(request)
             _limit_buffer(request)
@@ -273,15 +295,15 @@ async def _body_of(request: web.Request) -> bytes:
         raise web.HTTPRequestTimeout(reason=f"no body arrived within {BODY_S:g} s") from None
 
 
-async def _token_posted(request: web.Request) -> str:
+async def _token_posted(request: web.Request) -> TokenForm:
     body = await _body_of(request)
     try:
         text = body.decode(request.charset or "utf-8")
         if request.content_type == JSON:
-            return msgspec.json.decode(text, type=TokenForm).token
+            return msgspec.json.decode(text, type=TokenForm)
         if request.content_type == FORM:
             fields = dict(parse_qsl(text, errors="strict", max_num_fields=10))
-            return msgspec.convert(fields, TokenForm).token
+            return msgspec.convert(fields, TokenForm, strict=False)
     except (msgspec.MsgspecError, ValueError, LookupError, RecursionError):
         pass
     raise RefusedError("malformed", NO_TOKEN)
@@ -300,7 +322,8 @@ ROUTES: tuple[Route, ...] = (
     Route("POST", "/token", None, Page.token,
         "exchanges a token for a cookie that no script can read; only over HTTPS",
         takes=TokenForm, forms=(JSON, FORM),
-        gives={303: Body("The token is valid. `Location` is the page.", media="")}),
+        gives={303: Body("The token is valid. `Location` is the page.", media=""),
+               409: Body("The browser's cookie has more permissions: `replace` it?", Problem)}),
     Route("GET", "/ws", "viewer", Page.socket,
         "a WebSocket with JSON as text in both directions: follows, drives, stops",
         gives={101: Body("It is open.", media="")}, paced=False),

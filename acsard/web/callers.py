@@ -2,11 +2,12 @@
 
 This module is pure.
 
-A client on the robot itself has the role maintainer. However, any web page in a browser there may
-open `ws://localhost`, or point a host name of its own at 127.0.0.1. So `Host` must be a loopback
-name, and `Origin`, if the browser sends it, must be this page. A client from another machine must
-use HTTPS, a host name that the robot has, and a token. Requests through a proxy are refused: a
-proxy on the robot that rewrites `Host` would turn every client behind it into a maintainer.
+A client on the robot itself needs no token and has the role in `web.local`. However, any web page
+in a browser there may open `ws://localhost`, or point a host name of its own at 127.0.0.1. So
+`Host` must be a loopback name, and `Origin`, if the browser sends it, must be this page. A client
+from another machine must use HTTPS, a host name that the robot has, and a token. Requests through a
+proxy are refused: a proxy on the robot that rewrites `Host` would give every client behind it the
+role of the robot itself.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ HERE = "here"
 COOKIE = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a `__Host-` cookie only if it is Secure, without a
 Domain, and for all paths."""
+
+PROTOCOL, TOKEN = "acsard", "acsard.token."
+"""Subprotocol of the WebSocket, and prefix of one that carries a token."""
 
 MOST_COOKIES = 8
 """Maximum number of cookies that are checked for a token."""
@@ -128,6 +132,23 @@ def require_own_origin(asked: Asked) -> None:
     strange = asked.origin is not None and asked.origin.lower() != own
     if strange or asked.site not in (None, "same-origin", "none"):
         raise RefusedError("origin", "a page from another origin may not do that")
+
+
+def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
+    """Return whether a web page of an origin in `web.origins` made the browser send this request.
+
+    `origins` are in lower case.
+    """
+    return asked.origin is not None and asked.origin.lower() in origins
+
+
+def tokens_offered(protocols: str) -> list[str]:
+    """Return the tokens in a `Sec-WebSocket-Protocol` header.
+
+    A script in a browser can set no other header of a WebSocket.
+    """
+    offered = (one.strip() for one in protocols.split(","))
+    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)]
 
 
 def cookie_name(robot: str, port: int) -> str:

@@ -15,9 +15,6 @@ from acsard.client.outbox import Outbox
 from acsard.core.messages.schema import Twist, Vector3
 from acsard.web.counts import Counts
 
-SOURCE = "teleop"
-"""The command source for a person; the arbiter prefers it to programs."""
-
 
 class Hand:
     """Sends the newest command of each viewer.
@@ -31,19 +28,19 @@ class Hand:
         """The server must exit when its thread is dead: no viewer can drive then, and no zero
         command is sent."""
 
-    def give(self, commander: Commander, sender: Sender, wish: Wish) -> None:
-        """Queue a command in place of an older one of the same sender."""
+    def give(self, source: str, commander: Commander, sender: Sender, wish: Wish) -> None:
+        """Queue a command in place of an older one of the same commander."""
         replaced = commander.replaced
-        self.outbox.take(commander, partial(self._put, sender), wish)
+        self.outbox.take(commander, partial(self._put, source, sender), wish)
         if commander.replaced > replaced:
             self._counts.add("commands_superseded")
 
-    def _put(self, sender: Sender, wish: Wish) -> None:
+    def _put(self, source: str, sender: Sender, wish: Wish) -> None:
         try:
             client = self._client()
             if client is not None:
                 twist = Twist(Vector3(x=wish.twist.linear), Vector3(z=wish.twist.angular))
-                client.put(twist, sender.sign(wish.stamp_ns, steady=wish.steady))
+                client.put(twist, sender.sign(wish.stamp_ns, steady=wish.steady), source)
                 self._counts.add("commands")
                 return
         except Exception:  # noqa: BLE001, S110 - only this one command is lost

@@ -27,6 +27,9 @@ LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
 """Largest stamp in ms since 1970: the signature's limit in ns, less one day. The margin is needed
 because the zero command after a release carries a later stamp than the last command."""
 
+PROGRAM = "app"
+"""Source of a command that names none. The page names `teleop`, the source of a person."""
+
 Short = Annotated[str, Meta(max_length=80)]
 Device = Annotated[str, Meta(max_length=200)]
 
@@ -84,6 +87,8 @@ class Command(_Frame, frozen=True):
     stamp: float
     steady: bool = False
     """True if the clock of `stamp` is never adjusted, like the browser's `performance.now()`."""
+    source: Short = PROGRAM
+    """The command source, one of the robot's."""
 
     @property
     def stamp_ns(self) -> int:

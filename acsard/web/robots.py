@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -12,7 +12,6 @@ import zenoh
 from msgspec import Struct
 
 from acsard.client import Client
-from acsard.client.commander import LONGEST_S
 from acsard.client.follower import Follower, restarted
 from acsard.client.watch import ANSWERS
 from acsard.core.messages.encodings import DecodeError, Decoder
@@ -26,7 +25,6 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.mailbox import Mailbox
 from acsard.host.threads import in_thread
-from acsard.web.commands import SOURCE
 from acsard.web.counts import Counts
 from acsard.web.last_minute import Minute, Plotted
 from acsard.web.streams import UNREADY, Stream, Streams
@@ -66,8 +64,8 @@ class About(Struct, frozen=True):
     state_hz: float
     recordings: str
     """Directory of the black box, "" if nothing is recorded."""
-    timeout_s: float = LONGEST_S
-    """Timeout of the source as which the page drives, s."""
+    timeouts: Mapping[str, float]
+    """The command sources and their timeouts, s."""
 
 
 def _path() -> Track:
@@ -247,11 +245,10 @@ class Robots:
                 float(config["limits"]["angular_speed"]),
                 float(config["rates"]["state"]),
                 str(config["record"]["directory"]),
-                next(
-                    float(source["timeout"])
+                {
+                    str(source["name"]): float(source["timeout"])
                     for source in config["commands"]["sources"]
-                    if source["name"] == SOURCE
-                ),
+                },
             )
         except (MendableError, DecodeError, msgspec.MsgspecError, KeyError, TypeError, ValueError):
             return False

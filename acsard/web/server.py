@@ -17,7 +17,6 @@ from aiohttp import web
 from msgspec import Struct
 
 from acsard.client import Client
-from acsard.client.commander import LONGEST_S
 from acsard.core.config.settings import Config
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.tls import CERTIFICATE, KEY, names_in
@@ -28,10 +27,11 @@ from acsard.web.acceptor import Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.calls import Calls
-from acsard.web.commands import SOURCE, Hand
+from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
+from acsard.web.frames import PROGRAM
 from acsard.web.guide import Guide
 from acsard.web.jobs import Reach
 from acsard.web.listen import Listen, bound, own_name, require_certificate
@@ -91,7 +91,10 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
     calls, fleet = Calls(robots, guide.stop), Fleet(robots)
     vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
-    page = Page(robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page)
+    page = Page(
+        robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page,
+        wanted.config.web,
+    )  # fmt: skip
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
         shutdown_timeout=LEAVE_S,
@@ -168,7 +171,7 @@ async def _held(leaving: asyncio.Event) -> None:
 def _connected(address: Address) -> Client:
     """Return a client that is connected to the daemon; blocks."""
     session = client_session(address.endpoint, address.tls)
-    return Client(session, address.robot_id, SOURCE, address.tls, address.endpoint)
+    return Client(session, address.robot_id, PROGRAM, address.tls, address.endpoint)
 
 
 def _reach(wanted: Wanted) -> Reach:
@@ -185,7 +188,7 @@ def _about(wanted: Wanted) -> About:
         config.limits.angular_speed,
         config.rates.state,
         config.record.directory,
-        next((one.timeout for one in config.commands.sources if one.name == SOURCE), LONGEST_S),
+        {one.name: one.timeout for one in config.commands.sources},
     )
 
 

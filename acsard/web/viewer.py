@@ -14,7 +14,7 @@ from typing import Any
 import aiohttp
 from aiohttp import web
 
-from acsard.client.commander import Commander, Sender, Wish
+from acsard.client.commander import LONGEST_S, Commander, Sender, Wish
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
 from acsard.core.values import Role, Twist
@@ -83,7 +83,7 @@ class Viewer:
     ) -> None:
         self.who = who
         whole = sender_id(who.name)
-        self._sender, self._commander = Sender(whole), Commander()
+        self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, robots.certificate)
         """Public name that `state.sender` has while this viewer drives. The page never learns the
         secret part."""
@@ -187,6 +187,11 @@ class Viewer:
                 self._guide.press(self, frame)
 
     def _command(self, frame: Command) -> None:
+        if frame.source not in self._robots.about.timeouts:
+            names = ", ".join(self._robots.about.timeouts)
+            text = f"{frame.source} is not one of the robot's sources: {names}"
+            self._out.refuse("cmd", "malformed", text)
+            return
         stamp_ns = frame.stamp_ns
         if stamp_ns == self._stamp_ns and not frame.moves:
             # Some clocks stand still for a while. A zero command with an equal stamp is still a
@@ -199,14 +204,17 @@ class Viewer:
             return
         self._stamp_ns = stamp_ns
         wish = Wish(Twist(frame.cmd.linear_x, frame.cmd.angular_z), stamp_ns, frame.steady)
-        self._hand.give(self._commander, self._sender, wish)
+        commander = self._commanders.setdefault(frame.source, Commander())
+        self._hand.give(frame.source, commander, self._sender, wish)
 
     def _release(self) -> None:
-        """Send one zero command if the robot may still follow this viewer, by its own clock.
+        """Send a zero command to each source by which the robot may still follow this viewer.
 
-        This is the last command that is sent for this viewer.
+        They are the last commands that are sent for this viewer.
         """
-        self._hand.outbox.release(self._commander, self._robots.about.timeout_s)
+        timeouts = self._robots.about.timeouts
+        for source, commander in self._commanders.items():
+            self._hand.outbox.release(commander, timeouts.get(source, LONGEST_S))
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":

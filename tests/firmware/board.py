@@ -140,7 +140,7 @@ class Status(NamedTuple):
     answer_ns: int
     """Time from a received byte to the first byte of the board's next line: its time to answer."""
     wanted_ns: int
-    """When the firmware last wanted a motor to turn, whatever the reason."""
+    """Time when the firmware last wanted a motor to turn, for any reason."""
     set_points: int
     """Number of changes of the speeds that the firmware wants of the motors."""
     wrong: int

@@ -28,10 +28,10 @@ from tests.firmware.board import (
 )
 from tests.system.harness import until
 
-pytestmark = [pytest.mark.firmware, pytest.mark.xdist_group("board")]
+pytestmark = pytest.mark.firmware
 
 KNOWN = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1"
-"""The beginning of the identity line, whatever follows."""
+"""The beginning of every identity line."""
 
 POWERED_ON = KNOWN + b" lines=0 refused=0 trips=0 runaways=0 reset=power"
 

@@ -25,9 +25,6 @@ COUNTS_PER_TURN = 3200
 
 REVERSE_TICKS = 2
 
-# No real time passes here, so these tests need not wait for those that measure it.
-pytestmark = pytest.mark.xdist_group("computed")
-
 
 class WatchdogC(ctypes.Structure):
     _fields_ = (("fed_ms", ctypes.c_uint32), ("fed", ctypes.c_bool))

@@ -24,9 +24,6 @@ from tests.each import each
 from tests.firmware.board import checked, read_identity, read_reply, speeds_line
 from tests.vectors.lines import ACCEPTED, REFUSED, SEED_LINE, ZERO
 
-# No real time passes here, so these tests need not wait for those that measure it.
-pytestmark = pytest.mark.xdist_group("computed")
-
 
 class CommandC(ctypes.Structure):
     _fields_ = (

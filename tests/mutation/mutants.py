@@ -122,7 +122,7 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
         case ast.If(orelse=[]) | ast.Return(value=ast.Constant() | None):
             yield ast.Pass()
         case ast.Assign(targets=targets) if not isinstance(parent, ast.Module | ast.ClassDef):
-            # Without its assignment a local name is an error for nothing.
+            # A local name without its assignment raises an error, which every test notices.
             if not any(
                 isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
                 for target in targets
@@ -201,7 +201,7 @@ def mutants(root: Path, path: str) -> Iterator[Mutant]:
 
 
 def change(before: str, after: str) -> str:
-    """What differs, with what stands around it, in one line."""
+    """Return the changed words with their neighbours, in one line."""
     old, new = before.splitlines(), after.splitlines()
     while old and new and old[0] == new[0]:
         del old[0], new[0]

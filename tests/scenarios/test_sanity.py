@@ -118,7 +118,7 @@ def enter(world: World, mode: str, dice: random.Random) -> None:
 
 
 def leave(world: World, mode: str) -> None:
-    """Return to ready, whatever the mode was."""
+    """Return to ready from any mode."""
     if mode in ("stopped", "fault"):
         assert world.call("clear").success
     elif mode == "inactive":

@@ -1,7 +1,7 @@
 """The whole daemon in virtual time: control loop, fake MCU and an in-memory bus, no real clock.
 
-`World.run` jumps from one thing that happens to the next, so an hour costs seconds. The port here
-applies the same gate as the real one; the wire's pace is the fake MCU's.
+`World.run` jumps from one event to the next, so an hour costs seconds. The port here applies the
+same gate as the real one. The fake MCU sets the pace of the wire.
 """
 
 from __future__ import annotations
@@ -36,23 +36,26 @@ START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 EVERY_KEY = frozenset(topic.key for topic in PUBLISHED if not topic.latched)
 
 LET_GO_NS = 4 * NS_PER_S // 10
-"""A zero counts so long after a speed, for commanders of 5 Hz and more."""
+"""Time after a speed in which a zero does not arm, for senders of 5 Hz and more."""
 
 SIGNED = Signature("somebody").pack()
-"""The sender of what `World.send` sends."""
+"""Sender attachment of the commands of `World.send`."""
 
 
 class VirtualPort:
-    """A serial port to the fake MCU that can be unplugged, blocked, late and stingy."""
+    """A serial port to the fake MCU.
+
+    Tests can unplug it, block it, delay it and make it take only part of a line.
+    """
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
         self.is_open = False
         self.opened = 0
         self.blocked = False
         self.pause: Callable[[], int] | None = None
-        """What happens between the making of the next line and its handing over; the time then."""
+        """Runs before the next line is handed over, and returns the time then."""
         self.takes: int | None = None
-        """How many bytes of the next line the kernel takes."""
+        """Number of bytes of the next line that the kernel takes; None for all."""
         self.trouble = ""
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
@@ -96,7 +99,7 @@ class VirtualPort:
 
 
 class MemoryBus:
-    """Collects the messages on the keys that are wanted; hands in what the test sends."""
+    """Collects the messages on the wanted keys, and delivers the test's samples and queries."""
 
     def __init__(self, wanted: Collection[str]) -> None:
         self.wanted = set(wanted)
@@ -127,7 +130,7 @@ class MemoryBus:
 
 
 class World:
-    """A robot on a bench that exists only in numbers."""
+    """A simulated robot on a bench, with its daemon, in virtual time."""
 
     def __init__(
         self,
@@ -139,14 +142,14 @@ class World:
         keeper: LatchKeeper | None = None,
         wanted: Collection[str] = (),
     ) -> None:
-        """Messages are made only for the `wanted` keys. `state` and `odom` need no such key."""
+        """Messages are made only for the `wanted` keys. `state` and `odom` need no key."""
         self.config = config or Config()
         self.now_ns = START.mono_ns
         self.wall_offset_ns = START.wall_ns - START.mono_ns
         self.period_ns = int(NS_PER_S / self.config.rate_hz)
         self.next_period_ns = self.now_ns
         self.truth = Pose()
-        """Where the robot truly is, as far as somebody looks: with a gyro, each 10 ms."""
+        """True pose, updated every 10 ms, but only with a gyro."""
         self.gyro_dead = False
         watched = self.config.odometry.gyro
         self.mcu = (
@@ -179,11 +182,11 @@ class World:
         )
         self._queries = 0
         self._moved_ns: dict[str, int] = {}
-        """When a speed was last sent, by source."""
+        """Maps each source to the time of its last speed."""
         self.steps = 0
         self._alarm_ns: int | None = None
         self._alarm_set_ns: int | None = None
-        """As `runtime.wakeup.Alarm` keeps them: when it rings, what it was last set to."""
+        """Time to which the alarm was last set. It may have rung since then."""
         self._missed = 0
 
     def _see(self, sight: Sight) -> None:
@@ -198,7 +201,7 @@ class World:
 
     @property
     def _listens(self) -> bool:
-        """As `runtime.wakeup` keeps it: a command that comes in now gets a step of its own."""
+        """Whether a command that arrives now gets a step of its own."""
         return self.steps > 0 and self.loop.listens
 
     @property
@@ -206,7 +209,7 @@ class World:
         return Instant(self.now_ns, self.now_ns + self.wall_offset_ns)
 
     def run(self, seconds: float) -> None:
-        """Let time pass: bytes arrive when they do, a step comes every period."""
+        """Let time pass. Bytes arrive when they are due, and each period has a step."""
         end_ns = self.now_ns + int(seconds * NS_PER_S)
         while True:
             alarm_ns, at_ns = self._alarm_ns, self.next_period_ns
@@ -231,7 +234,10 @@ class World:
             self._step(Period(1 + missed, due_ns))
 
     def _bytes_came(self, until_ns: int) -> bool:
-        """Let the MCU live until its next bytes reach the port; False if none do by then."""
+        """Advance the MCU until its next bytes reach the port.
+
+        Return False if no bytes arrive by `until_ns`.
+        """
         mcu = self.port.mcu
         if mcu is None:
             return False
@@ -244,7 +250,7 @@ class World:
         return False
 
     def stall(self, seconds: float) -> None:
-        """The loop does not run, the world goes on."""
+        """Let time pass without a step of the loop."""
         self.now_ns += int(seconds * NS_PER_S)
         if self.port.mcu is not None:
             data = self.port.mcu.advance(self.now_ns)
@@ -254,7 +260,7 @@ class World:
         self.next_period_ns += self._missed * self.period_ns
 
     def stall_in_step(self, seconds: float) -> None:
-        """The loop stands still when the next line is made and not yet handed over."""
+        """Stall the loop between the making of the next line and its handing over."""
 
         def pause() -> int:
             self.stall(seconds)
@@ -272,12 +278,12 @@ class World:
         self._alarm_set_ns = retry_ns
         self.watch(outputs)
 
-    # what people do
+    # actions of clients
 
     def send(
         self, linear: float, angular: float = 0.0, source: str = "app", stamp_ns: int | None = None
     ) -> None:
-        """One Twist as JSON, of one who says who he is: `speakers.py` has the others."""
+        """Send one Twist as JSON with a sender attachment. `speakers.py` has the other senders."""
         if linear or angular:
             self._moved_ns[source] = self.now_ns
         payload = msgspec.json.encode({"linear": {"x": linear}, "angular": {"z": angular}})
@@ -307,7 +313,7 @@ class World:
         source: str = "app",
         hz: float = 20.0,
     ) -> None:
-        """Open with a zero, or as many as are neutral now; then the twist at `hz` for so long."""
+        """Send the zeros that arm the source, and then the twist at `hz` for `seconds`."""
         let_go_ns = self._moved_ns.get(source, 0) + LET_GO_NS
         while self.now_ns < let_go_ns:
             self.send(0.0, 0.0, source)
@@ -324,7 +330,7 @@ class World:
         source: str = "app",
         hz: float = 20.0,
     ) -> None:
-        """Send the twist at `hz` for so long, without a zero first."""
+        """Send the twist at `hz` for `seconds`, without a zero first."""
         for _ in range(round(seconds * hz)):
             self.send(linear, angular, source)
             self.run(1 / hz)
@@ -337,7 +343,7 @@ class World:
         payload: bytes = b"",
         attachment: bytes = b"",
     ) -> list[Reply]:
-        """The replies to a query after one period."""
+        """Send a query and return the replies that came within two periods."""
         self._queries += 1
         name = key if asked is None else asked
         at_ns = self.now_ns
@@ -347,13 +353,13 @@ class World:
         return self.bus.replies.get(query.ticket, [])
 
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
-        """Return a service's answer; a release names the latch of `state`, as our tools do."""
+        """Return a service's answer. Like our tools, a release names the latch of `state`."""
         if service in ("clear", "activate") and not payload:
             payload = msgspec.json.encode({"latch": self.state.latch})
         (reply,) = self.ask(f"srv/{service}", payload=payload)
         return msgspec.json.decode(reply.payload, type=ServiceReply)
 
-    # what people see
+    # observations
 
     @property
     def state(self) -> RobotState:
@@ -368,5 +374,5 @@ class World:
         return message
 
     def lines(self) -> list[bytes]:
-        """The lines the MCU heard, oldest first, bare line ends left out."""
+        """Return the lines that the MCU received, oldest first, without bare line ends."""
         return [line for _, line in self.mcu.heard if line != b"\r\n"]

@@ -121,6 +121,8 @@ class Hands:
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
+        self.source = "teleop"
+        """The source that each command names, as a page does; "" for none."""
         self.heard: list[Any] = []
 
     async def say(self, **message: object) -> None:
@@ -128,7 +130,8 @@ class Hands:
 
     async def drive(self, linear: float, angular: float = 0.0, late_ms: float = 0.0) -> None:
         wish = {"linear_x": linear, "angular_z": angular}
-        await self.say(cmd=wish, stamp=time.time() * 1e3 - late_ms)
+        source = {"source": self.source} if self.source else {}
+        await self.say(cmd=wish, stamp=time.time() * 1e3 - late_ms, **source)
 
     async def hold(self, linear: float, seconds: float, angular: float = 0.0) -> None:
         """Hold a finger on the stick, at 20 Hz."""
@@ -163,7 +166,7 @@ class Hands:
         await holding
         holding = asyncio.create_task(self.hold(linear, PATIENCE_S))
         try:
-            await self.state(lambda s: abs(s["linear"] - linear) < 0.25 * abs(linear))
+            await self.state(lambda s: abs((s["linear"] or 0.0) - linear) < 0.25 * abs(linear))
         finally:
             holding.cancel()
 

@@ -83,7 +83,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """The page of that daemon, over HTTP here and over HTTPS for other hosts."""
     where = tmp_path_factory.mktemp("page")
-    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
+    Authority.make(where / "tls", "test", 1, [NAME]).issue(where / "tls", "robot", [NAME], 1)
     with Page(daemon, where) as page:
         yield page
 

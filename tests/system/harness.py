@@ -820,7 +820,7 @@ class Bus:
 
 
 class Commander:
-    """A client that keeps sending commands, whatever happens to the robot."""
+    """A client that keeps sending commands in every mode of the robot."""
 
     def __init__(self, bus: Bus, key: str, linear: float, angular: float) -> None:
         self.key, self.sender = key, f"commander/{secrets.token_hex(16)}"

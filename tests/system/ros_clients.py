@@ -306,8 +306,12 @@ class Client:
     def key(self, name: str, type_name: str) -> str:
         raise NotImplementedError
 
-    def put(self, name: str, type_name: str, payload: bytes) -> None:
+    def attachment(self) -> bytes | None:
+        """Return the attachment of the next sample, or None for a sample without one."""
         raise NotImplementedError
+
+    def put(self, name: str, type_name: str, payload: bytes) -> None:
+        self.session.put(self.key(name, type_name), payload, attachment=self.attachment())
 
     def call(self, name: str, type_name: str = TRIGGER, payload: bytes = EMPTY_REQUEST) -> Called:
         raise NotImplementedError
@@ -413,9 +417,6 @@ class RmwClient(Client):
         self._sequence += 1
         return Attached(self._sequence, time.time_ns() - int(age * 1e9), self.gid).pack()
 
-    def put(self, name: str, type_name: str, payload: bytes) -> None:
-        self.session.put(self.key(name, type_name), payload, attachment=self.attachment())
-
     def call(
         self,
         name: str,
@@ -444,8 +445,8 @@ class BridgeHalf(Client):
     def key(self, name: str, type_name: str) -> str:
         return self.full(name)
 
-    def put(self, name: str, type_name: str, payload: bytes) -> None:
-        self.session.put(self.key(name, type_name), payload)
+    def attachment(self) -> None:
+        """A bridge sends samples without an attachment."""
 
     def call(self, name: str, type_name: str = TRIGGER, payload: bytes = EMPTY_REQUEST) -> Called:
         attachment = b"rqh" + os.urandom(16) + b"\1"

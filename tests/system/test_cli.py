@@ -24,8 +24,8 @@ from typing import Any
 import pytest
 
 from acsard.client import connect
-from acsard.daemon.bus.quiet import Around
-from acsard.daemon.bus.robot_discovery import around
+from acsard.daemon.bus.robot_discovery import presence
+from acsard.daemon.bus.silent_key import Presence
 from tests.each import each
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -253,13 +253,13 @@ def test_who_waits_for_what_does_not_come_is_told_why_once_and_goes_on_waiting(
 def test_who_waits_sees_that_the_daemon_has_ended(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as robot:
 
-        def seen() -> Around | None:
-            return around(robot.session, "acsar", daemon.endpoint)
+        def seen() -> Presence | None:
+            return presence(robot.session, "acsar", daemon.endpoint)
 
-        assert seen() == Around(linked=True, here=True)
+        assert seen() == Presence(linked=True, here=True)
         daemon.signal(signal.SIGINT)
         daemon.ended(5.0)
-        until(lambda: seen() == Around(linked=False, here=False), 5.0, "that it is gone")
+        until(lambda: seen() == Presence(linked=False, here=False), 5.0, "that it is gone")
 
 
 def test_echo_of_no_messages_prints_none(shared: Daemon) -> None:

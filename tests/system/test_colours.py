@@ -42,9 +42,9 @@ SCREENS = [
     (["top"], WAITS),
     (["top", "--once"], WAITS),
     (["fleet"], WAITS),
+    (["echo", "state"], WAITS),
     (["fleet", "--once"], WAITS),
     (["echo", "state", "--short"], WAITS),
-    (["echo", "state"], WAITS),
     (["doctor"], "configuration"),
     (["recording", "--directory", "."], "no recording"),
     (["run", "--port", "nowhere", "--id", "other"], "nowhere"),
@@ -129,8 +129,9 @@ def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Pa
     [
         ["doctor"], ["top"], ["fleet"], ["echo", "state", "-n1", "--short"],
         ["echo", "odom", "-n1"],
-        ["hz", "odom", "-n2"], ["topics"], ["check"], ["set"], ["whoami"], ["accuracy"],
-        ["get", "nonsense"], ["call", "nonsense"], ["set", "limits.linear_speed", "-1"], ["drive"],
+        ["whoami"], ["topics"], ["check"], ["set"], ["hz", "odom", "-n2"],
+        ["get", "nonsense"], ["accuracy"], ["call", "nonsense"],
+        ["set", "limits.linear_speed", "-1"], ["drive"],
     ],
     ids=" ".join,
 )  # fmt: skip

@@ -23,7 +23,7 @@ from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
 from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, until, wheels
 from tests.system.hosts import Hosts, inside, on
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+pytestmark = pytest.mark.slow
 
 
 async def beside(call: Callable[[], Any]) -> Any:
@@ -201,7 +201,9 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
     hosts: Hosts, tmp_path: Path
 ) -> None:
     """No connection closes, and no program gets an error."""
-    Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", [hosts.address], 1)
+    Authority.make(tmp_path / "tls", "test", 1, [hosts.address]).issue(
+        tmp_path / "tls", "robot", [hosts.address], 1
+    )
 
     def fast(since: float) -> float:
         """Return the speed of a wheel if all of the last lines have it, else 0."""

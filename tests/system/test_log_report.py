@@ -16,7 +16,7 @@ from tests import pictures
 from tests.pictures import LOOKS
 from tests.system.chromium import DESKTOP, PHONE, browsing
 from tests.system.harness import until
-from tests.unit.report.driven import drive_of_two, followed
+from tests.unit.report.driven import drive_of_two, report_from
 from tests.unit.report.test_page import EVIL, clock, evil_steps, origin
 
 BROWSER = shutil.which("chromium")
@@ -36,7 +36,7 @@ def test_it_is_drawn_and_no_strangers_program_runs(tmp_path: Path) -> None:
     assert BROWSER is not None
     path = tmp_path / "evil.html"
     evil = "<script>document.title = 'taken'</script>"
-    text = page(followed(evil_steps()), origin(robot=evil + EVIL), get_plotlyjs(), clock)
+    text = page(report_from(evil_steps()), origin(robot=evil + EVIL), get_plotlyjs(), clock)
     # If the escaping were missing somewhere, the policy would still block the script.
     path.write_text(text.replace("<h1>", f"<h1>{evil}"), encoding="utf-8")
     done = subprocess.run(

@@ -934,7 +934,7 @@ WORDS = """one => one.getAttribute('aria-describedby')?.split(' ')
 
 
 def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> None:
-    Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", [NAME], 1)
+    Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
     settings = {"record": {"directory": str(tmp_path / "record")}}
     there = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
     with Daemon(tmp_path, config=settings) as daemon, Bus(daemon.endpoint) as bus:

@@ -52,7 +52,7 @@ class Stranger:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     where = tmp_path_factory.mktemp("invited")
-    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
+    Authority.make(where / "tls", "test", 1, [NAME]).issue(where / "tls", "robot", [NAME], 1)
     with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         with Page(daemon, where) as server:

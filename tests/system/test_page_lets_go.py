@@ -74,7 +74,9 @@ class Field:
         self.hosts, self.peer, self._where, self._daemon = hosts, peer, where, daemon
         self.longest_s = 3.0
         """The longest time for which the network is cut, s."""
-        Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [hosts.address], 1)
+        Authority.make(where / "tls", "test", 1, [hosts.address]).issue(
+            where / "tls", "robot", [hosts.address], 1
+        )
         self._servers, self._browsers = ExitStack(), ExitStack()
         self.serve()
         self.token = self.server.invite("operator", "phone")

@@ -123,7 +123,6 @@ for arguments in json.loads(sys.argv[1]):
 
 
 @pytest.mark.network
-@pytest.mark.xdist_group("collecting")
 @pytest.mark.timeout(600)
 def test_each_call_that_proves_a_promise_finds_tests() -> None:
     asked = [words for words in promises() if any(word.startswith("tests/") for word in words)]
@@ -240,7 +239,6 @@ def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: 
 
 @pytest.mark.soak
 @pytest.mark.network
-@pytest.mark.xdist_group("installing")
 @pytest.mark.timeout(2 * INSTALL_S)
 def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> None:
     page, venv = "deploy/systemd/README.md", clone.parent / "opt"
@@ -261,7 +259,6 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
 
 
 @pytest.mark.network
-@pytest.mark.xdist_group("installing")
 @pytest.mark.timeout(2 * INSTALL_S)
 def test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs(
     clone: Path,

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 import zenoh
 
@@ -22,6 +21,7 @@ from tests.system.ros_clients import (
     JOINTS,
     LIST,
     ODOMETRY,
+    PAYLOADS,
     PUBLISHED,
     QUICK,
     SERVICES,
@@ -45,7 +45,6 @@ from tests.system.ros_clients import (
     listed,
     make,
     refused_without_motion,
-    released,
     rmw_key,
     settled,
     stamped,
@@ -325,16 +324,6 @@ def test_no_message_is_made_while_no_ros_client_listens(tmp_path: Path) -> None:
         print(f"unheard for 50 periods: {again - last - 1} samples made")
 
 
-def test_a_late_advanced_subscriber_gets_the_static_transforms_at_once(ros: RmwClient) -> None:
-    for _ in range(2):
-        begun = time.monotonic()
-        with ros.follow_late("tf_static", TF) as samples:
-            got = samples.first("tf_static", within=2.0)
-        message = decode(TF, got.payload)
-        assert [t.child_frame_id for t in message.transforms] == ["lidar_link"]
-        assert time.monotonic() - begun < 1.0
-
-
 def test_the_static_transforms_have_the_heartbeat_of_a_late_comer_s_publisher(
     tmp_path: Path,
 ) -> None:
@@ -382,129 +371,33 @@ def test_every_service_is_asked_as_rmw_zenoh_asks_and_answers_once(
             bus.get(f"srv/{verb}")
 
 
-def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: RmwClient) -> None:
-    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
-        states.find(lambda s: (s["linear"] or 0.0) > 0.1 and s["source"] == "nav", 3.0, "it drives")
-        assert ros.call("acsard/stop").trigger()[0]
-        states.find(lambda s: s["mode"] == "stopped" and not any(s["wheels"]), 3.0, "it stands")
-        released(ros)
-        cleared = time.monotonic()
-        lines = bus.count("lines_sent")
-        until(lambda: bus.count("lines_sent") > lines + 20, 3.0, "20 periods")
-        # This sender never sent a zero, so it does not drive on.
-        assert not any(bus.state()["wheels"]), cleared
-    settled(bus)
-
-
-# bad messages are refused and counted, and disturb no other client
-
-
-class Bad(NamedTuple):
-    """The way to send it, the counter of its refusal, and a word of the logged reason."""
-
-    send: Callable[[RmwClient], None]
-    reason: str
-    said: str
-
-
-def raw(
-    payload: bytes,
-    attachment: bytes | None = None,
-    *,
-    kind: str = TWIST,
-    topic: str = "cmd_vel",
-    bare: bool = False,
-) -> Callable[[RmwClient], None]:
-    def send(ros: RmwClient) -> None:
-        attached = None if bare else attachment or ros.attachment()
-        ros.session.put(ros.key(topic, kind), payload, attachment=attached)
-
-    return send
-
-
-def delete(topic: str, kind: str) -> Callable[[RmwClient], None]:
-    return lambda ros: ros.session.delete(ros.key(topic, kind), attachment=ros.attachment())
-
-
-def nan_on(index: int) -> bytes:
-    values = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
-    values[index] = float("nan")
-    return b"\0\1\0\0" + struct.pack("<6d", *values)
+# bad attachments, keys and requests are refused and counted, and disturb no other client
 
 
 GO = twist(0.5)
 NOW = Attached(1, time.time_ns(), bytes(16)).pack()
 
-BAD = {
-    "no attachment": Bad(raw(GO, bare=True), "no_attachment", "attachment"),
-    "no attachment, stamped": Bad(
-        raw(stamped(0.5), bare=True, kind=STAMPED), "no_attachment", "attachment"
-    ),
-    "no attachment, joints": Bad(
-        raw(joints(6.0), bare=True, kind=JOINTS, topic="joint_commands"),
-        "no_attachment", "attachment",
-    ),
-    "the bridge's attachment": Bad(raw(GO, b"rqh" + bytes(17)), "bad_attachment", "20 bytes"),
-    "a GID too short": Bad(raw(GO, NOW[:16] + b"\x0f" + bytes(16)), "bad_attachment", "15"),
-    "a GID too long": Bad(raw(GO, NOW[:16] + b"\x11" + bytes(17)), "bad_attachment", "34"),
-    "one byte short": Bad(raw(GO, NOW[:-1]), "bad_attachment", "32"),
-    "an attachment of 60 kB": Bad(raw(GO, bytes(60_000)), "bad_attachment", "instead of 33"),
-    "a twist cut short": Bad(raw(GO[:-1]), "malformed", "ends after 51"),
-    "a header only": Bad(raw(GO[:4]), "malformed", "ends after 4"),
-    "half a header": Bad(raw(GO[:2]), "malformed", "header"),
-    "nothing": Bad(raw(b""), "malformed", "header"),
-    "parameter-list CDR": Bad(raw(b"\0\3" + GO[2:]), "malformed", "header"),
-    "XCDR2": Bad(raw(b"\0\7" + GO[2:]), "malformed", "header"),
-    "JSON": Bad(raw(b'{"linear":{"x":0.5},"angular":{}}'), "malformed", "header"),
-    "a stamped twist cut short": Bad(raw(stamped(0.5)[:-1], kind=STAMPED), "malformed", "ends"),
-    "a frame without end": Bad(
-        raw(stamped(0.5)[:12] + b"\xff\xff\xff\x7f" + stamped(0.5)[16:], kind=STAMPED),
-        "malformed", "length of 2147483647",
-    ),
-    "a frame that is no text": Bad(
-        raw(stamped(0.5).replace(b"base_link", b"\xff" * 9), kind=STAMPED), "malformed", "UTF-8"
-    ),
-    "5 kB": Bad(raw(GO + bytes(5000)), "too_big", "bytes"),
-    "NaN": Bad(raw(nan_on(0)), "not_finite", "NaN"),
-    "NaN on an axis that is ignored": Bad(raw(nan_on(4)), "not_finite", "NaN"),
-    "infinity": Bad(raw(twist(float("inf"))), "not_finite", "infinity"),
-    "a wheel at NaN": Bad(
-        raw(joints(float("nan")), kind=JOINTS, topic="joint_commands"), "not_finite", "NaN"
-    ),
-    "a wheel missing": Bad(
-        raw(joints(6.0, WHEELS[:3]), kind=JOINTS, topic="joint_commands"),
-        "wrong_wheels", "rear_right",
-    ),
-    "joints cut short": Bad(
-        raw(joints(6.0)[:-9], kind=JOINTS, topic="joint_commands"), "malformed", "length of 4"
-    ),
-    "a DELETE": Bad(delete("cmd_vel", TWIST), "not_a_put", "DELETE"),
-    "a DELETE of joints": Bad(delete("joint_commands", JOINTS), "not_a_put", "DELETE"),
-}  # fmt: skip
+ATTACHED = {
+    "none": (b"", "no_attachment", "attachment"),
+    "the bridge's": (b"rqh" + bytes(17), "bad_attachment", "20 bytes"),
+    "a GID too short": (NOW[:16] + b"\x0f" + bytes(16), "bad_attachment", "15"),
+    "a GID too long": (NOW[:16] + b"\x11" + bytes(17), "bad_attachment", "34"),
+    "one byte short": (NOW[:-1], "bad_attachment", "32"),
+    "60 kB": (bytes(60_000), "bad_attachment", "instead of 33"),
+}
+"""Attachments with the counter of the refusal and a word of the logged reason."""
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_a_bad_command_is_counted_and_said_and_moves_nothing(
+@pytest.mark.parametrize("name", ATTACHED)
+def test_a_command_with_a_wrong_attachment_is_counted_and_reported_and_moves_nothing(
     bus: Bus, ros: RmwClient, name: str
 ) -> None:
-    bad = BAD[name]
+    attachment, reason, said = ATTACHED[name]
     ros.zeros(bus)
-    refused_without_motion(bus, lambda: bad.send(ros), bad.reason, bad.said)
-
-
-@pytest.mark.parametrize("key", ["0/cmd_vel/**", "*/cmd_vel/*/*", "0/**", "**"])
-def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: RmwClient, key: str) -> None:
-    ros.zeros(bus)
-    before = bus.state()
-    bus.session.put(key, GO, attachment=ros.attachment())
-    bus.session.delete(key, attachment=ros.attachment())
-    behind(bus, lambda: raw(GO, bare=True)(ros), "no_attachment")
-    after = bus.state()
-    # Either the access rules keep it out, or the daemon's code refuses it.
-    assert changes(before, after).keys() <= {"command_no_attachment", "command_wildcard"}
-    assert (after["x"], after["wheels"]) == (before["x"], before["wheels"])
-    if after["mode"] == "stopped":  # "**" includes `stop`
-        bus.get("srv/clear")
+    key = ros.key("cmd_vel", TWIST)
+    refused_without_motion(
+        bus, lambda: ros.session.put(key, GO, attachment=attachment or None), reason, said
+    )
 
 
 def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: RmwClient) -> None:
@@ -658,51 +551,19 @@ def test_of_many_calls_at_once_every_one_is_answered(
     bus.state()
 
 
-@pytest.mark.parametrize("way", ["rmw", "bridge"])
-def test_a_parameter_is_set_by_both_ways_as_by_anybody(bus: Bus, way: str) -> None:
-    client: Client = RmwClient(bus.session) if way == "rmw" else BridgeHalf(bus.session)
-
-    def ask(value: float) -> Any:
-        none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "string_value": ""}
-        lists = ("byte_array", "bool_array", "integer_array", "double_array", "string_array")
-        none |= {f"{kind}_value": np.array([]) for kind in lists}
-        double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
-        wish = make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
-        request = encode(make("rcl_interfaces/msg/SetRequest", parameters=[wish]))
-        name = "acsard/set_parameters"
-        (reply,) = client.call(name, SERVICES[name], request).replies
-        return decode("rcl_interfaces/msg/SetReply", reply.payload).results[0]
-
-    before = bus.get("config")["limits"]["linear_speed"]
-    try:
-        assert ask(0.6).successful
-        assert bus.get("config")["limits"]["linear_speed"] == 0.6
-        refused = ask(60.0)
-        assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
-        assert bus.get("config")["limits"]["linear_speed"] == 0.6
-    finally:
-        assert ask(before).successful
-
-
-def test_a_query_on_all_keys_of_ros_stops_nothing(bus: Bus, ros: RmwClient) -> None:
-    before = bus.state()
-    for key in ("0/**", "0/acsard/*/std_srvs::srv::dds_::Trigger_/*", "**"):
-        for _ in bus.session.get(key, payload=EMPTY_REQUEST, attachment=ros.attachment()):
-            pass
-    after = bus.state()
-    assert after["mode"] != "stopped"
-    assert changes(before, after) == {}
-
-
 def test_a_topic_of_a_source_that_is_not_listed_is_refused(tmp_path: Path) -> None:
     only = {"[commands.sources]": {"name": "teleop", "priority": 9, "timeout": 0.25}}
     with Daemon(tmp_path, config=only) as daemon, Bus(daemon.endpoint) as bus:
         ros = RmwClient(bus.session)
         bus.linked()
         ros.heard(bus, "cmd_vel_teleop", TWIST, twist(0.0))
-        wheels = raw(joints(6.0), kind=JOINTS, topic="joint_commands")
-        refused_without_motion(bus, lambda: raw(GO)(ros), "unknown_source", "commands.sources")
-        refused_without_motion(bus, lambda: wheels(ros), "unknown_source", "ros2_control")
+        for topic, kind, said in (
+            ("cmd_vel", TWIST, "commands.sources"),
+            ("joint_commands", JOINTS, "ros2_control"),
+        ):
+            payload = PAYLOADS[kind](0.5)
+            send = partial(ros.put, topic, kind, payload)
+            refused_without_motion(bus, send, "unknown_source", said)
 
 
 def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:

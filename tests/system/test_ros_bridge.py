@@ -5,13 +5,11 @@ from __future__ import annotations
 import shutil
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
-from acsard.core.motion.lifecycle import LOOK_FIRST_S
 from tests.system.harness import Bus, Daemon, Program, until
 from tests.system.ros_clients import (
     DDS,
@@ -21,23 +19,15 @@ from tests.system.ros_clients import (
     PUBLISHED,
     QUICK,
     SERVICES,
-    STAMPED,
-    TF,
-    TRIGGER,
-    TRIGGERS,
     TWIST,
-    WHEELS,
     Bridge,
     BridgeHalf,
     Relay,
     RmwClient,
-    behind,
     changes,
     decode,
-    joints,
     listed,
     refused_without_motion,
-    released,
     session_at,
     stamped,
     twist,
@@ -60,16 +50,6 @@ def ros(bus: Bus) -> BridgeHalf:
     return BridgeHalf(bus.session)
 
 
-@pytest.fixture
-def restored(bus: Bus) -> Iterator[None]:
-    """Leave the shared robot at rest and at the origin."""
-    yield
-    for verb in ("clear", "activate"):
-        bus.get(f"srv/{verb}")
-    bus.at_rest()
-    bus.get("srv/reset_odometry")
-
-
 # the bridge's Zenoh half
 
 
@@ -83,46 +63,6 @@ def test_the_odometry_comes_as_plain_cdr(ros: BridgeHalf) -> None:
     assert stamp.sec + stamp.nanosec / 1e9 == pytest.approx(time.time(), abs=5.0)
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_every_topic_reaches_a_bridge(ros: BridgeHalf, name: str) -> None:
-    kind, _, late = PUBLISHED[name]
-    with (ros.follow_late if late else ros.follow)(name, kind) as samples:
-        decode(kind, samples.first(name).payload)
-
-
-def test_a_route_that_is_made_late_gets_the_static_transforms_at_once(ros: BridgeHalf) -> None:
-    for _ in range(2):
-        begun = time.monotonic()
-        with ros.follow_late("tf_static", TF) as samples:
-            got = samples.first("tf_static", within=2.0)
-        assert [t.child_frame_id for t in decode(TF, got.payload).transforms] == ["lidar_link"]
-        assert time.monotonic() - begun < 1.0
-
-
-COMMANDS = {
-    "Twist": ("cmd_vel", TWIST, 0.3, "nav"),
-    "TwistStamped": ("cmd_vel_teleop", STAMPED, 0.3, "teleop"),
-    "JointState": ("joint_commands", JOINTS, 6.0, "ros2_control"),
-}
-
-
-@pytest.mark.usefixtures("restored")
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_of_each_type_drives_the_robot(bus: Bus, ros: BridgeHalf, name: str) -> None:
-    topic, kind, amount, source = COMMANDS[name]
-    with ros.follow("odom", ODOMETRY) as odometry, ros.follow("joint_states", JOINTS) as wheels:
-        with ros.driving(bus, topic, kind, amount):
-            odometry.first("motion", lambda s: _speed(s.payload) > 0.2)
-            assert bus.state()["source"] == source
-        turning = decode(JOINTS, wheels.seen[-1].payload)
-    assert sorted(turning.name) == sorted(WHEELS)
-    assert all(speed > 3.0 for speed in turning.velocity)
-
-
-def _speed(payload: bytes) -> float:
-    return float(decode(ODOMETRY, payload).twist.twist.linear.x)
-
-
 def test_a_twist_has_52_bytes_and_a_stamped_one_more(bus: Bus, ros: BridgeHalf) -> None:
     plain = twist(0.0)
     assert (len(plain), len(stamped(0.0))) == (52, 76)
@@ -134,124 +74,29 @@ def test_a_twist_has_52_bytes_and_a_stamped_one_more(bus: Bus, ros: BridgeHalf) 
     assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
 
 
-@pytest.mark.usefixtures("restored")
-def test_a_person_at_teleop_is_followed_before_the_navigation(bus: Bus, ros: BridgeHalf) -> None:
-    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
-        states.find(
-            lambda s: s["source"] == "nav" and (s["linear"] or 0.0) > 0.1, 3.0, "nav drives"
-        )
-        with ros.driving(bus, "cmd_vel_teleop", TWIST, -0.2):
-            states.find(
-                lambda s: s["source"] == "teleop" and (s["linear"] or 0.0) < -0.1,
-                3.0,
-                "teleop drives",
-            )
-        let_go = time.monotonic()
-        states.find(
-            lambda s: s["source"] == "nav" and (s["linear"] or 0.0) > 0.1,
-            3.0,
-            "nav again",
-            after=let_go,
-        )
-
-
-@pytest.mark.parametrize("request_bytes", [b"\0\1\0\0", b"\0\1\0\0\0", b"\0\1\0\0\0\0\0\0"])
-@pytest.mark.parametrize("verb", TRIGGERS)
-def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
-    bus: Bus, ros: BridgeHalf, verb: str, request_bytes: bytes
-) -> None:
-    if verb == "clear":
-        bus.get("srv/stop")
-        # A Trigger has no latch number, so it only works 2 s after a stop.
-        stopped = time.monotonic()
-        until(lambda: time.monotonic() > stopped + LOOK_FIRST_S, 5.0, "two seconds")
-    called = ros.call(f"acsard/{verb}", TRIGGER, request_bytes)
-    for undo in ("clear", "activate"):
-        bus.get(f"srv/{undo}")
-    success, message = called.trigger()
-    assert success, message
-    assert called.seconds < 1.0
-    assert called.replies[0].attachment == b""
-
-
-@pytest.mark.usefixtures("restored")
-def test_a_stop_stops_until_clear(bus: Bus, ros: BridgeHalf) -> None:
-    assert ros.call("acsard/stop").trigger()[0]
-    assert bus.state()["mode"] == "stopped"
-    success, message = ros.call("acsard/clear").trigger()
-    assert not success
-    assert "look at the robot, then call /acsard/clear again 2 s after that" in message
-    released(ros)
-    assert bus.state()["mode"] == "ready"
-
-
 # bad messages
-
-
-class Bad(NamedTuple):
-    """The way to send it, the counter of its refusal, and a word of the logged reason."""
-
-    send: Callable[[BridgeHalf], None]
-    reason: str
-    said: str
-
-
-def raw(payload: bytes, topic: str = "cmd_vel") -> Callable[[BridgeHalf], None]:
-    return lambda ros: ros.session.put(topic, payload)
-
-
-def delete(topic: str) -> Callable[[BridgeHalf], None]:
-    return lambda ros: ros.session.delete(topic)
 
 
 GO = twist(0.5)
 
 BAD = {
-    "a twist cut short": Bad(raw(GO[:-1]), "malformed", "ends after 51"),
-    "a stamped twist cut short": Bad(raw(stamped(0.5)[:-1]), "malformed", "ends after 75"),
-    "between both": Bad(raw(GO + bytes(8)), "wrong_shape", "neither a Twist"),
-    "nothing": Bad(raw(b""), "malformed", "header"),
-    "JSON": Bad(raw(b'{"linear":{"x":0.5},"angular":{}}'), "malformed", "header"),
-    "5 kB": Bad(raw(GO + bytes(5000)), "too_big", "bytes"),
-    "NaN": Bad(raw(twist(float("nan"))), "not_finite", "NaN"),
-    "NaN, big endian": Bad(
-        raw(b"\0\0\0\0" + struct.pack(">6d", 0.5, 0, 0, 0, 0, float("nan"))), "not_finite", "NaN"
+    "between both": ("cmd_vel", GO + bytes(8), "wrong_shape", "neither a Twist"),
+    "NaN, big endian": (
+        "cmd_vel", b"\0\0\0\0" + struct.pack(">6d", 0.5, 0, 0, 0, 0, float("nan")),
+        "not_finite", "NaN",
     ),
-    "a wheel missing": Bad(
-        raw(joints(6.0, WHEELS[:3]), "joint_commands"), "wrong_wheels", "rear_right"
-    ),
-    "a wheel of another robot": Bad(
-        raw(joints(6.0, [*WHEELS[:3], "wheel_4"]), "joint_commands"), "wrong_wheels", "rear_right"
-    ),
-    "a twist for joints": Bad(raw(GO, "joint_commands"), "malformed", ""),
-    "a DELETE": Bad(delete("cmd_vel"), "not_a_put", "DELETE"),
-    "a DELETE of teleop's": Bad(delete("cmd_vel_teleop"), "not_a_put", "DELETE"),
-}
+    "a twist for joints": ("joint_commands", GO, "malformed", ""),
+}  # fmt: skip
+"""The topic, the payload, the counter of the refusal and a word of the logged reason."""
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_command_is_counted_and_said_and_moves_nothing(
+def test_a_payload_of_no_type_is_counted_and_reported_and_moves_nothing(
     bus: Bus, ros: BridgeHalf, name: str
 ) -> None:
-    bad = BAD[name]
+    topic, payload, reason, said = BAD[name]
     ros.zeros(bus)
-    refused_without_motion(bus, lambda: bad.send(ros), bad.reason, bad.said)
-
-
-@pytest.mark.parametrize("key", ["cmd_vel$*", "*", "**"])
-def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: BridgeHalf, key: str) -> None:
-    ros.zeros(bus)
-    before = bus.state()
-    bus.session.put(key, GO)
-    bus.session.delete(key)
-    behind(bus, lambda: bus.session.put("cmd_vel", b""), "malformed")
-    after = bus.state()
-    # Either the access rules keep it out, or the daemon's code refuses it.
-    mine = {"command_malformed", "command_wildcard", "command_no_attachment"}
-    assert changes(before, after).keys() <= mine
-    assert (after["x"], after["wheels"]) == (before["x"], before["wheels"])
-    if after["mode"] == "stopped":  # "**" includes `stop`
-        bus.get("srv/clear")
+    refused_without_motion(bus, lambda: ros.session.put(topic, payload), reason, said)
 
 
 def test_an_attachment_means_nothing_here(bus: Bus, ros: BridgeHalf) -> None:
@@ -263,18 +108,12 @@ def test_an_attachment_means_nothing_here(bus: Bus, ros: BridgeHalf) -> None:
     assert changes(before, bus.state()) == {"commands": 3}
 
 
+def test_a_reply_has_no_attachment(ros: BridgeHalf) -> None:
+    assert ros.call("acsard/reset_odometry").replies[0].attachment == b""
+
+
 def _more(bus: Bus, before: int) -> None:
     until(lambda: bus.count("commands") > before, 3.0, "one more command")
-
-
-def test_a_query_on_every_key_stops_nothing(bus: Bus) -> None:
-    before = bus.state()
-    for key in ("acsard/*", "**", "acsard/stop/**", "*/stop"):
-        for _ in bus.session.get(key, payload=b"\0\1\0\0"):
-            pass
-    after = bus.state()
-    assert after["mode"] != "stopped"
-    assert changes(before, after) == {}
 
 
 def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:

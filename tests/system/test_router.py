@@ -96,5 +96,7 @@ def test_one_that_lacks_its_certificates_ends_with_a_sentence(where: Path) -> No
     (where / ITS_NAME / "key.pem").unlink()
     with watched_router(where, free_tls_endpoint()) as router:
         assert router.ended(10.0) == 78
-        assert [line for line in router.err if "private key" in line and "in place" in line]
+        assert [
+            line for line in router.err if "private key" in line and "provide the files" in line
+        ]
         assert "gateway" not in router.stderr

@@ -26,7 +26,7 @@ ALL_NAMES = ["localhost", "127.0.0.1"]
 def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An authority with a client's certificate, one that has expired, and another authority's."""
     place = tmp_path_factory.mktemp("tls")
-    ours = Authority.make(place / "ca", "ours", 10)
+    ours = Authority.make(place / "ca", "ours", 10, ["robot.example"])
     ours.issue(place / "client", "client", [], 1)
     ours.issue(place / "ended", "client", [], -1)
     ours.issue(place / "robot", "robot", ALL_NAMES, 1)
@@ -97,8 +97,11 @@ def test_the_directory_is_looked_at_before_the_network(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("robot_has", "sentence"),
     [
-        ("robot ended", "the certificate of 127.0.0.1 has expired, by this machine's clock"),
-        ("robot later", "is not valid yet, by this machine's clock"),
+        (
+            "robot ended",
+            "of 127.0.0.1 has expired, according to this machine's clock",
+        ),
+        ("robot later", "is not valid yet, according to this machine's clock"),
         ("robot elsewhere", "tls renew --address 127.0.0.1"),
     ],
 )
@@ -116,7 +119,7 @@ def test_what_is_wrong_with_the_robot_s_certificate(
     ("shown", "sentence"),
     [
         ("stranger", "comes from another authority than"),
-        ("mixed", "it comes from another authority than the robot's"),
+        ("mixed", "comes from another authority than the robot's"),
         ("ended", "has expired or is not valid yet"),
     ],
 )

@@ -53,10 +53,10 @@ def place(
         yield Place(daemon, tool)
 
 
-def test_top_says_how_long_ago_it_heard_of_it_and_how_often_lines_come(place: Place) -> None:
+def test_top_says_how_long_ago_the_robot_was_seen_and_how_often_lines_come(place: Place) -> None:
     def rates() -> list[float]:
         told = place.tool("top", "--once").out
-        assert re.search(r"heard \d+\.\d s ago", told), told
+        assert re.search(r"seen \d+\.\d s ago", told), told
         return [float(one) for one in re.findall(r"(\d+\.\d)/s of", told)]
 
     found = until(rates, 20.0, "how often lines come")

@@ -70,7 +70,7 @@ CROWDS: dict[str, tuple[str, int, Sequence[str]]] = {
 def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
     where = tmp_path_factory.mktemp("crowds")
     names = [ROBOT_AT, ROBOT_6]
-    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", names, 1)
+    Authority.make(where / "tls", "test", 1, names).issue(where / "tls", "robot", names, 1)
     return where
 
 

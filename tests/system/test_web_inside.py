@@ -13,13 +13,13 @@ import pytest
 from aiohttp.test_utils import TestServer
 
 from acsard.client import Client
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, WebConfig
 from acsard.core.messages.signature import MOST
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
-from acsard.web.app import Page
+from acsard.web.app import DEFAULT, Page
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
@@ -39,13 +39,13 @@ pytestmark = pytest.mark.network
 MISSED = 50
 """Messages at 50 a second that one client does not read."""
 
-ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
+ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
 class Inside:
     """The whole server without a connection to a robot, which a test opens if it needs one."""
 
-    def __init__(self, where: Path) -> None:
+    def __init__(self, where: Path, rules: WebConfig = DEFAULT) -> None:
         self.counts = Counts()
 
         def connect() -> Client:
@@ -57,7 +57,7 @@ class Inside:
         self.page = Page(
             self.robots, self.hand, Calls(self.robots), self.fleet, self.counts,
             Vault(where, "acsar"), frozenset(), self.acceptor,
-            Guide(Reach("", "", "acsar", ""), "sim"),
+            Guide(Reach("", "", "acsar", ""), "sim"), rules=rules,
         )  # fmt: skip
 
     @asynccontextmanager
@@ -235,5 +235,90 @@ def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
         inside.hand.outbox.dead.set_exception(MemoryError("no room"))
         with pytest.raises(MemoryError):
             await _until(asyncio.Event(), inside.robots, inside.hand, inside.page, wanted)
+
+    run(story)
+
+
+def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
+    inside = Inside(tmp_path, WebConfig(local="operator"))
+
+    async def story() -> None:
+        async with inside.hands() as ours:
+            hello = (await ours.find(lambda said: "hello" in said))["hello"]
+            assert hello["role"] == "operator"
+            assert {"set", "begin"} <= hello["barred"].keys()
+            assert not (await ours.call("set", settings={}))["ok"]
+        assert inside.counts.refused() == {"role": 1}
+
+    run(story)
+
+
+DASHBOARD = "http://127.0.0.1:5173"
+
+
+@pytest.fixture
+def shared(tmp_path: Path) -> Inside:
+    return Inside(tmp_path, WebConfig(origins=(DASHBOARD,)))
+
+
+def test_a_page_of_a_listed_origin_may_ask_and_read_and_any_other_may_not(shared: Inside) -> None:
+    """Another page of this machine, and the robot's own, are tried as well."""
+
+    async def story() -> None:
+        async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
+            place, own = server.make_url("/api/srv/stop"), f"http://127.0.0.1:{server.port}"
+            for origin, status, readable in [
+                (DASHBOARD, 409, DASHBOARD),  # there is no robot to stop
+                ("http://127.0.0.1:5174", 403, None),
+                ("http://localhost:5173", 403, None),
+                ("https://127.0.0.1:5173", 403, None),
+                ("null", 403, None),
+                (own, 409, None),
+            ]:
+                told = {"Origin": origin, "Sec-Fetch-Site": "same-site"}
+                if origin == own:
+                    told["Sec-Fetch-Site"] = "same-origin"
+                async with session.post(place, headers=told) as answer:
+                    assert answer.status == status, origin
+                    assert answer.headers.get("Access-Control-Allow-Origin") == readable
+                    assert "Access-Control-Allow-Credentials" not in answer.headers
+                    assert answer.headers["Vary"] == "Origin"
+
+    run(story)
+
+
+def test_a_browser_learns_what_a_page_of_a_listed_origin_may_send(shared: Inside) -> None:
+    async def story() -> None:
+        async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
+            place = server.make_url("/api/srv/clear")
+            asked = {"Access-Control-Request-Method": "POST"}
+            async with session.options(place, headers=asked | {"Origin": DASHBOARD}) as answer:
+                assert answer.status == 204
+                assert answer.headers["Access-Control-Allow-Origin"] == DASHBOARD
+                assert "Authorization" in answer.headers["Access-Control-Allow-Headers"]
+            for strange in ({"Origin": "http://evil.example"}, {}):
+                async with session.options(place, headers=asked | strange) as answer:
+                    assert answer.status in (403, 405)
+                    assert "Access-Control-Allow-Origin" not in answer.headers
+            evil = asked | {"Origin": DASHBOARD, "Host": "evil.example"}
+            async with session.options(place, headers=evil) as answer:
+                assert answer.status == 403
+
+    run(story)
+
+
+def test_a_page_of_a_listed_origin_opens_the_socket_and_exchanges_no_link(shared: Inside) -> None:
+    async def story() -> None:
+        async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
+            place, told = server.make_url("/ws"), {"Origin": DASHBOARD}
+            async with session.ws_connect(place, headers=told) as opened:
+                assert "hello" in (await opened.receive()).data
+            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+                await session.ws_connect(place, headers={"Origin": "http://127.0.0.1:5174"})
+            assert caught.value.status == 403
+            url = server.make_url("/token")
+            async with session.post(url, json={"token": "x"}, headers=told) as answer:
+                assert answer.status == 403
+                assert "origin" in (await answer.json())["error"]
 
     run(story)

@@ -19,6 +19,7 @@ import aiohttp
 import pytest
 import websockets
 
+from acsard.core.values import ROLES, Role
 from acsard.web.limits import (
     CONNECTIONS_ALIKE,
     CONNECTIONS_HERE,
@@ -119,6 +120,34 @@ def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(pag
     run(story)
     assert "lent" not in page.tokens("--tokens")
     assert token not in page.stdout + page.stderr
+
+
+def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(page: Page) -> None:
+    token = {role: page.invite(role, f"my-{role}") for role in ROLES}
+
+    async def story() -> None:
+        async with page.client() as phone:
+
+            async def opens(role: Role, replace: bool = False) -> tuple[int, str]:
+                """Return the status and whose cookie the browser has then."""
+                form = {"token": token[role], "replace": replace}
+                url = f"{page.away}/token"
+                async with phone.post(url, json=form, allow_redirects=False) as answer:
+                    status, told = answer.status, await answer.text()
+                assert status == 303 or "my-operator (operator) here" in told
+                async with phone.get(f"{page.away}/api/whoami") as answer:
+                    return status, (await answer.json())["role"]
+
+            assert await opens("operator") == (303, "operator")
+            assert await opens("viewer") == (409, "operator")
+            assert await opens("operator") == (303, "operator")
+            assert await opens("maintainer") == (303, "maintainer")
+            assert await opens("operator", replace=True) == (303, "operator")
+            assert await opens("viewer", replace=True) == (303, "viewer")
+            page.vault.revoke("my-viewer")
+            assert await opens("operator") == (303, "operator")
+
+    run(story)
 
 
 def test_two_pages_on_one_host_leave_each_other_s_phones_in(

@@ -207,7 +207,7 @@ def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare:
     done = bare.run(ACSARD, "service", "install")
     assert done.code == 0, done.err + bare.messages()
     until(lambda: FORMER in asks(bare, "/api/recordings"), 20.0, "what was recorded before")
-    until(lambda: "being written" in asks(bare, "/api/recordings"), 20.0, "what is recorded now")
+    until(lambda: "being recorded" in asks(bare, "/api/recordings"), 20.0, "what is recorded now")
     fetched = f"http://127.0.0.1:8080/api/recordings/{FORMER}"
     given = bare.run("python3", "-c", FETCHED, fetched).out.strip()
     assert given == hashlib.sha256(recording).hexdigest()

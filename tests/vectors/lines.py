@@ -55,7 +55,7 @@ REFUSED: list[tuple[bytes, str]] = [
     (b"p12.50,bn08.75,cp15.00,dn10.25", "malformed"),
     (b"ap12.50,bn08.75,cp15.00,dn10", "malformed"),
     (b"ap12.50,bn08.75,cp15.00,dn10.", "malformed"),
-    # what is not a motor, not a direction
+    # letters that name neither a motor nor a direction
     (b"ep12.50,bn08.75,cp15.00,dn10.25", "malformed"),
     (b"Ap12.50,bn08.75,cp15.00,dn10.25", "malformed"),
     (b"ax12.50,bn08.75,cp15.00,dn10.25", "malformed"),
@@ -63,7 +63,7 @@ REFUSED: list[tuple[bytes, str]] = [
     (b"a12.50,bn08.75,cp15.00,dn10.25", "malformed"),
     (b"a+12.50,bn08.75,cp15.00,dn10.25", "malformed"),
     (b"ap-2.50,bn08.75,cp15.00,dn10.25", "malformed"),
-    # what is not a number of this shape
+    # numbers of another shape
     (b"ap100.00,bn08.75,cp15.00,dn10.25", "malformed"),
     (b"ap012.50,bn08.75,cp15.00,dn10.25", "malformed"),
     (b"ap12.5000,bn08.75,cp15.00,dn10.25", "malformed"),

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.core.values import Role
 
 Name = Annotated[
     str,
@@ -65,6 +66,19 @@ WebAddress = Annotated[
         extra={
             "unit": "http(s)://, an address, a colon and a port",
             "example": "http://127.0.0.1:8080",
+        },
+    ),
+]
+WebOrigin = Annotated[
+    str,
+    Meta(
+        pattern=(
+            r"^(?!http://.*:80\Z|https://.*:443\Z)"
+            r"https?://(\[[0-9a-f:.]{2,45}\]|[a-z0-9.-]{1,253})(:[0-9]{1,5})?\Z"
+        ),
+        extra={
+            "unit": "http(s):// and a host in lower case, and a port unless it is 80 or 443",
+            "example": "http://127.0.0.1:5173",
         },
     ),
 ]
@@ -321,6 +335,8 @@ class WebConfig(Struct, frozen=True):
     address: Annotated[tuple[WebAddress, ...], Meta(min_length=1, max_length=8)] = (
         "http://127.0.0.1:8080",
     )
+    local: Role = "maintainer"
+    origins: Annotated[tuple[WebOrigin, ...], Meta(max_length=16)] = ()
 
 
 class SimConfig(Struct, frozen=True):

@@ -165,8 +165,8 @@ class EchoDetector:
 
     def forget(self) -> None:
         """Start over: the port has been opened."""
-        self._sent: deque[tuple[int, bytes]] = deque(maxlen=LINES)
-        """The last lines, each with its number."""
+        self._sent: deque[bytes] = deque(maxlen=LINES)
+        """The last lines, of which the newest has the number `_lines`."""
         self._lines = self._reports = 0
         self._runs: dict[int, _Run] = {}
         """By the number of a report minus that of its line, which no delay of an echo changes."""
@@ -174,14 +174,17 @@ class EchoDetector:
     def left(self, line: bytes) -> None:
         """Note that this line left, with its end."""
         self._lines += 1
-        self._sent.append((self._lines, line.removesuffix(b"\r\n")))
+        self._sent.append(line.removesuffix(b"\r\n"))
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
         """Take a report without its end, and the speeds in it; return whether it is an echo."""
         self._reports += 1
         runs: dict[int, _Run] = {}
+        if line not in self._sent:
+            self._runs = runs
+            return False
         first, found = (0, 0.0, speeds), False
-        for number, sent in self._sent:
+        for number, sent in enumerate(self._sent, self._lines - len(self._sent) + 1):
             if line == sent:
                 offset = self._reports - number
                 equal, change, before = self._runs.get(offset, first)

@@ -126,7 +126,7 @@ class McuSession:
         if port_open:
             for piece in received:
                 feedback += self._read(piece)
-            more = self._lines.too_long - self.rejects.get("too_long", 0)
+            more = self._lines.too_long - self.rejects.get("too_long", 0) if received else 0
             if more > 0:
                 self._reject("too_long", more=more)
                 self._bad()

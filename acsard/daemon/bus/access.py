@@ -1,16 +1,18 @@
-"""Makes Zenoh's access rules, default deny, from the table of keys and roles and the ROS names.
+"""Makes Zenoh's access rules from the table of keys and roles, and from the ROS names.
+
+Zenoh denies every message that no rule allows.
 
 - Zenoh checks the rules at the end of a link: at the daemon's session or, over TLS, at the session
-  of the TLS gateway. It sees only the neighbour on that link, so a client behind a router has the
-  rights of the router.
-- A rule holds for each key expression that it includes. A query with a wildcard therefore needs a
-  rule with a wildcard.
-- A client over TLS gets exact keys only, because a few wildcards can take Zenoh's time without
-  bound.
-- The daemon checks each message again in code: exact key, kind PUT, listed source.
+  of the TLS gateway. It knows only the neighbour on that link, so a client behind a router has the
+  permissions of the router.
+- A rule allows a key expression if one of the rule's key expressions includes it. A query with a
+  wildcard therefore needs a rule with a wildcard.
+- A client over TLS may use exact keys only, because a few wildcards can take all the time of Zenoh.
+- The daemon checks each message again: the exact key, the kind PUT and the source.
 
-Zenoh does not tell the daemon which certificate a sample came with. The rules do it instead: each
-certificate that commands has keys of its own, which end with its name.
+Zenoh does not tell the daemon with which certificate a sample came. Therefore each certificate that
+may command has keys of its own, which end with the certificate's name, and the rules let no other
+certificate put on these keys.
 """
 
 from __future__ import annotations
@@ -33,10 +35,13 @@ from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, 
 from acsard.core.values import ROLES, ROOT, Role
 
 LOCAL_LINKS = ("tcp",)
-"""Links without a certificate. They do not leave the machine unless `bus.insecure` lets them."""
+"""Protocols of links without a certificate.
+
+Such links connect programs of one machine, unless `bus.insecure` allows others.
+"""
 
 TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
-"""The liveliness tokens of the ROS trees."""
+"""Key expressions of the liveliness tokens of ROS."""
 
 SPOKEN = (
     "declare_subscriber",
@@ -46,35 +51,35 @@ SPOKEN = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
-"""The messages that a daemon sends by itself: data, answers and its declarations."""
+"""Zenoh's names of the messages that a daemon sends, besides its data."""
 
 EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
 DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_ROLE))
-"""The roles whose certificates command."""
+"""The roles whose certificates may command."""
 
 
 def _grants(role: Role) -> tuple[str, ...]:
-    """Return the rules of a role: those of its own keys and those of the roles below it.
+    """Return the names of a role's rules: for its own keys, and for those of lower roles.
 
-    A router is a maintainer: it forwards the tokens of other daemons.
+    A router has the role maintainer. Only this role may forward the tokens of other daemons.
     """
     own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
     return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))
 
 
 USES = ("subscribes", "queries", "publishes")
-"""The ends of the names of a role's rules."""
+"""The name of a rule for a role's keys is the role and one of these words."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
-"""The rules of each role."""
+"""The names of the rules of each role. `_rules` defines the rules."""
 
 WIDE: dict[Role, tuple[str, ...]] = {
     "viewer": ("roam", "recall"),
     "operator": ("roam", "recall"),
     "maintainer": ("roam", "recall", "browse", "attend"),
 }
-"""The rules that `access.wildcards` adds to each role."""
+"""The names of the rules that `access.wildcards` adds to each role."""
 
 LOCAL = (
     *GRANTS["maintainer"],
@@ -86,16 +91,17 @@ LOCAL = (
     "err",
     "forge",
 )
-"""The rules of a client on the robot's own machine.
+"""The names of the rules of a client on the robot's own machine.
 
-It may also subscribe with any wildcard, receive commands, and put on wrong keys, which the daemon
-refuses with a reason and counts. It may not publish in the robot's place.
+Such a client has the permissions of a maintainer. It may also subscribe with any wildcard and
+follow the commands. It may put on wrong keys, so that the daemon can count such a sample and refuse
+it with a reason. It may not publish on the keys on which the robot publishes.
 """
 
 Flow = Literal["ingress", "egress"]
 
 Permission = Literal["allow", "deny"]
-"""Where both hold, Zenoh denies."""
+"""Effect of a rule. A message to which both an allowing and a denying rule apply is denied."""
 
 
 class Rule(TypedDict):
@@ -109,62 +115,70 @@ class Rule(TypedDict):
 
 
 class _Keys:
-    """The keys of one robot, native and ROS, grouped by their use."""
+    """The native keys and ROS keys of one robot, in groups for the rules."""
 
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
         self._robot, self._sources = robot, [source.name for source in config.commands.sources]
         self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU})
-        topics, told = offered(config), published(config)
-        self._taken = [topic for topic in topics if topic not in told]
-        """The rows that clients put on. The simulator publishes its gyro itself."""
-        self._given = [*told, *(t for t in self._taken if t.direction != "in")]
-        """The rows that clients follow and query."""
+        topics, outgoing = offered(config), published(config)
+        self._incoming = [topic for topic in topics if topic not in outgoing]
+        """Rows of the topic table on which clients put, and the queries and services.
+
+        The gyro's row is not among them if the daemon publishes the simulator's gyro.
+        """
+        self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
+        """Rows of the topic table to which clients subscribe, and which they query."""
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.claims = claims(config.ros)
         self.imu = full_key(robot, IMU)
-        self.published = [full_key(robot, topic.key) for topic in told]
-        self.published += [full_key(robot, json_key(topic.key)) for topic in told]
+        self.published = [full_key(robot, topic.key) for topic in outgoing]
+        self.published += [full_key(robot, json_key(topic.key)) for topic in outgoing]
         self.published += _of(ros, "out")
-        latched = [full_key(robot, topic.key) for topic in told if topic.latched]
+        latched = [full_key(robot, topic.key) for topic in outgoing if topic.latched]
         latched += [e.key for e in ros if e.latched]
         self.kept = [f"{key}/@adv/**" for key in latched]
         """Keys under which Zenoh's advanced publishers keep samples for late subscribers."""
-        self.heard = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
-        self.heard += _of(ros, "in")
-        """Keys that the daemon subscribes to, for each sender."""
+        self.subscribed = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
+        self.subscribed += _of(ros, "in")
+        """Key expressions to which the daemon subscribes."""
         self.commands = [full_key(robot, key) for key in source_keys(self._sources)]
-        """Command keys of the listed sources for clients without a certificate."""
-        self.questions = [
+        """Command keys of the configured sources, for clients without a certificate."""
+        self.viewer_queries = [
             full_key(robot, t.pattern)
             for t in topics
             if t.direction == "query" and t.query == "viewer"
         ]
-        """Expressions of the queries that every client may send."""
-        asked = [full_key(robot, t.pattern) for t in topics if t.direction in ("query", "service")]
-        self.answered = [*self.published, *self.kept, *asked]
+        """Key expressions of the queries that every client may send."""
+        queries = [
+            full_key(robot, t.pattern) for t in topics if t.direction in ("query", "service")
+        ]
+        self.answered = [*self.published, *self.kept, *queries]
         self.answered += [e.key for e in ros if e.direction in ("query", "service")]
-        """Keys that the daemon publishes on or answers."""
+        """Key expressions on which the daemon publishes, or which it answers."""
 
     def of(self, role: Role, use: Use) -> list[str]:
-        """Return the exact keys for which `role` is the least role, native and ROS.
+        """Return the exact native and ROS keys that `role` may use, but no lower role.
 
-        Command keys that end with a certificate are left out; see `commands_by`.
+        Command keys that end with a certificate's name are not included; see `commands_by`.
         """
-        rows = self._taken if use == "publish" else self._given
+        rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
         return keys + [e.key for e in self._ros if use in _uses(e) and self._least(e) == role]
 
     def commands_by(self, certificate: str) -> list[str]:
-        """Return the command keys of the listed sources for this certificate, "*" for any."""
+        """Return a certificate's command keys of the configured sources; "*" for any certificate.
+
+        A router forwards the commands of any certificate.
+        """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def _least(self, endpoint: Endpoint) -> Role | None:
-        """Return the least role for a ROS name: that of the native key that it stands for.
+        """Return the least role for a ROS endpoint: that of the native key for which it stands.
 
-        Commands of a source that is not listed are for nobody. ROS keys have no place for a
-        certificate, so they are granted to each role that may command.
+        Returns None for the commands of a source that is not configured, which no role may send. A
+        ROS key has no place for a certificate's name, so each role that may command may use it.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):
@@ -181,24 +195,28 @@ def _uses(endpoint: Endpoint) -> tuple[Use, ...]:
 
 
 def access_control(config: Config) -> dict[str, object]:
-    """Return the value of Zenoh's `access_control` for the session of this daemon.
+    """Return the value of Zenoh's `access_control` for the session of the daemon.
 
     A TLS link of that session leads to a router. The router lets each client put only on the keys
-    of its own certificate, and forwards those samples.
+    of the client's own certificate, and forwards these samples to the daemon.
     """
     return _access(config, LOCAL, gateway=False)
 
 
 def gateway_access(config: Config) -> dict[str, object]:
-    """Return the value of `access_control` for the TLS gateway's session.
+    """Return the value of Zenoh's `access_control` for the session of the TLS gateway.
 
-    Its only link without a certificate is that to the daemon. Each certificate that may command has
-    a subject of its own beside the subject of its role.
+    The only link of that session without a certificate leads to the daemon. Each certificate that
+    may command is a subject of its own, and also belongs to the subject of its role.
     """
     return _access(config, ("pass",), gateway=True)
 
 
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
+    """Return the value of `access_control`; `local` names the rules of links without certificate.
+
+    `gateway` is true for the TLS gateway and false for the daemon.
+    """
     keys = _Keys(config)
     rules = _rules(keys)
     access = config.access
@@ -207,7 +225,7 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
         "operator": access.operators,
         "maintainer": access.maintainers,
     }
-    # Zenoh compares the name of a certificate only on a link that it authenticated.
+    # Zenoh compares the name of a certificate only on a link that has authenticated the client.
     subjects: dict[str, dict[str, list[str]]] = {"local": {"link_protocols": list(LOCAL_LINKS)}}
     subjects |= {
         role: {"link_protocols": ["tls"], "cert_common_names": list(held)}
@@ -246,15 +264,17 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
 
 def _rules(keys: _Keys) -> dict[str, Rule]:
     tokens = [keys.alive, *keys.claims, *keys.kept, *TOKENS]
-    # A gyro beside the simulator's is let through, because the code refuses it with a reason.
+    # Samples on the gyro's key pass although the simulator publishes there, because the daemon
+    # refuses them with a reason.
     forged = [key for key in keys.answered if key != keys.imu]
     following = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
     rules = [
-        _rule("speak", "egress", SPOKEN, [*keys.answered, *keys.heard, *tokens]),
+        # The daemon's declarations and answers, its data, and the commands that others follow:
+        _rule("speak", "egress", SPOKEN, [*keys.answered, *keys.subscribed, *tokens]),
         _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
-        _rule("overhear", "egress", ["put"], keys.heard),
+        _rule("overhear", "egress", ["put"], keys.subscribed),
     ]
-    # exact keys
+    # The exact keys of each role:
     for role in ROLES:
         rules += [
             _rule(f"{role} subscribes", "ingress", following, keys.of(role, "subscribe")),
@@ -262,19 +282,22 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
             _rule(f"{role} publishes", "ingress", ["put"], keys.of(role, "publish")),
         ]
     rules += [
+        # The tokens of other daemons, which a router forwards:
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
+        # Commands of a client without a certificate, and those that a router forwards:
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("hand_on", "ingress", ["put"], keys.commands_by("*")),
-        # with wildcards: all robots at once, the discovery of ROS, samples for late subscribers
+        # Wildcards: all robots and the tokens of ROS, the samples for late subscribers, all keys of
+        # the robot, and the tokens of late subscribers:
         _rule("roam", "ingress", following, [f"{ROOT}/**", *tokens]),
-        _rule("recall", "ingress", ["query"], [*keys.kept, *keys.questions]),
+        _rule("recall", "ingress", ["query"], [*keys.kept, *keys.viewer_queries]),
         _rule("browse", "ingress", ["query"], [keys.all]),
         _rule("attend", "ingress", ["liveliness_token"], keys.kept),
-        # on the robot's own machine
+        # A client on the robot's own machine: see `LOCAL`.
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*forged, *tokens], "deny"),
-        # between the TLS gateway and the daemon; ** includes no key with an @
+        # All messages between the TLS gateway and the daemon. In Zenoh, ** includes no @.
         _rule("pass", "both", EVERYTHING, ["**", *tokens]),
     ]
     return {rule["id"]: rule for rule in rules}

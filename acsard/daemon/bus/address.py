@@ -1,4 +1,4 @@
-"""Finds the endpoint, the id and the certificates for a tool that connects to a robot."""
+"""Finds the endpoint, the robot id and the certificate directory for a tool that connects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Address(NamedTuple):
     endpoint: str
     robot_id: str
     tls: str
-    """Directory with the client's certificate, "" for none."""
+    """Directory with the client's certificate; "" without a certificate."""
 
 
 def address_of(
@@ -29,17 +29,18 @@ def address_of(
     robot_id: str | None = None,
     tls: str | None = None,
 ) -> Address:
-    """Return the address of the configuration's robot.
+    """Return the address of a robot from its configuration and from options of a tool.
 
-    A given option replaces the value of the configuration. Raises `UsageError` for an id that no
-    robot can have.
+    An option that is not None replaces the value of the configuration. Raises `UsageError` for an
+    id that no robot can have.
     """
     robot_id = config.robot.id if robot_id is None else robot_id
     require_id(robot_id)
     bus = config.bus
-    # The daemon listens only in peer mode. Prefer a plain endpoint, which needs no certificate.
-    known = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
-    endpoint = connect or reachable(known[0])
+    # The daemon listens only in peer mode. A tcp endpoint comes first, because it needs no
+    # certificate.
+    endpoints = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
+    endpoint = connect or reachable(endpoints[0])
     certificates = (tls or bus.tls) if _is_tls(endpoint) else ""
     return Address(endpoint, robot_id, certificates)
 
@@ -47,15 +48,16 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    Arguments come first, then the file that $ACSARD_CONFIG names, then the defaults. For the
-    certificate directory $ACSARD_TLS overrides the file. Raises `UsageError` for an id that no
-    robot can have and for a file that cannot be used.
+    An argument that is not None wins. The other values come from the file that $ACSARD_CONFIG
+    names, or from the defaults. $ACSARD_TLS replaces the certificate directory of the file. Raises
+    `UsageError` for an id that no robot can have, and for a file that cannot be used.
     """
-    settled = endpoint is not None and robot_id is not None
-    if settled and (tls is not None or not _is_tls(endpoint or "")):
-        config = Config()  # the file cannot change the result
+    complete = endpoint is not None and robot_id is not None
+    if complete and (tls is not None or not _is_tls(endpoint or "")):
+        # The file could not change the result, so it need not exist.
+        config = Config()
     else:
-        config = _named_by_environment()
+        config = _config_of_environment()
     where = address_of(config, endpoint, robot_id, tls)
     return Address(
         where.endpoint if endpoint is None else endpoint,
@@ -64,19 +66,19 @@ def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str 
     )
 
 
-def _named_by_environment() -> Config:
-    named = os.environ.get("ACSARD_CONFIG")
+def _config_of_environment() -> Config:
+    file = os.environ.get("ACSARD_CONFIG")
     tls = os.environ.get("ACSARD_TLS")
     given: dict[str, dict[str, object]] = {} if tls is None else {"bus": {"tls": tls}}
     try:
-        return parse(Path(named).read_bytes() if named else b"", given)
+        return parse(Path(file).read_bytes() if file else b"", given)
     except OSError as error:
         raise UsageError(
-            f"cannot read {named}, the file in ACSARD_CONFIG: {error.strerror}; name an existing "
+            f"cannot read {file}, the file in ACSARD_CONFIG: {error.strerror}; name an existing "
             "file, or unset ACSARD_CONFIG"
         ) from None
     except ConfigError as error:
-        where = f"{named}, the file in ACSARD_CONFIG" if named else "the environment"
+        where = f"{file}, the file in ACSARD_CONFIG" if file else "the environment"
         raise UsageError(f"{where}: {'; '.join(error.problems)}") from None
 
 

@@ -1,15 +1,13 @@
 """Owns the daemon's Zenoh session and its keys, takes input from the bus and publishes to it.
 
 Every Zenoh call that may block (open, declare, put, reply, close) runs in a thread, never on the
-event loop. A further thread watches whether the endpoints of `bus.connect` are connected.
+event loop.
 """
 
 from __future__ import annotations
 
-import socket
 import time
 from functools import partial
-from threading import Event, Thread
 from types import TracebackType
 
 import zenoh
@@ -25,127 +23,24 @@ from acsard.core.messages.signature import Signature
 from acsard.core.messages.topics import IMU, Topic, full_key, json_key
 from acsard.core.ros.names import gid
 from acsard.core.ros.transports import Endpoint, claims, command_keys, endpoints, node_tokens
-from acsard.core.values import NS_PER_S, RoutersStatus
+from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets, direct
+from acsard.daemon.bus.router_links import RouterLinks
 from acsard.daemon.bus.zenoh_sessions import daemon_session
 from acsard.host import clock
 from acsard.host.errors import InUseError
 from acsard.host.threads import in_thread
 
-EVERY_S = 0.5
-"""Seconds between two polls. One poll takes Zenoh 0.1 ms."""
-
-STOP_S = 0.05
-
-
-class Links:
-    """Watcher of the links of one session.
-
-    Zenoh reconnects by itself and does not report it, so nobody would notice a missing router. A
-    thread of its own polls Zenoh, because the call may block.
-    """
-
-    def __init__(self, bus: BusConfig, inbox: Inbox) -> None:
-        """Prepare the watcher. It writes the ids of connected routers to `inbox.routers`."""
-        self._bus, self._inbox = bus, inbox
-        self._status: RoutersStatus | None = None
-        self._news = False
-        """Whether the status has changed. It is set after the status, so that no change is
-        overlooked."""
-        self._over = Event()
-        self._thread = Thread(target=self._run, name="links", daemon=True)
-        self._session: zenoh.Session
-
-    def news(self) -> RoutersStatus | None:
-        """Return the status if it has changed since the last call, else None. Never wait."""
-        if not self._news:
-            return None
-        self._news = False
-        return self._status
-
-    def start(self, session: zenoh.Session) -> None:
-        """Start polling.
-
-        Poll even without `bus.connect`, because a router may have connected to the daemon.
-        """
-        self._session = session
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop polling. Do not wait for a name lookup that is under way."""
-        self._over.set()
-        if self._thread.is_alive():
-            self._thread.join(STOP_S)
-
-    def _run(self) -> None:
-        connects = False  # the first poll reports nothing: Zenoh has had no time to connect yet
-        while True:
-            status = self._look()
-            if connects and status != self._status:
-                self._status, self._news = status, True
-            connects = bool(self._bus.connect)
-            if self._over.wait(EVERY_S):
-                return
-
-    def _look(self) -> RoutersStatus:
-        endpoints = self._bus.connect
-        try:
-            info = self._session.info
-            far = {str(link.dst): str(link.zid) for link in info.links()}
-            kinds = {str(one.zid): one.whatami for one in info.transports()}
-        except zenoh.ZError:  # the session is closing
-            return self._status or RoutersStatus()
-        routers = (zid for zid, kind in kinds.items() if kind == zenoh.WhatAmI.ROUTER)
-        self._inbox.routers = frozenset(routers)
-        missing = unreached(self._bus.mode, endpoints, set(far))
-        connected = tuple(one for one in endpoints if one not in missing)
-        ends = {end for end, zid in far.items() if kinds.get(zid) == zenoh.WhatAmI.PEER}
-        peers = tuple(one for one in connected if _leads_there(one, ends))
-        return RoutersStatus(connected, missing, peers)
-
-
-def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
-    """Return the endpoints that no link leads to, given the far `ends` of all links.
-
-    A client has one link only, so with any link it misses none. A program that connected to the
-    daemon (the TLS gateway, a bridge, a ROS node) has an ephemeral port at its end and matches no
-    endpoint. Host names are resolved, which may block.
-    """
-    if mode == "client":
-        return () if ends else endpoints
-    return tuple(one for one in endpoints if not _leads_there(one, ends))
-
-
-def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Return whether a link leads to the endpoint.
-
-    Zenoh lists addresses; the endpoint may be a name.
-    """
-    bare = endpoint.partition("?")[0].partition("#")[0]
-    protocol, _, place = bare.partition("/")
-    host, _, port = place.rpartition(":")
-    if bare in ends:
-        return True
-    try:
-        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
-    except (OSError, ValueError):  # the name no longer resolves, which does not end a link
-        return bool(port) and any(
-            end.startswith(f"{protocol}/") and end.endswith(f":{port}") for end in ends
-        )
-    hosts = (str(one[4][0]) for one in found)
-    return any(f"{protocol}/{f'[{one}]' if ':' in one else one}:{port}" in ends for one in hosts)
-
-
 OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
-TWIN_PATIENCE_S = 0.5
-"""Seconds to listen for another daemon with this robot's id or ROS names before claiming them."""
+TWIN_TIMEOUT_S = 0.5
+"""Time to listen for another daemon with this robot's id or ROS names, before using them, s."""
 
 
 class ZenohBus:
-    """The robot's keys on the bus, declared while the context manager is entered."""
+    """The robot's keys on the bus. The keys exist while this asynchronous context is entered."""
 
     def __init__(
         self,
@@ -159,14 +54,18 @@ class ZenohBus:
         topics: tuple[Topic, ...],
         published: tuple[Topic, ...],
     ) -> None:
-        """Store the settings; entering the bus opens the session.
+        """Store the settings. The session opens when the context is entered.
 
         Args:
+            bus: the table `[bus]`.
+            ros: the table `[ros]`.
             silent: native keys that get no ROS endpoint.
-            sources: names of the listed command sources.
+            robot_id: `robot.id`.
+            sources: names of the configured command sources.
             access: the value of Zenoh's `access_control`.
+            waker: wakes the control loop when a command or a stop arrives.
             topics: rows of the topic table that this robot offers.
-            published: rows that the daemon publishes.
+            published: rows of the topic table that the daemon publishes.
         """
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
         self._access, self._silent = access, silent
@@ -175,7 +74,7 @@ class ZenohBus:
         prefix = full_key(robot_id, "")
         self._replies = Replies(prefix)
         self._inbox = Inbox(prefix, self._replies, sources, waker)
-        self._outlets, self._links = Outlets(), Links(bus, self._inbox)
+        self._outlets, self._links = Outlets(), RouterLinks(bus, self._inbox)
         self._session: zenoh.Session
         self._kept: list[object] = []
         """Declared entities. Zenoh undeclares an entity when nothing refers to it."""
@@ -184,22 +83,22 @@ class ZenohBus:
 
     @property
     def wanted(self) -> frozenset[str]:
-        """Published topics that have a listener in any tree."""
+        """Published topics that have a subscriber, natively or in ROS."""
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
         """Return the input since the last call, with at most `queries` + 1 queries."""
-        got = self._inbox.take(queries)
-        routers = self._links.news()
+        taken = self._inbox.take(queries)
+        routers = self._links.changed()
         if routers is not None:
-            got = replace(got, routers=routers)
+            taken = replace(taken, routers=routers)
         if not self._outlets.behind:
-            return got
+            return taken
         dropped, stuck = self._outlets.losses(clock.mono_ns())
-        return replace(got, dropped=dropped, stuck=stuck) if dropped or stuck else got
+        return replace(taken, dropped=dropped, stuck=stuck) if dropped or stuck else taken
 
     def publish(self, key: str, message: Message) -> None:
-        """Queue a message for its listeners. `flush` sends it."""
+        """Queue a message for the subscribers of the topic `key`. `flush` sends it."""
         self._outlets.publish(key, message)
 
     def flush(self) -> None:
@@ -207,11 +106,11 @@ class ZenohBus:
         self._outlets.flush()
 
     def reply(self, reply: Reply) -> None:
-        """Reply to the query that holds the ticket `reply.ticket`."""
+        """Send a reply to the query that `reply.ticket` names."""
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
-        """End the query of this ticket: it gets no more replies."""
+        """End the query that the ticket names. It gets no more replies."""
         self._replies.retire(ticket)
 
     # Opening the session.
@@ -226,11 +125,11 @@ class ZenohBus:
         settings, limited = self._settings, command_keys(self._ros)
         session = daemon_session(settings, self._id, self._sources, limited, self._access)
         if settings.connect:
-            taken = self._taken(_seen(session, self._alive, claims(self._ros)))
-            if taken:
+            conflict = self._conflict(_others(session, self._alive, claims(self._ros)))
+            if conflict:
                 session.close()
-                raise InUseError(taken)
-        # Set this before the first key is declared, because a sample may arrive at once.
+                raise InUseError(conflict)
+        # Set `own_id` before the first key is declared, because a sample may arrive at once.
         self._inbox.own_id = session.new_timestamp().get_id()
         self._replies.start(session)
         self._declare_native(session)
@@ -243,21 +142,26 @@ class ZenohBus:
         self._links.start(session)
         return session
 
-    def _taken(self, seen: set[str]) -> str:
-        """Return the error if another daemon has this robot's id or ROS names, else ""."""
-        if self._alive in seen:
+    def _conflict(self, tokens: set[str]) -> str:
+        """Return an error message if another daemon has this robot's id or ROS names, else "".
+
+        `tokens` are the liveliness tokens that other sessions hold, out of those of this robot.
+        """
+        if self._alive in tokens:
             return (
                 f"another daemon on this bus already has the id {self._id}; give this robot its "
                 "own robot.id"
             )
-        ways = [way for way in ("bridge", "rmw") if any(f"/@ros/{way}/" in one for one in seen)]
-        if ways:
-            off = " and ".join(f"ros.{way} = false" for way in ways)
+        transports = [
+            name for name in ("bridge", "rmw") if any(f"/@ros/{name}/" in token for token in tokens)
+        ]
+        if transports:
+            off = " and ".join(f"ros.{name} = false" for name in transports)
             return (
                 f'another robot on this bus already has ros.namespace = "{self._ros.namespace}": '
-                f"one cmd_vel of ROS, by {' or '.join(ways)}, would drive both; give this robot "
-                "its own namespace, in [ros] namespace or by `acsard run --namespace NAME`, or "
-                f"{off}"
+                f"one cmd_vel of ROS over {' or '.join(transports)} would drive both; give this "
+                "robot its own namespace, with [ros] namespace or `acsard run --namespace NAME`, "
+                f"or set {off}"
             )
         return ""
 
@@ -279,10 +183,10 @@ class ZenohBus:
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
-        """Publish the topic also as JSON, for clients without msgpack.
+        """Publish the topic as JSON too, for clients without msgpack.
 
-        Not latched: a latched publisher would encode every message even without subscribers. A
-        query gets the present value instead.
+        The publisher is never latched, because a latched publisher encodes every message even
+        without subscribers. A query returns the present value instead.
         """
         below = json_key(topic.key)
         key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
@@ -321,7 +225,8 @@ class ZenohBus:
         try:
             await in_thread(self._close, CLOSE_TIMEOUT_S)
         except TimeoutError:
-            pass  # a stuck remote; the process ends without closing the session
+            # A remote program that hangs must not delay the end of this process.
+            pass
 
     def _close(self) -> None:
         self._outlets.stop(CLOSE_TIMEOUT_S)
@@ -329,18 +234,22 @@ class ZenohBus:
         self._session.close()
 
 
-def _seen(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return the liveliness tokens that other sessions hold or declare within TWIN_PATIENCE_S."""
+def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
+    """Return which of the liveliness tokens `alive` and `claims` other sessions hold.
+
+    Takes up to `TWIN_TIMEOUT_S`.
+    """
     liveliness = session.liveliness()
-    others = {
+    subscribers = {
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)
     }
-    deadline_ns = clock.now().mono_ns + int(TWIN_PATIENCE_S * NS_PER_S)
-    found: set[str] = set()
-    # A daemon with our id also has our ROS names. Wait for the id, which is the better message.
-    while alive not in found and clock.now().mono_ns < deadline_ns:
+    deadline_ns = clock.now().mono_ns + int(TWIN_TIMEOUT_S * NS_PER_S)
+    held: set[str] = set()
+    # A daemon with this robot's id also has its ROS names. The message about the id is better, so
+    # wait for the id.
+    while alive not in held and clock.now().mono_ns < deadline_ns:
         time.sleep(0.01)
-        found |= {token for token, other in others.items() if other.try_recv() is not None}
-    for other in others.values():
-        other.undeclare()
-    return found
+        held |= {token for token, other in subscribers.items() if other.try_recv() is not None}
+    for subscriber in subscribers.values():
+        subscriber.undeclare()
+    return held

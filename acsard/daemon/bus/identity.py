@@ -1,7 +1,9 @@
-"""Finds out a client's identity: its role by the keys that answer, its certificate by its own file.
+"""Finds out which role and certificate this client has for a robot.
 
-Zenoh does not tell the daemon which link a query came by. But the access rules let each role query
-only its own key and those of lower roles, so the highest key that answers is the role.
+Zenoh does not tell the daemon over which link a query came. But each role has a key, and the access
+rules let a client query only the keys of its own role and of lower roles. So the client queries all
+these keys, and the highest role whose key answers is its own. The certificate is the one in the
+client's own file.
 """
 
 from __future__ import annotations
@@ -21,30 +23,30 @@ from acsard.daemon.bus.tls import common_name
 from acsard.host import clock
 
 WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
-"""Seconds to wait for the first answer, and for more answers once one has come."""
+"""Time to wait for the first answer, and after the first for more answers, s."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""A function that queries a key and calls back with each sample that answers."""
+"""Function that queries a key, and calls its second argument with each sample that answers."""
 
 
 class Identity(Struct, frozen=True):
-    """The identity of a client as the daemon sees it."""
+    """Role, certificate and name of a client, as the daemon sees them."""
 
     role: Role | Literal[""]
-    """The role of the client's link, "" if no key answered."""
+    """The role of the client; "" if no key answered."""
     certificate: str
-    """The common name of the client's certificate, "" without one."""
+    """The common name of the client's certificate; "" if the client has no certificate."""
     sender: str
-    """The client's name on each command."""
+    """The name that the daemon gives to this client's commands."""
     robot: str = ""
     """The id of the robot that was queried."""
     endpoint: str = ""
-    """The endpoint of the query."""
+    """The endpoint to which the client is connected."""
 
     def lacks(self, key: str) -> str:
         """Return why this client may not use a key below the robot's id.
 
-        "" means that it may, or that neither its role nor its certificate is known.
+        Returns "" if the client may use it, or if neither role nor certificate are known.
         """
         least = least_role(key)
         if not self.role:
@@ -55,54 +57,65 @@ class Identity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """The likeliest reasons why no key answered, "" with a role or without a certificate.
+        """The likeliest reasons why no key answered.
 
-        A client cannot distinguish a robot that is absent, one that is stuck and one that does not
-        list the client's certificate. The message therefore asserts none of the three.
+        It is "" if the client has a role, or has no certificate. A client cannot distinguish three
+        cases: the robot is absent, it hangs, or it does not list the client's certificate.
+        Therefore the message names all three.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
     def _nobody(self) -> str:
         where = f" at {self.endpoint}" if self.endpoint else ""
-        asked = full_key(self.robot, whoami_key(ROLES[0])) if self.robot else ""
-        who = f" as '{self.robot}'{where} (asked: {asked})" if asked else where
-        told = (
-            f"no daemon answers{who}: is --id right, and does that robot's daemon run and answer?"
+        key = full_key(self.robot, whoami_key(ROLES[0])) if self.robot else ""
+        robot = f" as '{self.robot}'{where} (asked: {key})" if key else where
+        message = (
+            f"no daemon answers{robot}: is --id right, and does that robot's daemon run and answer?"
         )
         if not self.certificate:
-            return told
+            return message
         return (
-            f"{told} If so, your certificate, {self.certificate}, may be missing from every "
-            "role's list ([access] in the robot's acsard.toml; behind a router, the router's "
-            "list). The robot answers only certificates in a list"
+            f"{message} If so, your certificate, {self.certificate}, may be missing from every "
+            "role's list. The lists are in [access] of the robot's acsard.toml, or behind a router "
+            "in the router's file. The robot answers only certificates in a list"
         )
 
     def words(self) -> str:
         """Return the role and the certificate in a sentence."""
-        if self.role:
-            whose = f"your certificate {self.certificate}" if self.certificate else "you, without"
-            whose += "" if self.certificate else " a certificate that is valid here, over this link"
-            return f"{whose} is {self.role}: {MAY[self.role]}"
-        return self._nobody()
+        if not self.role:
+            return self._nobody()
+        owner = (
+            f"your certificate {self.certificate} is"
+            if self.certificate
+            else "you have no certificate for this link and are"
+        )
+        return f"{owner} {self.role}: {MAY[self.role]}"
 
 
 def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:
-    """Query the robot for this client's role; return its identity.
+    """Query the robot for this client's role, and return its identity.
 
-    Blocks for up to WHOAMI_S. `tls` is the directory of the client's certificate, "" for none.
+    Blocks for up to `WHOAMI_S`.
+
+    Args:
+        ask: queries a key of the robot.
+        tls: directory of the client's certificate; "" without a certificate.
+        sender: see `Identity.sender`.
+        robot: the robot's id.
+        endpoint: the endpoint to which the client is connected.
     """
     answers: SimpleQueue[str] = SimpleQueue()
-    for one in ROLES:
-        ask(whoami_key(one), lambda sample: answers.put(str(sample.key_expr)))
+    for role in ROLES:
+        ask(whoami_key(role), lambda sample: answers.put(str(sample.key_expr)))
     best, end = -1, _now_s() + WHOAMI_S
     while best < len(ROLES) - 1 and (left := end - _now_s()) > 0:
         with suppress(Empty):
-            role = answers.get(timeout=left).rpartition("/")[2]
+            name = answers.get(timeout=left).rpartition("/")[2]
             # A key that this client may not query never answers. The other answers arrive together.
             end = min(end, _now_s() + WHOAMI_MORE_S)
-            best = max(best, next((n for n, r in enumerate(ROLES) if r == role), -1))
-    name = common_name(tls) if tls else ""
-    return Identity(ROLES[best] if best >= 0 else "", name, sender, robot, endpoint)
+            best = max(best, next((n for n, role in enumerate(ROLES) if role == name), -1))
+    certificate = common_name(tls) if tls else ""
+    return Identity(ROLES[best] if best >= 0 else "", certificate, sender, robot, endpoint)
 
 
 def _now_s() -> float:

@@ -1,11 +1,11 @@
 """Buffers the samples and queries from the bus for the next control step, and sends the replies.
 
-Zenoh's threads fill the buffers, and every buffer is bounded. A callback here only copies its input
-and never calls Zenoh back, except to send a refusal through `Replies`.
+Zenoh's threads fill the buffers, and every buffer is bounded. A callback in this module only copies
+its input. It never calls back into Zenoh: even a refusal goes through `Replies`.
 
-The replies go from a thread of its own, because a stuck client would block the control loop. Each
-query gets a numbered ticket when it arrives, and replies name that ticket. Retiring the ticket
-drops the query, which ends the client's wait.
+A thread of its own sends the replies, because a client that hangs would block the control loop.
+Each query gets a number, its ticket, when it arrives, and a reply names that ticket. When a ticket
+is retired, Zenoh's query is dropped, and the client stops waiting.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 TICKETS = 1024
-"""Queries held at once. Further queries are dropped without an answer."""
+"""Largest number of unfinished queries. Further queries are dropped without an answer."""
 
 
 class Replies:
-    """The queries of one robot that are not finished yet."""
+    """Holds the unfinished queries of one robot, and sends the replies to them."""
 
     def __init__(self, prefix: str) -> None:
         self._prefix = prefix
@@ -40,9 +40,10 @@ class Replies:
         """Replies and retired tickets, in order. None ends the thread."""
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
-        """Return a ticket for this query, or None if too many are held.
+        """Return a ticket for this query, or None if there are too many unfinished queries.
 
-        The replies go out on `key`, or if `key` is "" on the key of each reply below the prefix.
+        The replies go to the key `key`. If it is "", each reply goes to its own key below the
+        prefix of the robot.
         """
         if len(self._queries) > TICKETS:
             return None
@@ -55,15 +56,15 @@ class Replies:
         self._queue.put(reply)
 
     def retire(self, ticket: int) -> None:
-        """Queue the end of a query: it gets no more replies."""
+        """End the query of this ticket after the replies that are queued already."""
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Start sending. Replies queued earlier wait until then."""
+        """Start the thread. Earlier replies wait for it in the queue."""
         threading.Thread(target=self._run, args=(session,), name="replies", daemon=True).start()
 
     def stop(self) -> None:
-        """Send the queued replies and stop."""
+        """Let the thread send the queued replies and end."""
         self._queue.put(None)
 
     def _run(self, session: zenoh.Session) -> None:
@@ -80,7 +81,8 @@ class Replies:
             try:
                 self._reply(session, query, key, item)
             except zenoh.ZError:
-                pass  # the client has disconnected
+                # The client has disconnected.
+                pass
 
     def _reply(self, session: zenoh.Session, query: zenoh.Query, key: str, reply: Reply) -> None:
         if not reply.ok:
@@ -97,31 +99,41 @@ class Replies:
 
 
 ARRIVALS = 16
-"""Newest samples buffered per key between two steps. A sender at the limit of 1000 Hz puts 10 of
-them into one step at 100 Hz. The samples on keys of unlisted sources share one buffer, so a flood
-there cannot push out a command on a listed key."""
+"""Size of the buffer of each command key. The newest samples stay.
+
+A sender at the limit of 1000 Hz puts 10 samples into one step at 100 Hz.
+"""
 
 SAMPLES = 64
-"""Newest gyro samples buffered: a gyro at 400 Hz fills them while the loop stands still for 150
-ms."""
+"""Size of the buffer for gyro samples. A gyro at 400 Hz fills it while the control loop stands
+still for 150 ms.
+"""
 
 OTHERS = ""
-"""The buffer's key for samples on all unlisted keys."""
+"""Name of the buffer for the keys of all unlisted sources.
+
+They share one buffer, so that a flood on these keys cannot displace a command on a listed key.
+"""
 
 ALL = "*"
-"""Placeholder for the certificate's name in a key."""
+"""Placeholder for the name of a certificate in a key."""
 
 STOPS = 16
-"""Stops buffered. They have a buffer of their own, so that no flood can push one out."""
+"""Size of the buffer for stops. It is separate, so that no flood can displace a stop."""
 
 QUERIES = 256
-"""Queries buffered in each of three queues: services, other native queries, and the slow ones. One
-slow query is answered per step, so the last of 256 waits 2.6 s. Further queries are refused with
-`BUSY`."""
+"""Size of each of the three queues: services, other native queries, and slow queries.
+
+One slow query is answered per step, so the last of 256 waits 2.6 s. If a queue is full, further
+queries are refused with `BUSY`.
+"""
 
 ATTACHMENT_BYTES = 256
-"""Bytes of an attachment that are kept. An attachment of rmw_zenoh has 33, ours up to 140. A longer
-one is cut, so it decodes to no sender."""
+"""Number of bytes of an attachment that are used.
+
+An attachment of rmw_zenoh has 33 bytes, and one of acsard has up to 140. A longer attachment is cut
+off, so that no sender can be decoded from it.
+"""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
@@ -134,63 +146,75 @@ class Inbox:
         self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
-        """The id with which this session stamps samples that came without a timestamp. Such a
-        timestamp is not the sender's."""
+        """The id with which the daemon's own session stamps samples that came without a timestamp.
+
+        Such a timestamp is not the sender's.
+        """
         self.routers: frozenset[str] = frozenset()
-        """The ids with which routers stamp samples. Such an id tells when a sample passed a router,
-        but does not identify its sender."""
+        """The ids of the connected routers, which stamp samples without a timestamp.
+
+        Such a timestamp says when the sample passed the router, and does not identify its sender.
+        """
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
             key: Mailbox(ARRIVALS, self._commanded)
             for key in (*source_keys(sources), *source_keys(sources, ALL), OTHERS)
         }
-        # A gyro sample wakes nobody: it waits for the next feedback of the wheels.
+        # A gyro sample does not wake the control loop. It waits for the next feedback line.
         self._arrivals[IMU] = Mailbox(SAMPLES, self._note)
         self._stops = Mailbox[Arrival](STOPS, self._stopped)
-        # Queries are no mailbox: a query that finds no room is refused, and displaces no other.
+        # In a mailbox a new query would displace the oldest one. Here the new query is refused.
         self._services: deque[Query] = deque()
-        self._questions: deque[Query] = deque()
+        self._others: deque[Query] = deque()
+        """Native queries that are neither services nor slow."""
         self._slow: deque[Query] = deque()
-        """ROS parameter queries and settings. One of them takes as long as all other queries of a
-        step."""
+        """ROS parameter queries, and changes of settings.
+
+        One of these takes as long as all other queries of a step.
+        """
         self._overrun = 0
+        """Number of samples that newer ones have displaced since the last `take`."""
         self._any = False
-        """Whether something has arrived. It is set after the item is queued, so that no item is
-        overlooked."""
+        """True if an item has arrived. It is set after the item is queued, so that `take` misses no
+        item.
+        """
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, stops first and the other samples by arrival time.
+        """Return the samples since the last call, and waiting queries.
 
-        It holds at most `queries` queries, and one more if all of them are services and a slow
-        query waits.
+        The stops come first, then the other samples in the order of their arrival. There are at
+        most `queries` queries, or one more if all of these are services and a slow query waits.
         """
         if not self._any:
             return NOTHING
         self._any = False
-        arrivals = [one for box in self._arrivals.values() if box.waiting for one in box.take()]
-        arrivals.sort(key=lambda one: one.arrived_ns)
+        arrivals = [
+            arrival for box in self._arrivals.values() if box.waiting for arrival in box.take()
+        ]
+        arrivals.sort(key=lambda arrival: arrival.arrived_ns)
         arrivals = self._stops.take() + arrivals
-        asked = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
-        asked += _taken_of(self._questions, queries - len(asked))
-        if self._services or self._slow or self._questions:
-            self._any = True  # the rest waits for the next step
+        taken = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
+        taken += _taken_of(self._others, queries - len(taken))
+        if self._services or self._slow or self._others:
+            # The other queries wait for the next step.
+            self._any = True
         overrun, self._overrun = self._overrun, 0
-        return BusInput(tuple(arrivals), tuple(asked), overrun)
+        return BusInput(tuple(arrivals), tuple(taken), overrun)
 
     # Zenoh's threads call the methods below.
 
     def on_sample(self, sample: zenoh.Sample) -> None:
         """Queue a sample on a native key."""
         key = str(sample.key_expr)
-        # A stop to all robots arrives under the key that it was sent on.
+        # A stop for all robots arrives with the wildcard in its key.
         key = "stop" if key == STOP_ALL else key.removeprefix(self._prefix)
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample on a ROS key as a sample of the native key that it stands for.
+        """Queue a sample on a ROS key like a sample on the native key that the ROS key stands for.
 
-        ROS keys carry no encoding, so the endpoint supplies it.
+        A ROS sample has no encoding, so `endpoint` supplies the encoding.
         """
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
@@ -201,11 +225,13 @@ class Inbox:
         put = sample.kind == zenoh.SampleKind.PUT
         stamp, stamp_ns, sender, received_ns = sample.timestamp, None, "", None
         if stamp is not None:
-            stamp_ns, sender = stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id())
-            if stamp.get_id() == self.own_id:
-                stamp_ns, sender, received_ns = None, "", stamp_ns
-            elif via == "native" and sender in self.routers:
-                sender = ""
+            at_ns, session = stamp.get_time_as_ntp64().as_nanos(), stamp.get_id()
+            if session == self.own_id:
+                received_ns = at_ns
+            else:
+                stamp_ns, sender = at_ns, str(session)
+                if via == "native" and sender in self.routers:
+                    sender = ""
         arrival = Arrival(
             key,
             put,
@@ -221,20 +247,17 @@ class Inbox:
         if key == "stop" and put:
             self._stops.put(arrival)
         else:
-            line = self._line(key)
-            # The count comes before the wake-up, because the reader takes both at once.
-            self._overrun += not line.store(arrival)
-            line.wake()
+            buffer = self._buffer(key)
+            # Count before the wake-up, because `take` takes the samples and the count together.
+            self._overrun += not buffer.store(arrival)
+            buffer.wake()
 
-    def _line(self, key: str) -> Mailbox[Arrival]:
-        """Return the buffer of a key.
-
-        The certificates of one source share it, as they share a rate limit.
-        """
-        held = self._arrivals.get(key)
-        if held is None:
-            held = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])
-        return held
+    def _buffer(self, key: str) -> Mailbox[Arrival]:
+        """Return the buffer of a key. All certificates of one source share a buffer."""
+        buffer = self._arrivals.get(key)
+        if buffer is None:
+            buffer = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])
+        return buffer
 
     def _note(self) -> None:
         self._any = True
@@ -248,36 +271,38 @@ class Inbox:
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
-        """Queue a query that matched a row of the native topic table."""
+        """Queue a query that matches `topic`, a row of the native topic table."""
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
-            return  # dropping the query ends it; a wildcard also matches the plain key
-        self._asked(query, topic, asked, "", "native")
+            # A wildcard must not call a service. It also matches the key of the JSON topic without
+            # `json/`, which answers it. Returning drops the query, which ends it.
+            return
+        self._queried(query, topic, asked, "", "native")
 
     def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:
         """Queue a call of a ROS service."""
         if str(query.key_expr) == endpoint.key:
             native = endpoint.native
-            self._asked(query, native, native, endpoint.key, endpoint.transport)
+            self._queried(query, native, native, endpoint.key, endpoint.transport)
 
-    def _line_for(self, topic: str, via: Via) -> deque[Query]:
+    def _queue_of(self, topic: str, via: Via) -> deque[Query]:
         if topic == SET:
             return self._slow
         if topic in VERBS:
             return self._services
-        return self._questions if via == "native" else self._slow
+        return self._others if via == "native" else self._slow
 
-    def _asked(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
+    def _queried(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
         arrived = clock.now()
         if topic == STOP:
-            # The stop itself never waits behind other queries and is never refused as busy.
+            # The stop itself never waits behind other queries and is never refused with `BUSY`.
             by = _bytes(query.attachment, ATTACHMENT_BYTES)
             self._stops.put(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
         if ticket is None:
             return
         encoding = query.encoding
-        held = Query(
+        item = Query(
             ticket,
             topic,
             asked,
@@ -288,19 +313,19 @@ class Inbox:
             via,
             _bytes(query.attachment, ATTACHMENT_BYTES),
         )
-        waiting = self._line_for(topic, via)
+        waiting = self._queue_of(topic, via)
         if len(waiting) >= QUERIES:
-            busy = refused(held, BUSY, arrived.wall_ns)
+            busy = refused(item, BUSY, arrived.wall_ns)
             if busy is not None:
                 self._replies.send(busy)
             self._replies.retire(ticket)
             return
-        waiting.append(held)
+        waiting.append(item)
         self._any = True
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Copy a payload, cut to `most` + 1 bytes: the extra byte shows that it is too long."""
+    """Copy at most `most` + 1 bytes of a payload. The extra byte shows that it is too long."""
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

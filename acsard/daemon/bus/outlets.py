@@ -1,10 +1,11 @@
-"""Publishes each topic on every key that has a listener.
+"""Publishes each topic on every key of the topic that has a subscriber.
 
-A topic has one outlet in the native tree and one in each ROS tree that has the topic. A message is
-encoded once per encoding, and not at all for a tree without listeners.
+A topic has native keys and perhaps ROS keys; this module calls each of them an outlet. A message is
+encoded once per encoding, and only if an outlet with that encoding has a subscriber.
 
-The control loop only leaves messages in slots, which keep the newest of each topic. A thread of its
-own encodes and sends them, so a bus that blocks costs messages and never a control period.
+The control loop only puts messages into slots, which keep the newest messages of each topic. A
+thread encodes and sends these messages, so a bus that blocks costs messages and never a control
+period.
 """
 
 from __future__ import annotations
@@ -25,32 +26,39 @@ from acsard.host.mailbox import Bell, Mailbox
 
 OPTIONS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
-    # All puts of the loop share one priority: a blocked put of another thread on the same priority
-    # would delay them.
+    # A blocked put of another thread with the same priority would delay the puts of this thread.
     "priority": zenoh.Priority.REAL_TIME,
 }
 
 HELD = 16
-"""Newest messages of one topic that wait for the thread. This is odometry of 0.16 s, longer than
-the machine or a joining client usually blocks the thread."""
+"""Size of the slot of a topic. The newest messages stay.
+
+At 100 Hz this is odometry of 0.16 s, longer than the machine or a joining client usually blocks the
+thread.
+"""
 
 STUCK_NS = NS_PER_S // 4
-"""A round of puts takes 0.1 ms, a little longer on a busy machine. If it takes longer than this,
-the bus is blocked."""
+"""If a round of puts takes longer than this, the bus is blocked.
+
+A round usually takes 0.1 ms, and a little longer on a busy machine.
+"""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
-"""Heartbeat of latched ROS topics, as rmw_zenoh sets it for samples kept for late subscribers."""
+"""Heartbeat of latched ROS topics, with the settings of rmw_zenoh."""
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
-    """Wrap a callback to run on Zenoh's receiving thread instead of a thread of its own."""
+    """Wrap a callback so that it runs in Zenoh's receiving thread, not in a thread of its own."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
 class _Outlet:
+    """The publisher of one key."""
+
     def __init__(self, publisher: Any, form: Format, gid: bytes, signed: bytes) -> None:
         self.publisher, self.form = publisher, form
         self.wanted = False
+        """True if the key has a subscriber."""
         self._gid, self._sequence = gid, 0
         self._signed = {"attachment": signed} if signed else {}
 
@@ -64,27 +72,30 @@ class _Outlet:
 
 
 class Outlets:
-    """The publishers of one session, by the native key of their topic."""
+    """The publishers of one session."""
 
     def __init__(self) -> None:
         self._outlets: dict[str, list[_Outlet]] = {}
+        """Maps the native key of each topic to its outlets."""
         self._kept: list[object] = []
+        """Zenoh's listeners, which end when nothing refers to them."""
         self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
-        """The topics that have a listener."""
+        """The topics that have a subscriber, as native keys."""
         self._slots: dict[str, Mailbox[Message]] = {}
         self._bell = Bell()
-        """Wakes the thread. One bell serves all slots, because a step fills several of them."""
+        """Wakes the thread. All slots share one bell, because a step fills several slots."""
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0
+        """Number of messages that newer ones have displaced since the last `losses`."""
         self._began_ns: int | None = None
-        """Monotonic time at which the present round began, None between rounds."""
+        """Monotonic time at which the present round of puts began; None between rounds."""
         self._error: BaseException | None = None
         self._thread = Thread(target=self._run, name="outlets", daemon=True)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
-        # Zenoh's threads call this one at a time, under the lock. The set is replaced as a whole,
-        # because the control loop may be reading it.
+        # Several threads of Zenoh call this method, so it needs a lock. It replaces the set as a
+        # whole, because the control loop may be reading the set.
         with self._counting:
             outlet.wanted = wanted
             self.wanted = frozenset(
@@ -96,15 +107,15 @@ class Outlets:
     # The control loop calls the methods below. None of them waits or calls Zenoh.
 
     def publish(self, topic: str, message: Message) -> None:
-        """Queue a message for its listeners. `flush` sends it."""
+        """Put a message into the slot of its topic. `flush` sends it."""
         if not self._slots[topic].store(message):
             self._dropped += 1
         self._waiting = True
 
     def flush(self) -> None:
-        """Wake the thread to send the queued messages.
+        """Wake the thread, which sends the messages in the slots.
 
-        Raise the error that ended the thread, if any.
+        Raises the error that has ended the thread, if there was one.
         """
         if self._error is not None:
             raise self._error
@@ -114,27 +125,30 @@ class Outlets:
 
     @property
     def behind(self) -> bool:
-        """Whether `losses` may have something to report."""
+        """True if `losses` may have losses to report."""
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return the number of messages dropped since the last call, and if the bus blocked."""
-        dropped, self._dropped = self._dropped, 0
-        began_ns, was = self._began_ns, self._stuck
-        self._stuck = began_ns is not None and now_ns - began_ns > STUCK_NS
-        return dropped, self._stuck and not was
+        """Return the number of messages dropped since the last call, and whether the bus blocks.
 
-    # The thread runs the code below.
+        The second value is true only once for each time that the bus blocks.
+        """
+        dropped, self._dropped = self._dropped, 0
+        began_ns, was_stuck = self._began_ns, self._stuck
+        self._stuck = began_ns is not None and now_ns - began_ns > STUCK_NS
+        return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
-        """Start sending. Messages published earlier wait until then."""
+        """Start the thread. Earlier messages wait for it in the slots."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
-        """Send the queued messages and stop. Give up after `timeout` s."""
+        """Let the thread send the messages in the slots and end. Wait at most `timeout` s."""
         self._leaving = True
         self._bell.ring()
         self._thread.join(timeout)
+
+    # The thread runs `_run` and `_send`.
 
     def _run(self) -> None:
         try:
@@ -170,10 +184,17 @@ class Outlets:
         gid: bytes = b"",
         signed: bytes = b"",
     ) -> None:
-        """Open `key` for a topic.
+        """Declare a publisher of a topic.
 
-        With a `gid` the samples carry an attachment of rmw_zenoh, else the attachment `signed`, if
-        any.
+        Args:
+            session: the daemon's Zenoh session.
+            topic: native key of the topic.
+            key: key to publish on.
+            form: form of the payload.
+            encoding: name of the encoding for Zenoh.
+            latched: keep the last sample for late subscribers.
+            gid: identity of a ROS publisher. With it, the samples carry an attachment of rmw_zenoh.
+            signed: attachment of the samples without a `gid`; may be empty.
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(
@@ -191,7 +212,7 @@ class Outlets:
         outlet = _Outlet(publisher, form, gid, signed)
         self._outlets.setdefault(topic, []).append(outlet)
         if latched:
-            # Its samples are kept for late subscribers, so they are always encoded.
+            # A latched publisher keeps its last sample, so each message must be encoded.
             self._count(outlet, wanted=True)
             return
 

@@ -15,19 +15,22 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 QUEUED = 1000
-"""Samples queued for a slow reader. Beyond that the oldest are dropped."""
+"""Largest number of samples that wait for a slow reader. Newer samples displace the oldest."""
 
 
 class Arrivals(Mailbox[zenoh.Sample]):
-    """The samples that Zenoh's thread hands to the reader of a subscription."""
+    """The queue from Zenoh's thread to the reader of a subscription."""
 
     def __init__(self) -> None:
         super().__init__(QUEUED)
         self.declared: list[Any] = []
-        """The Zenoh subscribers that fill it."""
+        """The Zenoh subscribers that fill this queue."""
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if none has arrived; raise `ZError` after the end."""
+        """Return the next sample, or None if no sample waits.
+
+        Raises `ZError` if no sample waits and the session has ended.
+        """
         sample = self.pop()
         if sample is None and self.closed and not self.waiting:
             raise zenoh.ZError("the session has been closed")
@@ -35,23 +38,28 @@ class Arrivals(Mailbox[zenoh.Sample]):
 
     def undeclare(self) -> None:
         """Undeclare the subscribers."""
-        for one in self.declared:
-            one.undeclare()
+        for subscriber in self.declared:
+            subscriber.undeclare()
 
 
 class Subscription:
     """The samples of a key in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
-        """Read from a queue.
+        """Read from `queue`, such as an `Arrivals`.
 
-        With `key`, skip samples that were put on another key or a wildcard.
+        If `key` is given, the subscription skips samples that were put on another key or on a
+        wildcard.
         """
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if none has arrived."""
-        for _ in range(QUEUED):  # bounded, so that a flood of other samples cannot hold the caller
+        """Return the next sample, or None if no sample waits.
+
+        Raises `ZError` if no sample waits and the session has ended.
+        """
+        # The loop is bounded, because a flood of samples on other keys must not hold the caller.
+        for _ in range(QUEUED):
             sample: zenoh.Sample | None = self._queue.try_recv()
             if sample is None or not self._key or on(self._key, sample):
                 return sample
@@ -62,11 +70,14 @@ class Subscription:
         self._queue.wakes(wake)
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Append a sample that a query fetched, as if it had been published."""
+        """Append a sample that was fetched by a query, as if it had been published."""
         self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """Yield samples until none arrives for `timeout` s or the session closes."""
+        """Yield samples until no sample arrives for `timeout` s, or until the session closes.
+
+        `timeout` None means no limit.
+        """
         quiet_since_ns = clock.mono_ns()
         try:
             while True:
@@ -79,31 +90,32 @@ class Subscription:
                     quiet_since_ns = clock.mono_ns()
                     continue
                 quiet_s = (clock.mono_ns() - quiet_since_ns) / NS_PER_S
-                left = None if timeout is None else timeout - quiet_s
-                if left is not None and left <= 0:
+                left_s = None if timeout is None else timeout - quiet_s
+                if left_s is not None and left_s <= 0:
                     return
-                self._queue.wait(left)
+                self._queue.wait(left_s)
         finally:
             self.undeclare()
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
         """Yield samples until the session closes."""
-        come, loop = asyncio.Event(), asyncio.get_running_loop()
+        arrived, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:
-            with suppress(RuntimeError):  # the event loop has ended
-                loop.call_soon_threadsafe(come.set)
+            # The event loop may have ended.
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(arrived.set)
 
         self._queue.wakes(wake)
         try:
             while True:
-                come.clear()
+                arrived.clear()
                 try:
                     sample = self.try_recv()
                 except zenoh.ZError:
                     return
                 if sample is None:
-                    await come.wait()
+                    await arrived.wait()
                     continue
                 yield sample
         finally:
@@ -114,28 +126,34 @@ class Subscription:
         try:
             self._queue.undeclare()
         except zenoh.ZError:
-            pass  # the session is closed, which undeclared them
+            # The session has closed, which undeclared the subscribers.
+            pass
 
 
 def on(key: str, sample: zenoh.Sample) -> bool:
-    """Return whether the sample was put on exactly this key, not on a wildcard that includes it."""
+    """Return whether a sample was put on exactly this key, and not on a wildcard."""
     return str(sample.key_expr) == key
 
 
 def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
-    """Return the encoding and the payload of a sample or reply, as a `Decoder` takes them."""
+    """Return the encoding and the payload of a sample or a reply, for a `Decoder`."""
     return str(sample.encoding), sample.payload.to_bytes()
 
 
 def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
-    """Subscribe to the keys. With `latched` the kept sample of each key comes first."""
+    """Subscribe to the keys, and return the queue of their samples.
+
+    If `latched` is true, the last published sample of each key comes first.
+    """
     arrivals = Arrivals()
     handler = zenoh.handlers.Callback(arrivals.put, arrivals.close)
     for key in keys:
         if latched:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-            one: Any = zenoh.ext.declare_advanced_subscriber(session, key, handler, history=history)
+            subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                session, key, handler, history=history
+            )
         else:
-            one = session.declare_subscriber(key, handler)
-        arrivals.declared.append(one)
+            subscriber = session.declare_subscriber(key, handler)
+        arrivals.declared.append(subscriber)
     return arrivals

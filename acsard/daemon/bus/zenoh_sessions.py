@@ -1,7 +1,7 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-This module holds the session settings and the reason for each. It knows no keys or messages beyond
-the rate limits.
+This module has the settings of these sessions, and the reason for each setting. It uses keys only
+for the rate limits.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.host.terminal_modes import coloured
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands accepted per key and second: enough for a zero 1 ms after a command, too few to cost a
-control period. The TLS gateway accepts as many stops. A stop beyond the limit repeats the one of
-the previous millisecond, so dropping it is safe."""
+"""Largest number of commands on a key that a session accepts, per second.
+
+It lets a zero pass 1 ms after a command, and is too low to cost a control period. The TLS gateway
+has the same limit for stops. A stop beyond the limit comes within a millisecond after another one,
+so dropping it is safe.
+"""
 
 MAX_SESSIONS = 256
-"""Clients at once, on the robot's machine and at the TLS gateway each. Idle connections of
-strangers must not keep an operator out for long."""
+"""Largest number of connections of the daemon's session, and of the TLS gateway's session."""
 
 MESSAGE_BYTES = 65536
-"""Largest message that a link accepts, bytes. The code holds commands to a far lower limit."""
+"""Largest message that a link accepts, bytes. The limit for commands is far lower."""
 
 
 def daemon_session(
@@ -45,17 +47,20 @@ def daemon_session(
     blocks until the router answers, so call it in a thread.
 
     Args:
-        sources: names of the listed command sources.
+        bus: the table `[bus]`.
+        robot_id: `robot.id`.
+        sources: names of the configured command sources.
         limited: ROS keys on which commands arrive.
         access: the value of Zenoh's `access_control`.
 
     Raises:
-        InUseError: the session cannot listen, for example because the address is taken.
+        InUseError: the session cannot listen, for example because another program uses the address.
     """
     settings = _base(bus.mode) | {
         "listen/endpoints": list(bus.plain),
         "connect/endpoints": list(bus.connect),
-        # Peers behind a router find each other by gossip only. Without a router no peers exist.
+        # Peers behind a router find each other only through gossip. Without a router the daemon has
+        # no peers.
         "scouting/gossip/enabled": bool(bus.connect),
         "timestamping/enabled": True,
         "queries_default_timeout": 3000,
@@ -75,14 +80,14 @@ def gateway_session(
     limited: tuple[str, ...],
     access: dict[str, object],
 ) -> zenoh.Session:
-    """Open the TLS gateway's session, a router.
+    """Open the TLS gateway's session: a router between TLS clients and the daemon on this machine.
 
-    It connects TLS clients with the daemon on this machine.
+    The arguments and the exception are those of `daemon_session`.
     """
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
-    # Limit puts only: a flood of DELETEs, which are not stops, must not use up the limit of the
-    # stops. The daemon's own session does not limit stops.
-    stops = _at_most("stops", ["put"], [full_key(robot_id, "stop")])
+    # The limit counts puts only. Otherwise a flood of DELETE messages, which are not stops, would
+    # use up the limit of the stops. The daemon's own session does not limit stops.
+    stops = _rate_limit("stops", ["put"], [full_key(robot_id, "stop")])
     settings |= _limits(robot_id, sources, limited, access, stops)
     settings |= {
         "listen/endpoints": list(bus.outside),
@@ -95,7 +100,10 @@ def gateway_session(
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint by which a program on this machine reaches a listen endpoint."""
+    """Return the endpoint with which a program on this machine reaches a listen endpoint.
+
+    A listen endpoint on all addresses becomes one on loopback.
+    """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
@@ -105,18 +113,20 @@ def no_endpoint(text: str) -> UsageError:
 
 
 PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+"""Settings of a session that tries to connect until it succeeds."""
 
 
 def _listening() -> dict[str, object]:
-    """Return the limits against strangers who connect and send nothing, or too much."""
+    """Return the limits for clients that connect and send nothing, or too much."""
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
-        # With 32, 300 idle connections keep an operator out for 2 s. With 512 they cost 3 MB.
+        # If only 32 connections may be pending, 300 idle connections keep an operator out for 2 s.
+        # With 512 these connections cost 3 MB.
         "transport/unicast/accept_pending": 512,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
-        # A stopped subscriber must not delay a put. By default each put waits 1 ms for room.
+        # A subscriber that does not read must not delay a put. By default each put waits 1 ms.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
@@ -129,7 +139,10 @@ def _limits(
     access: dict[str, object],
     *more: dict[str, object],
 ) -> dict[str, object]:
-    """Return the access rules and the rate limits as Zenoh settings."""
+    """Return the access rules and the rate limits as Zenoh settings.
+
+    The rate limits are those of the commands, and `more`.
+    """
     limits = [_command_limits(robot_id, sources, limited), *more]
     return {"access_control": access, "downsampling": limits}
 
@@ -139,29 +152,30 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
         raise InUseError(
-            f"cannot listen on {', '.join(where)}: {first_line(error)}; another daemon or router "
-            "may use it: stop that one, or give this one another address with --listen or in "
-            "bus.listen",
+            f"cannot listen on {', '.join(where)}: {first_line(error)}; if another daemon or "
+            "router uses the address, stop that program, or give this one another address with "
+            "--listen or in bus.listen",
         ) from error
 
 
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
-    """Open a client session to the daemon or router at `endpoint`.
+    """Open a session in Zenoh's client mode to the daemon or router at `endpoint`.
 
-    It is a client because a peer that connects to a router would reach nobody else. `tls` is the
-    directory with the certificates for an endpoint like "tls/robot.local:7449".
+    In peer mode the session would reach no program behind a router. `tls` is the directory with the
+    certificates, for an endpoint like "tls/robot.local:7449".
 
     Raises:
         UsageError: `endpoint` is not an endpoint.
-        NotPermittedError: a certificate file may not be read.
+        NotPermittedError: this user may not read a certificate file.
         CertificateError: a certificate is missing or unusable.
-        UnreachableError: no daemon or router answers there.
+        UnreachableError: no daemon or router answers at the endpoint.
     """
     if "/" not in endpoint:
         raise no_endpoint(endpoint)
     settings = _base("client") | {
         "connect/endpoints": [endpoint],
-        # A server that accepts and then sends nothing is not a daemon, and a person waits here.
+        # A server that accepts a connection and then sends nothing is not a daemon. The limit is
+        # short, because a person waits.
         "transport/unicast/open_timeout": 3000,
         "timestamping/enabled": True,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
@@ -170,24 +184,25 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     if secured and not tls:
         raise CertificateError(
             f"{endpoint} requires a certificate: add --tls DIRECTORY (tls= in Python), the "
-            "directory that `acsard tls init` or `tls add` made for you"
+            "directory that `acsard tls init` or `acsard tls add` made for you"
         )
     if secured:
-        # Zenoh reports unusable certificates as if the daemon were absent.
+        # For an unusable certificate Zenoh would report the same error as for an absent daemon.
         require_usable(tls)
         settings |= _tls(tls)
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
-        seen = trouble(endpoint, tls) if secured else ""
+        reason = trouble(endpoint, tls) if secured else ""
+        # The message leaves out Zenoh's own error, which names Zenoh's source files.
         raise UnreachableError(
             f"no daemon answers at {endpoint}: "
             + (
-                seen
+                reason
                 or "does `acsard run` run, does its bus.listen have this address, are fewer "
                 f"than {MAX_SESSIONS} clients connected? ({first_line(error)})"
             )
-        ) from None  # Zenoh's message names its own source files
+        ) from None
 
 
 def _base(mode: str) -> dict[str, object]:
@@ -195,8 +210,8 @@ def _base(mode: str) -> dict[str, object]:
         "mode": mode,
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
-        # Zenoh takes the retry settings only as a whole. With its defaults the daemon would
-        # reconnect seconds after a router comes back.
+        # Zenoh accepts the retry settings only together. With the defaults the daemon would
+        # reconnect only seconds after a router comes back.
         "connect/retry": {
             "period_init_ms": 100,
             "period_max_ms": 500,
@@ -206,9 +221,10 @@ def _base(mode: str) -> dict[str, object]:
 
 
 def _tls(directory: str) -> dict[str, object]:
-    """Return the TLS settings.
+    """Return the TLS settings with the certificates in a directory.
 
-    Both ends present a certificate of one CA, and a link ends when its certificate does.
+    Both ends of a link present a certificate of the same authority. A link closes when one of the
+    certificates expires.
     """
     certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
     return {
@@ -227,18 +243,19 @@ def _tls(directory: str) -> dict[str, object]:
 def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
-    """Return the rate limits: one per listed source, so that no source uses up another's.
+    """Return the rate limits of the command keys, of the gyro's key and of the keys `limited`.
 
-    All unlisted sources share one limit. The certificates of a source share its limit, but each
-    connection has limits of its own.
+    Each configured source has a limit of its own, so that no source uses up another's limit. All
+    other sources share one limit. All certificates of a source share the limit of the source. Zenoh
+    applies the limits to each connection separately.
     """
-    listed = [*sources, "*"]
-    below = [*source_keys(listed), *source_keys(listed, "*"), "imu"]
+    names = [*sources, "*"]
+    below = [*source_keys(names), *source_keys(names, "*"), "imu"]
     keys = [full_key(robot_id, key) for key in below]
-    return _at_most("commands", ["put", "delete"], [*keys, *limited])
+    return _rate_limit("commands", ["put", "delete"], [*keys, *limited])
 
 
-def _at_most(name: str, messages: list[str], keys: list[str]) -> dict[str, object]:
+def _rate_limit(name: str, messages: list[str], keys: list[str]) -> dict[str, object]:
     return {
         "id": name,
         "messages": messages,
@@ -261,15 +278,15 @@ def first_line(error: Exception) -> str:
 
 
 def log_from_environment() -> None:
-    """Start Zenoh's own log if RUST_LOG is set. It goes to standard output."""
+    """Start Zenoh's own log on standard output, if RUST_LOG is set."""
     if "RUST_LOG" not in os.environ:
         return
-    wish = os.environ.get("NO_COLOR")
-    # Zenoh looks at NO_COLOR alone and would colour pipes and files too.
+    before = os.environ.get("NO_COLOR")
+    # Zenoh reads only NO_COLOR, and would write colours to pipes and files too.
     if not coloured(sys.stdout):
         os.environ["NO_COLOR"] = "1"
     zenoh.try_init_log_from_env()
-    if wish is None:
+    if before is None:
         os.environ.pop("NO_COLOR", None)
     else:
-        os.environ["NO_COLOR"] = wish
+        os.environ["NO_COLOR"] = before

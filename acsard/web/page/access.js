@@ -3,15 +3,18 @@
 const AGAIN = 1000; // ms before the next attempt, while the robot does not answer an invitation
 const SHUT = [401, 403, 429]; // HTTP statuses for which a repeated request is pointless
 
-/** Exchange the token of an invitation (behind the # of the URL) for a cookie. The token is removed from the
- *  URL once it was accepted or finally rejected. Returns the reason for a rejection, or "" without one or
- *  without an invitation. `waiting(why)` is called while the robot does not answer. */
+/** Exchange the token of an invitation (behind the # of the URL) for a cookie. If the present cookie has more
+ *  permissions, ask first. The token is removed from the URL once it was accepted or finally rejected. Returns
+ *  the reason for a rejection, or "" without one or without an invitation. `waiting(why)` is called while the
+ *  robot does not answer. */
 export async function invited(waiting) {
   const token = new URLSearchParams(location.hash.slice(1)).get("token");
   if (!token) return "";
-  for (;;) {
-    const { status, error } = await shown(token);
+  for (let replace = false; ; ) {
+    const { status, error } = await shown(token, replace);
+    if (status === 409 && !replace && (replace = confirm(`${error}. Use the link anyway?`))) continue;
     if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname);
+    if (status === 409) return "";
     if (status === 401) return "this invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one (acsard web --invite)";
     if (status && status < 500) return error;
     waiting(`your invitation has no answer yet (${error}); this page sends it again`);
@@ -19,10 +22,10 @@ export async function invited(waiting) {
   }
 }
 
-async function shown(token) {
+async function shown(token, replace) {
   const headers = { "Content-Type": "application/json" };
   // The redirect leads to this page, which need not be fetched again.
-  const how = { method: "POST", headers, body: JSON.stringify({ token }), redirect: "manual" };
+  const how = { method: "POST", headers, body: JSON.stringify({ token, replace }), redirect: "manual" };
   return asked("token", how, 5000, (answer) => (answer.type === "opaqueredirect" ? { status: 303, error: "" } : null));
 }
 

@@ -4,7 +4,7 @@
 import { awake } from "./awake.js";
 import { Hand, twist, ZERO } from "./hand.js";
 
-export const SOURCE = "teleop";
+export const SOURCE = "teleop"; // a person; a program is "app", which has a lower priority
 const LOOK = 10;
 const TWICE = 50; // ms between the first and the second zero command
 const KEYS = {
@@ -102,7 +102,7 @@ export class Drive {
    *  zero, as a replay. */
   #send(cmd) {
     this.#stamp = Math.max(performance.timeOrigin + performance.now(), this.#stamp + 0.001);
-    const message = { cmd, stamp: this.#stamp, steady: true };
+    const message = { cmd, stamp: this.#stamp, steady: true, source: SOURCE };
     if (this.held) this.#link.send(message);
     else this.#link.urge(message);
   }

@@ -10,7 +10,7 @@ from acsard.calibration import prepared, solve, wheel_angles
 from acsard.calibration import runs as reading
 from acsard.calibration.evidence import Base
 from acsard.calibration.heading import of_gyro
-from acsard.calibration.log_table import read
+from acsard.calibration.log_table import Table, bounded, read
 from acsard.calibration.prepared import Prepared
 from acsard.calibration.tape_distance import Tape
 from acsard.core.config.settings import DriveConfig
@@ -33,15 +33,39 @@ def usual(seed: int = 3, plan: Plan = GUIDED) -> Drive:
     return drive(Robot(rng=np.random.default_rng(seed)), plan)
 
 
-def log_of(text: str) -> reading.Log:
-    return reading.runs(read(text.encode()))
+def table(seen: Drive, *, gyro: bool = True, places: bool = True) -> Table:
+    """Return the table that `read` makes of `seen.csv`, without the time for writing and reading.
+
+    `test_a_table_is_that_of_the_written_log` compares both.
+    """
+    counts = len(seen.t), len(seen.gyro_t) * gyro, len(seen.place_t) * places
+    ends = np.cumsum([0, *counts])
+    cells = np.full((6, ends[-1]), np.nan)
+    sensors = (
+        (seen.t, {1: seen.left, 2: seen.right}, 2),
+        (seen.gyro_t, {3: seen.gyro}, 6),
+        (seen.place_t, {4: seen.place.real, 5: seen.place.imag}, 4),
+    )
+    for begin, count, (times, values, decimals) in zip(ends, counts, sensors, strict=False):
+        rows = slice(begin, begin + count)
+        cells[0, rows] = np.round(times[:count], 6)
+        for column, sensed in values.items():
+            cells[column, rows] = np.round(sensed[:count], decimals)
+    cells = cells[:, np.argsort(cells[0], kind="stable")]
+    columns = dict(zip(("t", "left", "right", "yaw_rate", "x", "y"), cells, strict=True))
+    return Table(columns, np.zeros(ends[-1], np.int64), ("",), tuple(bounded(columns)))
 
 
-def ready(text: str) -> Prepared:
-    runs = log_of(text).runs
+def log_of(log: str | Table) -> reading.Log:
+    """Return the runs of a log, given as text or as a table."""
+    return reading.runs(read(log.encode()) if isinstance(log, str) else log)
+
+
+def ready(log: str | Table) -> Prepared:
+    runs = log_of(log).runs
     angles = [wheel_angles.angles_of(run) for run in runs]
     return prepared.prepared(runs, angles, of_gyro(runs, angles), BASE, 4.0)
 
 
-def calibrated(text: str, tape: Tape | None = None) -> solve.Calibration:
-    return solve.calibrate(log_of(text), DriveConfig(), tape)
+def calibrated(log: str | Table, tape: Tape | None = None) -> solve.Calibration:
+    return solve.calibrate(log_of(log), DriveConfig(), tape)

@@ -9,9 +9,9 @@ from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt
 from acsard.terminal.output import SENTENCES, plain
-from tests.unit.calibration.cut import calibrated, usual
+from tests.unit.calibration.cut import calibrated, table, usual
 
-FOUND = calibrated(usual().csv(places=False))
+FOUND = calibrated(table(usual(), places=False))
 REPORT = report("a.csv", FOUND, DriveConfig(), "")
 
 

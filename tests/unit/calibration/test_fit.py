@@ -16,7 +16,7 @@ from acsard.calibration.fit import (
     multipliers,
     rates,
 )
-from tests.unit.calibration.cut import BASE, ideal, ready
+from tests.unit.calibration.cut import BASE, ideal, ready, table
 
 START = np.array([1.0, 1.0, 1.0, *[0.0] * (COUNT - 3)])
 TRUTH = np.array([0.99, 1.01, 0.7])
@@ -119,7 +119,7 @@ def test_a_track_that_differs_from_block_to_block_is_as_unsure() -> None:
 
 
 def test_rates_are_those_of_the_turns() -> None:
-    rows = ready(ideal().csv(places=False)).rows
+    rows = ready(table(ideal(), places=False)).rows
     made = rates(rows, rows.turned)
     assert 0.5 < made.mean < made.fastest < 1.0
 

@@ -12,12 +12,12 @@ from acsard.calibration.evidence import COUNT, DELAY, SENSOR_X, SENSOR_Y, huber
 from acsard.calibration.heading import of_gyro, of_yaw, rows
 from acsard.calibration.log_table import LogError
 from acsard.calibration.wheel_angles import angles_of, blocks
-from tests.unit.calibration.cut import BASE, ideal, log_of, ready, usual
+from tests.unit.calibration.cut import BASE, ideal, log_of, ready, table, usual
 from tests.unit.calibration.robots import GUIDED, Drive, wander
 
 
 def headings_of(drive: Drive):  # type: ignore[no-untyped-def]
-    runs = log_of(drive.csv(places=False)).runs
+    runs = log_of(table(drive, places=False)).runs
     angles = [angles_of(run) for run in runs]
     return runs, angles, of_gyro(runs, angles)
 
@@ -116,7 +116,7 @@ AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (COUNT - 4)])
 
 
 def test_least_squares_find_both_sides_whatever_their_sign() -> None:
-    rows = ready(ideal().csv(places=False)).rows
+    rows = ready(table(ideal(), places=False)).rows
     left, right = heading.first(rows, BASE)
     assert left == pytest.approx(0.998 / 1.6, rel=1e-3)
     assert right == pytest.approx(1.002 / 1.6, rel=1e-3)
@@ -126,7 +126,7 @@ def test_least_squares_find_both_sides_whatever_their_sign() -> None:
 
 
 def test_slopes_are_those_of_what_the_wheels_say() -> None:
-    rows = ready(ideal().csv(places=False)).rows
+    rows = ready(table(ideal(), places=False)).rows
     step = 1e-6
     score = heading.evidence(rows, BASE, AT, len(rows.turned)).score.sum(axis=0)
     for index in range(4):

@@ -12,14 +12,14 @@ from acsard.calibration.improvement import (
     turns_by_positions,
     with_constant_track,
 )
-from tests.unit.calibration.cut import BASE, ideal, ready
+from tests.unit.calibration.cut import BASE, ideal, ready, table
 from tests.unit.calibration.robots import GUIDED
 
 RATE = Rates(0.5, 1.0)
 
 
 def test_every_block_is_left_out_once() -> None:
-    made = ready(ideal().csv(places=False))
+    made = ready(table(ideal(), places=False))
     fitted = fit(made.sources, made.start, places=False)
     held = [one.blocks for one in folds(fitted, made.parts, RATE)]
     assert len(held) == 5
@@ -27,7 +27,7 @@ def test_every_block_is_left_out_once() -> None:
 
 
 def test_an_ideal_robot_is_off_by_its_track_now_and_by_nothing_then() -> None:
-    made = ready(ideal().csv())
+    made = ready(table(ideal()))
     fitted = fit(made.sources, made.start, places=True)
     better = improvement(
         fitted, BASE, made.parts, RATE, made.rows, made.rows.turned, made.segments, made.steps
@@ -41,7 +41,7 @@ def test_an_ideal_robot_is_off_by_its_track_now_and_by_nothing_then() -> None:
 
 
 def test_without_anything_to_tell_an_error_by_there_is_none() -> None:
-    made = ready(ideal().csv(places=False))
+    made = ready(table(ideal(), places=False))
     fitted = fit(made.sources, made.start, places=False)
     better = improvement(
         fitted, BASE, made.parts, RATE, made.rows, np.zeros_like(made.rows.turned), [], []
@@ -52,7 +52,7 @@ def test_without_anything_to_tell_an_error_by_there_is_none() -> None:
 def test_a_slow_curve_is_no_straight() -> None:
     """The robot turns as slowly as a straight drive may, but turns much more in each metre."""
     slow = (60.0, 0.04, 0.06)
-    made = ready(ideal([*GUIDED, slow]).csv(places=False))
+    made = ready(table(ideal([*GUIDED, slow]), places=False))
     fitted = fit(made.sources, made.start, places=False)
     better = improvement(fitted, BASE, made.parts, RATE, made.rows, made.rows.turned, [], [])
     assert better.straight.before is not None
@@ -60,9 +60,9 @@ def test_a_slow_curve_is_no_straight() -> None:
 
 
 def test_positions_tell_how_far_it_turned() -> None:
-    made = ready(ideal().csv(gyro=False))
+    made = ready(table(ideal(), gyro=False))
     fitted = fit(made.sources, made.start, places=True)
-    seen, true = turns_by_positions(fitted, made.rows, BASE), ready(ideal().csv()).rows.turned
+    seen, true = turns_by_positions(fitted, made.rows, BASE), ready(table(ideal())).rows.turned
     assert np.abs(seen).sum() == pytest.approx(np.abs(true).sum(), rel=0.1)
 
 

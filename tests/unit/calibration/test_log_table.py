@@ -33,6 +33,8 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.topics import by_key
+from tests.each import each
+from tests.unit.calibration import cut
 
 LOG_HEADER = b"t,left,right,yaw_rate\n"
 
@@ -60,8 +62,8 @@ def test_other_separators_are_known_by_the_header(text: str) -> None:
     assert read(text.encode("utf-16")).columns["t"][0] == 1.5
 
 
-@pytest.mark.parametrize("place", ["first", "last"])
-@pytest.mark.parametrize("name", ["#1", "lap #2", "cw # slow", '"a, b"'])
+@each("place", ["first", "last"])
+@each("name", ["#1", "lap #2", "cw # slow", '"a, b"'])
 def test_a_run_may_have_any_sign_in_its_name(name: str, place: str) -> None:
     header, row = b"t,left,right,yaw_rate", "{},2,3,4"
     cells = [f"{name},{row}" if place == "first" else f"{row},{name}"] * 3
@@ -108,7 +110,7 @@ def test_runs_are_told_apart_by_any_name() -> None:
     assert table.runs.tolist() == [0, 1, 0]
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "words"),
     [
         (b"", "it is empty"),
@@ -194,7 +196,7 @@ FOREIGN: dict[str, bytes] = {
 }
 
 
-@pytest.mark.parametrize("how", FOREIGN)
+@each("how", FOREIGN)
 def test_what_others_write_is_the_same_table(how: str) -> None:
     table = read(FOREIGN[how])
     found = np.column_stack([table.columns[name] for name in NAMES])
@@ -202,7 +204,7 @@ def test_what_others_write_is_the_same_table(how: str) -> None:
     assert not [note for note in table.notes if "not used" not in note]
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "words"),
     [
         (written(point=",").encode(), "write numbers with a point"),
@@ -236,7 +238,7 @@ def test_garbage_anywhere_is_refused_or_left_out(garbage: bytes, at: int) -> Non
     assert len(table.runs) == len(table.columns["t"])
 
 
-@pytest.mark.parametrize(
+@each(
     ("cell", "name", "unit"),
     [
         ("t", "t", ""),
@@ -251,7 +253,7 @@ def test_a_unit_stands_in_brackets(cell: str, name: str, unit: str) -> None:
     assert parted(cell) == (name, unit)
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "unit", "times"),
     [
         ("t", "", 1.0),
@@ -363,3 +365,14 @@ def test_the_keys_are_of_the_table() -> None:
 def test_what_tells_nothing_of_wheels_or_turns_is_no_row(message: Message) -> None:
     with pytest.raises(ValueError, match="cannot be in a log"):
         row(message, 0)
+
+
+def test_a_table_is_that_of_the_written_log() -> None:
+    """`cut.table` spares the other tests the text between a drive and its table."""
+    seen = cut.usual()
+    for gyro, places in ((False, True), (True, False), (True, True)):
+        direct = cut.table(seen, gyro=gyro, places=places)
+        written = read(seen.csv(gyro=gyro, places=places).encode())
+        assert list(direct.columns) == list(written.columns)
+        for name, values in direct.columns.items():
+            assert np.allclose(values, written.columns[name], rtol=0, atol=1e-12, equal_nan=True)

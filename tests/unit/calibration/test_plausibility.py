@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration.plausibility import RefusedError, in_range, remarks, turn_units
-from tests.unit.calibration.cut import BASE, calibrated, usual
+from tests.unit.calibration.cut import BASE, calibrated, table, usual
 from tests.unit.calibration.robots import Drive
 
 DRIVE = usual()
@@ -76,7 +76,7 @@ WRONG = {
 )
 def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: str) -> None:
     with pytest.raises(RefusedError) as refused:
-        calibrated(WRONG[what].csv(gyro=gyro, places=places))
+        calibrated(table(WRONG[what], gyro=gyro, places=places))
     assert words in str(refused.value)
 
 
@@ -101,9 +101,9 @@ def odometry(robot: Drive) -> Drive:
 @pytest.mark.variations(2)
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True)])
 def test_what_was_made_of_the_same_wheels_is_told(gyro: bool, places: bool) -> None:
-    log = odometry(DRIVE).csv(gyro=gyro, places=places)
+    log = table(odometry(DRIVE), gyro=gyro, places=places)
     assert any("computed from the same wheels" in note for note in calibrated(log).notes)
-    usual_log = DRIVE.csv(gyro=gyro, places=places)
+    usual_log = table(DRIVE, gyro=gyro, places=places)
     assert not any("same wheels" in note for note in calibrated(usual_log).notes)
 
 
@@ -111,7 +111,7 @@ def test_positions_of_another_drive_are_refused() -> None:
     x, y = np.random.default_rng(1).normal(size=(2, len(DRIVE.place)))
     still = replace(DRIVE, place=x + 1j * y)
     with pytest.raises(RefusedError, match="positions"):
-        calibrated(still.csv(gyro=False))
+        calibrated(table(still, gyro=False))
 
 
 def test_multipliers_that_cannot_be_written_are_refused() -> None:

@@ -10,7 +10,7 @@ import pytest
 from acsard.calibration import positions
 from acsard.calibration.evidence import COUNT
 from acsard.calibration.wheel_angles import Block, angles_of
-from tests.unit.calibration.cut import BASE, ideal, log_of, usual
+from tests.unit.calibration.cut import BASE, ideal, log_of, table, usual
 from tests.unit.calibration.robots import Drive
 
 TRUE = np.array([0.998, 1.002, 1 / 1.6, 0.0, 0.0, 0.0, 0.0])
@@ -18,7 +18,7 @@ OFF = np.array([1.05, 0.95, 0.7, 0.0, 0.03, 0.1, -0.05, 0.0, 0.0])
 
 
 def of(drive: Drive):  # type: ignore[no-untyped-def]
-    runs = log_of(drive.csv(gyro=False)).runs
+    runs = log_of(table(drive, gyro=False)).runs
     angles = [angles_of(run) for run in runs]
     parts = [Block(0, float(b), float(b) + 8) for b in np.arange(3, 75, 8)]
     return runs, angles, positions.segments(runs, angles, parts)

@@ -20,12 +20,12 @@ from acsard.calibration.prepared import (
     turns_enough,
 )  # fmt: skip
 from acsard.calibration.wheel_angles import Block
-from tests.unit.calibration.cut import ready, usual
+from tests.unit.calibration.cut import ready, table, usual
 
 
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True), (True, True)])
 def test_it_begins_near_the_truth(gyro: bool, places: bool) -> None:
-    made = ready(usual().csv(gyro=gyro, places=places))
+    made = ready(table(usual(), gyro=gyro, places=places))
     assert len(made.sources) == gyro + places
     assert made.start[[LEFT, RIGHT]] == pytest.approx([1.0, 1.0], abs=0.05)
     assert 1 / made.start[INVERSE_TRACK] == pytest.approx(1.66, abs=0.15)
@@ -35,7 +35,7 @@ def test_sensors_of_another_time_are_refused() -> None:
     drive = usual()
     other = replace(drive, place_t=drive.place_t + 1000.0, gyro=np.zeros(0), gyro_t=np.zeros(0))
     with pytest.raises(RefusedError, match="one clock"):
-        ready(other.csv(gyro=False))
+        ready(table(other, gyro=False))
 
 
 def rows(left: list[float], right: list[float]) -> Rows:

@@ -11,12 +11,12 @@ from acsard.calibration.evidence import DELAY, INVERSE_TRACK, LEFT, RIGHT, Base
 from acsard.calibration.positions import segments
 from acsard.calibration.search import StartingPoint, search
 from acsard.calibration.wheel_angles import angles_of, blocks
-from tests.unit.calibration.cut import BASE, log_of, usual
+from tests.unit.calibration.cut import BASE, log_of, table, usual
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 
 def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> StartingPoint:
-    runs = log_of(seen.csv(gyro=False)).runs
+    runs = log_of(table(seen, gyro=False)).runs
     angles = [angles_of(run) for run in runs]
     return search(segments(runs, angles, blocks(runs, angles, 8.0)), runs, angles, base, sides)
 
@@ -34,7 +34,8 @@ def test_it_begins_near_the_truth(separation: float, radius: float) -> None:
 def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
     seen = usual()
     left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())
-    one = np.sign(begun(left).parameters[[LEFT, RIGHT]] * begun(left).parameters[INVERSE_TRACK])
+    found = begun(left).parameters
+    one = np.sign(found[[LEFT, RIGHT]] * found[INVERSE_TRACK])
     assert one.tolist() == [-1.0, 1.0]
     assert begun(mirrored).parameters[INVERSE_TRACK] < 0
 
@@ -54,8 +55,9 @@ def squares(chi: float) -> Plan:
     return [(3, 0, 0), *side * 8, *[(seconds, v, -w) for seconds, v, w in side * 8]]
 
 
-@pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
+@pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
 def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: complex) -> None:
     """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)

@@ -15,7 +15,7 @@ import pytest
 from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.solve import Calibration
 from acsard.calibration.tape_distance import Tape
-from tests.unit.calibration.cut import calibrated, usual
+from tests.unit.calibration.cut import calibrated, table, usual
 from tests.unit.calibration.robots import (
     GUIDED,
     RADIUS,
@@ -48,7 +48,7 @@ def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
         rng = np.random.default_rng(seed)
         robot = Robot(rng=rng)
         plan = GUIDED if seed % 2 else wander(rng, 80.0)
-        log = drive(robot, plan).csv(gyro=gyro, places=places)
+        log = table(drive(robot, plan), gyro=gyro, places=places)
         made.append((calibrated(log), drive(robot, wander(rng, 300.0))))
     return made
 
@@ -106,7 +106,7 @@ def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
     z = []
     for seed in range(12):
         robot = Robot(gyro_noise=0.06, slip=0.003, rng=np.random.default_rng(seed))
-        found = calibrated(drive(robot, wander(robot.rng, 100.0)).csv(places=False)).multipliers
+        found = calibrated(table(drive(robot, wander(robot.rng, 100.0)), places=False)).multipliers
         logs = found.covariance / np.outer(found.values, found.values)
         apart = np.array([0.0, -1.0, 1.0])
         off = np.log(found.values) @ apart - np.log(1.002 / 0.998)
@@ -127,7 +127,7 @@ def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
     ]
     left, right = (np.diff(counts) * 2 * np.pi / 20 / 0.001 for counts in counted)
     coarse = replace(seen, t=t[1:], left=left, right=right)
-    found = calibrated(coarse.csv(places=False)).multipliers
+    found = calibrated(table(coarse, places=False)).multipliers
     assert found.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
 
 
@@ -136,7 +136,7 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
     """A scale error of 1 % is normal for a gyro. Only positions reveal it."""
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
-    found = calibrated(replace(seen, gyro=seen.gyro * 1.01).csv(places=places)).multipliers
+    found = calibrated(table(replace(seen, gyro=seen.gyro * 1.01), places=places)).multipliers
     assert abs(found.values[0] - 1.6) < 2.2 * found.std[0]
     assert found.std[0] < 0.016
     if places:
@@ -146,7 +146,7 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
 def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
-    worth = calibrated(replace(seen, gyro=seen.gyro * 1.02).csv(places=True)).improvement
+    worth = calibrated(table(replace(seen, gyro=seen.gyro * 1.02))).improvement
     assert (worth.turn.after or math.inf) < 3.0  # deg in 360; 2 % of that are 7 deg
 
 
@@ -154,7 +154,7 @@ def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
     """The robot drives one small square. Pieces of four seconds are straights and noise."""
     side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
     robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
-    found = calibrated(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]).csv()).multipliers
+    found = calibrated(table(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]))).multipliers
     assert found.values[0] == pytest.approx(1.5, rel=0.05)
 
 
@@ -167,7 +167,7 @@ AHEAD: Plan = [
 def test_a_log_without_a_rest_tells_the_same_of_the_drive_as_one_with_rests() -> None:
     rests: Plan = [(3, 0, 0), *AHEAD, (3, 0, 0)]
     moving, resting = (
-        calibrated(drive(Robot(rng=np.random.default_rng(4)), plan).csv(places=False))
+        calibrated(table(drive(Robot(rng=np.random.default_rng(4)), plan), places=False))
         for plan in (AHEAD, rests)
     )
     assert moving.drives.metres == pytest.approx(resting.drives.metres, rel=0.02)
@@ -195,7 +195,7 @@ def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
     gyro, places = WAYS[way]
     rng = np.random.default_rng(5)
     made = drive(Robot(slip=0.05, rng=rng), wander(rng, 120.0))
-    found = calibrated(made.csv(gyro=gyro, places=places)).multipliers
+    found = calibrated(table(made, gyro=gyro, places=places)).multipliers
     assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
 
 
@@ -203,7 +203,7 @@ def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
 def test_coarse_positions_are_compared_over_a_longer_time() -> None:
     rng = np.random.default_rng(5)
     made = drive(Robot(place_noise=0.7, outliers=0.0, rng=rng), wander(rng, 600.0))
-    found = calibrated(made.csv(gyro=False)).multipliers
+    found = calibrated(table(made, gyro=False)).multipliers
     assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
 
 
@@ -222,7 +222,7 @@ def test_gaps_and_jumps_are_told_and_cost_little() -> None:
     kept = np.sin(made.t / 7) > -0.6
     jumped = made.place + np.where(made.place_t > 40, 30 - 20j, 0)
     torn = replace(made, t=made.t[kept], left=made.left[kept], right=made.right[kept], place=jumped)
-    found = calibrated(torn.csv())
+    found = calibrated(table(torn))
     assert any("gaps" in note for note in found.notes)
     assert any("jump" in note for note in found.notes)
     assert found.multipliers.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
@@ -236,7 +236,7 @@ def test_gaps_and_jumps_are_told_and_cost_little() -> None:
 def test_a_drive_that_tells_too_little_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
     gyro, places = WAYS[way]
     with pytest.raises(RefusedError, match="drive 60 s"):
-        calibrated(drive(Robot(), plan).csv(gyro=gyro, places=places))  # type: ignore[arg-type]
+        calibrated(table(drive(Robot(), plan), gyro=gyro, places=places))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

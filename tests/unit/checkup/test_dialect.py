@@ -12,6 +12,7 @@ from acsard.checkup.findings import StoppedError
 from acsard.checkup.outcomes import find
 from acsard.core.config.settings import Config, McuConfig
 from acsard.core.link.link_diagnosis import Look
+from tests.each import each
 from tests.unit.checkup.robots import Checked, Robot
 
 
@@ -94,7 +95,7 @@ def test_a_form_of_line_that_is_not_answered_is_left_for_the_other(comma: bool) 
         assert board.comma is comma
 
 
-@pytest.mark.parametrize(
+@each(
     ("faults", "wanted", "verdict", "keys"),
     [
         ((), "off", "PASS", {"mcu.link_check": "auto"}),
@@ -115,7 +116,7 @@ def test_the_check_is_used_where_it_is_known(
         assert board.sampled is (not faults)
 
 
-@pytest.mark.parametrize(
+@each(
     ("faults", "mcu", "verdict", "own"),
     [
         ((), {}, "PASS", False),

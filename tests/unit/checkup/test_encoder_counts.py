@@ -12,6 +12,7 @@ from acsard.checkup.motion import Reply
 from acsard.checkup.wheels import turn
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.link.check import Reading
+from tests.each import each
 from tests.unit.checkup.robots import Robot
 
 
@@ -24,8 +25,8 @@ def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[Rep
     return found
 
 
-@pytest.mark.parametrize("per_turn", [64, 3200, 40000])
-@pytest.mark.parametrize("speed", [3.0, -3.0])
+@each("per_turn", [64, 3200, 40000])
+@each("speed", [3.0, -3.0])
 def test_counts_per_turn_come_out_over_wraps_of_clock_and_counts(
     per_turn: int, speed: float
 ) -> None:

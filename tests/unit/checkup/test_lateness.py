@@ -9,6 +9,7 @@ import pytest
 from acsard.checkup.lateness import LEAST_S, PAUSE_S, SPOILS_S, Lateness, finding, judged, spoilt
 from acsard.checkup.motion import PERIOD_S
 from acsard.checkup.outcomes import Unsure, find
+from tests.each import each
 from tests.unit.checkup.robots import Busy, Robot, Starved
 
 
@@ -19,7 +20,7 @@ def test_the_most_since_a_moment_is_told() -> None:
     assert [lateness.since(s) for s in (0.0, 1.0, 1.5, 3.0, 3.5)] == [0.3, 0.3, 0.05, 0.05, 0.0]
 
 
-@pytest.mark.parametrize(
+@each(
     ("outcome", "late_s", "doubted"),
     [
         ("watchdog: late", SPOILS_S, True),

@@ -5,15 +5,14 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import pytest
-
 from acsard.checkup.motion import WATCHDOG_MOST_S
 from acsard.checkup.outcomes import MANUAL, OUTCOMES, find
 from acsard.checkup.procedure import STEPS
 from acsard.core.link.link_state import WATCHDOG_S
+from tests.each import each
 
 
-@pytest.mark.parametrize("outcome", MANUAL)
+@each("outcome", MANUAL)
 def test_every_outcome_is_whole(outcome: str) -> None:
     found = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, Seen()))
     assert found.name == outcome.partition(":")[0]

@@ -23,6 +23,7 @@ from acsard.checkup.restarts import (
 from acsard.core.config.settings import Config
 from acsard.core.link.check import Reading
 from acsard.core.link.session import IDENTITY
+from tests.each import each
 from tests.unit.checkup.robots import MS, Checked, Robot, check
 
 NAME = IDENTITY + b"1 counts=3200"
@@ -171,7 +172,7 @@ def test_a_board_that_does_not_come_back_is_said_not_to_have() -> None:
     assert "did not answer again within 3 s" in checked["restarts"].text
 
 
-@pytest.mark.parametrize(
+@each(
     ("cause", "mend"),
     [
         ("brown-out", "use a supply for the board alone"),
@@ -235,8 +236,8 @@ def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_before_one() -> N
     assert "text" in sign(restarts.look(TEXT, 0.2, None))
 
 
-@pytest.mark.parametrize("start_ms", [0, 40_000, CLOCK - 5_000])
-@pytest.mark.parametrize("clock", [0.98, 1.0, 1.02])
+@each("start_ms", [0, 40_000, CLOCK - 5_000])
+@each("clock", [0.98, 1.0, 1.02])
 def test_a_clock_that_runs_on_is_no_restart_at_any_pace_also_where_it_comes_round(
     start_ms: int, clock: float
 ) -> None:

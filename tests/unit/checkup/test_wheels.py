@@ -11,6 +11,7 @@ from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.link.codec import Motors
 from acsard.core.values import WHEELS
+from tests.each import each
 from tests.unit.checkup.robots import Robot
 
 MCU = McuConfig()
@@ -24,7 +25,7 @@ def seen(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0) -> Ch
     return Channel(motor, speeds(forth), speeds(back))
 
 
-@pytest.mark.parametrize(
+@each(
     ("channel", "kind"),
     [
         (seen(0, 0), "right"),

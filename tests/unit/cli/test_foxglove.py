@@ -12,6 +12,7 @@ import pytest
 
 from acsard.cli import foxglove
 from acsard.host.errors import Exit, MendableError, UsageError
+from tests.each import each
 
 
 def test_without_its_library_it_says_which_extra_to_install(
@@ -51,9 +52,7 @@ def test_beyond_this_machine_is_refused_with_the_reason_and_the_tunnel(text: str
         foxglove.loopback(text)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"]
-)
+@each("text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"])
 def test_what_is_no_address_is_told_how_to_write_one(text: str) -> None:
     with pytest.raises(UsageError, match=r"write it like 127\.0\.0\.1:8765"):
         foxglove.loopback(text)

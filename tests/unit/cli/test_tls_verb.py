@@ -30,6 +30,7 @@ from acsard.cli import main
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
+from acsard.machine.authority import Authority
 from tests.each import each
 
 ROLES = ("viewer", "operator", "maintainer")
@@ -516,8 +517,47 @@ def test_init_certifies_the_machine_s_addresses_and_prints_them(
 
 def test_renew_keeps_the_names_that_were_certified(own: Path) -> None:
     before = names_of(own)
+    assert tls("renew", "--directory", str(own), "--address", "more.local") == 0
+    assert names_of(own) >= {*before, "more.local", "robot.example", "192.0.2.7"}
+
+
+@each("words", [("renew",), ("add", "anna")])
+def test_no_certificate_is_made_that_the_authority_may_not_sign(
+    own: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    before = certificate(own).serial_number
+    more = ("--directory", str(own), "--address", "bank.example", "--address", "new.local")
+    assert tls(*words, *more) == Exit.FAILURE
+    said = capsys.readouterr().err
+    assert "may not sign for bank.example: " in said
+    assert "tls init --force --address bank.example`" in said
+    assert certificate(own).serial_number == before
+
+
+def test_renew_leaves_out_a_name_of_the_machine_that_the_authority_may_not_sign(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acsard.machine.identities.own_addresses", lambda: ["203.0.113.99"])
+    assert tls("renew", "--directory", str(own)) == 0
+    assert "203.0.113.99" not in names_of(own)
+
+
+def test_renew_warns_of_an_authority_that_may_sign_for_any_site(
+    own: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tls("renew", "--directory", str(own)) == 0
+    assert "any web site" not in capsys.readouterr().out
+    monkeypatch.setattr(Authority, "_permitted", lambda self: ())
     assert tls("renew", "--directory", str(own), "--address", "more.example") == 0
-    assert names_of(own) >= {*before, "more.example", "robot.example", "192.0.2.7"}
+    assert "may sign for any web site" in capsys.readouterr().out
+
+
+def test_without_the_authority_s_key_the_message_asks_for_it(
+    own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (own / "ca-key.pem").rename(own.parent / "ca-key.pem")
+    assert tls("renew", "--directory", str(own)) == Exit.FAILURE
+    assert "has no ca-key.pem: bring the authority's key back" in capsys.readouterr().err
 
 
 def test_add_prints_a_list_that_keeps_who_is_there(

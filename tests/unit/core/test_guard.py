@@ -433,9 +433,9 @@ class Clocked:
         return trip
 
 
-def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is_over() -> None:
+def test_ten_minutes_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is_over() -> None:
     clocked = Clocked()
-    trips = [clocked.trip(ms, "stopped") for ms in range(10, 3_600_000, 10)]
+    trips = [clocked.trip(ms, "stopped") for ms in range(10, 600_000, 10)]
     first = next(n for n, trip in enumerate(trips) if trip)
     assert trips[first] == LATE
     assert (first + 1) * 10 == 10 + 500 + MARGIN_NS // MS + 10

@@ -215,7 +215,7 @@ def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
     assert found == Wish(values.Twist(0.3, -0.2), 5 * NS_PER_S)
 
 
-@pytest.mark.parametrize(
+@each(
     ("form", "name"),
     [
         ("json", "std_msgs/msg/String"),
@@ -230,7 +230,7 @@ def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> 
         encoding_of(form, name)
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [
         b"",
@@ -248,7 +248,7 @@ def test_what_is_no_twist_is_refused(payload: bytes) -> None:
         wish(encoding_of("json", "geometry_msgs/Twist"), payload)
 
 
-@pytest.mark.parametrize("cut", range(0, 52, 4))
+@each("cut", range(0, 52, 4))
 def test_cdr_cut_anywhere_is_refused(cut: int) -> None:
     with pytest.raises(DecodeError):
         wish(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])

@@ -53,7 +53,7 @@ def grown(seconds: list[list[Message]]) -> tuple[bytes, list[int], bytes]:
 GROWS, ENDS, COMPLETE = grown(SECONDS)
 
 
-def test_a_chunk_that_grows_has_all_seconds_so_far() -> None:
+def test_a_growing_chunk_has_all_seconds_written_so_far() -> None:
     for number, end in enumerate(ENDS, start=1):
         got = read_chunk(GROWS[:end], 0)
         assert got is not None
@@ -62,7 +62,7 @@ def test_a_chunk_that_grows_has_all_seconds_so_far() -> None:
 
 
 @pytest.mark.parametrize("torn", [b"", bytes(700), DICE.randbytes(64)])
-def test_a_cut_anywhere_costs_the_second_that_it_is_in(torn: bytes) -> None:
+def test_a_cut_at_any_byte_costs_only_its_second(torn: bytes) -> None:
     for cut in range(len(GROWING_HEAD), len(GROWS), 7):
         whole = sum(end <= cut for end in ENDS)
         got = read_chunk(GROWS[:cut] + torn, 0)
@@ -72,7 +72,7 @@ def test_a_cut_anywhere_costs_the_second_that_it_is_in(torn: bytes) -> None:
         assert len(got.messages) <= 3 * (whole + 1)
 
 
-def test_the_formats_own_reader_reads_a_complete_chunk_and_one_that_was_cut_and_ended() -> None:
+def test_the_mcap_library_reads_a_complete_chunk_and_a_cut_chunk_that_was_ended() -> None:
     cut = read_chunk(GROWS[: ENDS[6] + 9], 0)
     assert cut is not None
     ended = cut.head(GROWS) + GROWS[len(GROWING_HEAD) : cut.end] + LAST_BLOCK
@@ -87,7 +87,7 @@ def test_the_formats_own_reader_reads_a_complete_chunk_and_one_that_was_cut_and_
         assert struct.unpack_from("<Q", data, 1)[0] == len(data) - 9
 
 
-def test_no_damage_changes_a_message_and_none_in_the_head_costs_one() -> None:
+def test_damage_never_changes_a_message_and_damage_in_the_head_costs_no_message() -> None:
     for at in range(len(COMPLETE)):
         bad = bytearray(COMPLETE)
         bad[at] ^= 1 << DICE.randrange(8)
@@ -101,13 +101,13 @@ def test_no_damage_changes_a_message_and_none_in_the_head_costs_one() -> None:
         assert len(got.messages) >= 3 * second
 
 
-def test_a_chunk_may_begin_wherever_the_name_of_its_compression_is() -> None:
+def test_each_compression_name_may_belong_to_the_head_of_a_chunk() -> None:
     assert list(chunk_places(bytes(100) + COMPLETE + COMPLETE, 0)) == [100, 100 + len(COMPLETE)]
     assert read_chunk(bytes(100), 0) is None
     assert read_chunk(ZSTD, 0) is None
 
 
-def test_a_chunk_of_very_many_blocks_takes_a_time_in_proportion() -> None:
+def test_the_time_to_read_a_chunk_is_proportional_to_the_number_of_its_blocks() -> None:
     chunk, data, message = GrowingChunk(), GROWING_HEAD, Message(1, 5, b"")
     parts = []
     for _ in range(20_000):
@@ -121,7 +121,7 @@ def test_a_chunk_of_very_many_blocks_takes_a_time_in_proportion() -> None:
     assert time.process_time() - began < 2.0
 
 
-def test_many_chunks_that_ask_for_megabytes_take_a_time_in_proportion() -> None:
+def test_the_time_to_read_chunks_that_claim_megabytes_is_proportional_to_their_number() -> None:
     """Each claims a message of 4 MB that does not end, so each must be decompressed."""
     inside = struct.pack("<BQ", 5, MAX_MESSAGE_BYTES - 100) + bytes(MAX_MESSAGE_BYTES - 200)
     packed = zstandard.ZstdCompressor(compression_params=PARAMETERS).compress(inside)
@@ -158,7 +158,7 @@ def raw(data: bytes) -> bytes:
 
 
 @each("first", [b"\0", struct.pack("<BQ", 5, 1 << 28), struct.pack("<BQ", 5, MAX_MESSAGE_BYTES)])
-def test_a_few_bytes_that_ask_for_gigabytes_get_nothing(first: bytes) -> None:
+def test_a_few_bytes_that_claim_gigabytes_get_no_memory(first: bytes) -> None:
     """The first byte of a message is its type, the next eight are its length."""
     data = GROWING_HEAD + FRAME_HEAD + raw(first) + REPEATED * 30_000
     began = time.process_time()
@@ -176,9 +176,7 @@ NEXT = GROWING_HEAD[:1] + struct.pack("<Q", EACH - 9) + GROWING_HEAD[9:]
     ("tail", "head"),
     [(REPEATED * 62, GROWING_HEAD), (REPEATED * 62, NEXT), (b"\x0a\0\0x" * 4000, GROWING_HEAD)],
 )
-def test_many_chunks_that_share_their_end_take_a_time_in_proportion(
-    tail: bytes, head: bytes
-) -> None:
+def test_the_time_to_read_chunks_that_share_their_end_is_limited(tail: bytes, head: bytes) -> None:
     data = with_a_shared_tail(1000, tail, head)
     began = time.process_time()
     found = list(walk(data))
@@ -187,7 +185,7 @@ def test_many_chunks_that_share_their_end_take_a_time_in_proportion(
     assert not any(one.messages for one in found)
 
 
-def test_the_beginnings_of_damaged_chunks_and_a_whole_one_behind_them_are_read() -> None:
+def test_the_beginnings_of_damaged_chunks_and_the_complete_chunk_after_them_are_read() -> None:
     bad = bytearray(COMPLETE)
     bad[ENDS[4] + 3 :] = b"\xff" * (len(bad) - ENDS[4] - 3)
     *damaged, last = walk(MAGIC + bytes(bad) * 200 + COMPLETE)

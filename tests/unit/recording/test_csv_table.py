@@ -33,7 +33,7 @@ def tape() -> Tape:
     return tape
 
 
-def test_a_line_for_each_feedback_and_each_report_of_the_gyro(tape: Tape) -> None:
+def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(tape: Tape) -> None:
     robot = Robot(GYRO)
     lines: list[str] = []
     for step in tape.steps():
@@ -47,7 +47,9 @@ def test_a_line_for_each_feedback_and_each_report_of_the_gyro(tape: Tape) -> Non
     assert ["driving", "up", "app"] in [row[-3:] for row in cells]
 
 
-def test_calibration_reads_the_whole_table_and_what_is_measured_alike(tape: Tape) -> None:
+def test_calibration_reads_the_same_from_the_whole_table_and_from_the_measured_columns(
+    tape: Tape,
+) -> None:
     robot, twin = Robot(GYRO), Robot(GYRO)
     whole, part = [HEADER], [MEASURED_HEADER]
     for step in tape.steps():
@@ -62,7 +64,7 @@ def test_calibration_reads_the_whole_table_and_what_is_measured_alike(tape: Tape
     np.testing.assert_allclose(fr[~np.isnan(fr)], speeds, rtol=1e-5)
 
 
-def test_times_are_those_of_the_samples(tape: Tape) -> None:
+def test_the_times_in_the_table_are_those_of_the_samples(tape: Tape) -> None:
     estimate = tape.taken[-1].outputs.estimates or tape.taken[-2].outputs.estimates
     wall_ns = estimate[0].at.wall_ns
     assert wheel_columns(estimate[0]).startswith(f"{wall_ns // 10**9}.{wall_ns % 10**9 // 1000:06}")

@@ -58,7 +58,7 @@ def sizes(where: Path) -> int:
     return sum(path.stat().st_size for path in listed(where))
 
 
-def test_files_are_numbered_on_whatever_the_clock_says(tmp_path: Path) -> None:
+def test_file_numbers_increase_whatever_the_clock_shows(tmp_path: Path) -> None:
     one = ring(tmp_path)
     for wall_ns in (NOW_NS, 0, NOW_NS - DAY_NS):
         one.end(one.begin(about(wall_ns)), "plain")
@@ -71,7 +71,7 @@ def test_files_are_numbered_on_whatever_the_clock_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("umask", [0, 0o077])
-def test_the_directory_is_the_services_and_its_groups(tmp_path: Path, umask: int) -> None:
+def test_the_service_and_its_group_may_read_the_directory(tmp_path: Path, umask: int) -> None:
     before = os.umask(umask)
     try:
         one = ring(tmp_path / "b")
@@ -86,7 +86,7 @@ def modes(where: Path) -> set[int]:
     return {path.stat().st_mode & 0o777 for path in listed(where)}
 
 
-def test_the_service_s_directory_lets_in_whoever_gets_there_but_to_its_lock(
+def test_every_user_may_read_the_directory_of_a_service_but_not_open_its_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     where = tmp_path / "b"
@@ -117,7 +117,7 @@ def test_the_service_s_directory_lets_in_whoever_gets_there_but_to_its_lock(
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="gives a directory away")
-def test_a_directory_that_is_somebody_else_s_is_recorded_to_all_the_same(
+def test_recording_works_in_a_directory_of_another_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ACSARD_RECORD", ".")
@@ -137,7 +137,9 @@ def test_a_directory_that_is_somebody_else_s_is_recorded_to_all_the_same(
     assert modes(tmp_path) == {0o644}
 
 
-def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path: Path) -> None:
+def test_beyond_the_limit_in_bytes_the_oldest_files_go_first_and_protected_ones_last(
+    tmp_path: Path,
+) -> None:
     one = ring(tmp_path)
     kept = record(one, 400_000, kind="kept")
     first = record(one, 400_000)
@@ -151,7 +153,7 @@ def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path:
 
 
 @pytest.mark.slow
-def test_room_is_made_among_many_files_in_a_time_that_grows_as_they_do(tmp_path: Path) -> None:
+def test_the_time_to_make_room_is_proportional_to_the_number_of_files(tmp_path: Path) -> None:
     first = record(ring(tmp_path / "first"))
 
     def seconds(count: int, turn: int) -> float:
@@ -169,7 +171,7 @@ def test_room_is_made_among_many_files_in_a_time_that_grows_as_they_do(tmp_path:
     assert many < 24 * few, "8 times as many; their square would be 64 times"
 
 
-def test_only_kept_files_are_bounded_in_bytes_too(tmp_path: Path) -> None:
+def test_protected_files_count_for_the_limit_in_bytes(tmp_path: Path) -> None:
     one = ring(tmp_path)
     for _ in range(30):
         newest = record(one, 400_000, kind="kept")
@@ -178,7 +180,7 @@ def test_only_kept_files_are_bounded_in_bytes_too(tmp_path: Path) -> None:
     assert newest.exists()
 
 
-def test_days_are_bounded_but_not_of_the_last_fifty_in_which_something_happened(
+def test_old_files_go_except_the_last_fifty_with_an_incident(
     tmp_path: Path,
 ) -> None:
     one = ring(tmp_path, days=2.0)
@@ -191,7 +193,7 @@ def test_days_are_bounded_but_not_of_the_last_fifty_in_which_something_happened(
     assert [path.exists() for path in (fresh, old, new)] == [True, False, True]
 
 
-def test_what_ended_in_this_run_is_not_old_and_a_clock_that_was_just_set_tells_no_age(
+def test_no_file_of_this_run_is_too_old_and_a_clock_that_was_just_set_is_not_trusted(
     tmp_path: Path,
 ) -> None:
     before = ring(tmp_path, days=2.0)
@@ -211,7 +213,7 @@ def test_what_ended_in_this_run_is_not_old_and_a_clock_that_was_just_set_tells_n
     assert (old.exists(), mine.exists()) == (False, True)
 
 
-def test_what_ended_before_the_clock_was_set_is_no_older_for_that(tmp_path: Path) -> None:
+def test_a_jump_of_the_clock_does_not_make_earlier_files_older(tmp_path: Path) -> None:
     one = ring(tmp_path, days=2.0)
     mine = record(one)
     ended_ns = mine.stat().st_mtime_ns
@@ -227,7 +229,7 @@ def test_what_ended_before_the_clock_was_set_is_no_older_for_that(tmp_path: Path
     assert mine.exists()
 
 
-def test_where_others_have_taken_the_disk_the_oldest_go_and_what_is_kept_stays(
+def test_if_other_programs_fill_the_disk_the_oldest_files_go_and_protected_ones_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = ring(tmp_path)
@@ -254,7 +256,7 @@ def test_where_others_have_taken_the_disk_the_oldest_go_and_what_is_kept_stays(
     assert left == [(3, True), (1, True), (0, True), (0, False)]
 
 
-def test_what_is_being_written_and_what_is_not_ours_stays(tmp_path: Path) -> None:
+def test_the_current_file_and_files_of_other_programs_are_never_deleted(tmp_path: Path) -> None:
     one = ring(tmp_path, days=0.01)
     (tmp_path / "notes.mcap").write_bytes(b"mine")
     (tmp_path / "notes-1.txt").write_bytes(b"mine")
@@ -265,7 +267,7 @@ def test_what_is_being_written_and_what_is_not_ours_stays(tmp_path: Path) -> Non
     assert len(listed(tmp_path)) == 1
 
 
-def test_a_file_becomes_a_kept_one_later(tmp_path: Path) -> None:
+def test_a_finished_file_can_be_retained_later(tmp_path: Path) -> None:
     one = ring(tmp_path)
     path = record(one)
     one.retain(path)
@@ -276,7 +278,7 @@ def test_a_file_becomes_a_kept_one_later(tmp_path: Path) -> None:
     assert listed(tmp_path) == [near]
 
 
-def test_what_a_crash_has_cut_is_made_whole_and_kept(tmp_path: Path) -> None:
+def test_a_file_that_a_crash_cut_is_finished_and_protected(tmp_path: Path) -> None:
     one = ring(tmp_path)
     writing = one.begin(about())
     writing.add("steps", NOW_NS, b"whole")
@@ -298,7 +300,7 @@ def test_what_a_crash_has_cut_is_made_whole_and_kept(tmp_path: Path) -> None:
     again.close()
 
 
-def test_what_a_disk_has_cut_is_made_whole_like_any_other(tmp_path: Path) -> None:
+def test_a_file_that_a_disk_error_cut_is_finished_and_keeps_its_class(tmp_path: Path) -> None:
     one = ring(tmp_path)
     writing = one.begin(about())
     writing.add("steps", NOW_NS, b"whole")
@@ -313,7 +315,7 @@ def test_what_a_disk_has_cut_is_made_whole_like_any_other(tmp_path: Path) -> Non
     assert last.cut == "disk"
 
 
-def test_two_daemons_do_not_record_to_one_place(tmp_path: Path) -> None:
+def test_two_daemons_cannot_record_to_the_same_directory(tmp_path: Path) -> None:
     one = ring(tmp_path)
     writing = one.begin(about())
     with pytest.raises(OSError, match="another daemon records there"):
@@ -324,7 +326,7 @@ def test_two_daemons_do_not_record_to_one_place(tmp_path: Path) -> None:
     ring(tmp_path).close()
 
 
-def test_what_only_has_a_recording_s_name_is_none_of_them(tmp_path: Path) -> None:
+def test_a_pipe_or_a_link_with_the_name_of_a_recording_is_not_one(tmp_path: Path) -> None:
     """A pipe would block its reader forever, and a link leads elsewhere."""
     whole = tmp_path / "000001-20260101T000000Z.mcap"
     whole.touch()
@@ -336,7 +338,7 @@ def test_what_only_has_a_recording_s_name_is_none_of_them(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("event", [b"", b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'])
-def test_what_was_cut_and_cannot_be_read_here_stays_and_is_told(
+def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
     tmp_path: Path, event: bytes
 ) -> None:
     """The file comes from a later version, or contains an event that no version writes."""
@@ -355,13 +357,13 @@ def test_what_was_cut_and_cannot_be_read_here_stays_and_is_told(
     assert ("acsard/99" if not event else "an event that cannot be read") in said
 
 
-def test_a_copy_that_did_not_become_whole_goes(tmp_path: Path) -> None:
+def test_an_incomplete_copy_is_deleted(tmp_path: Path) -> None:
     (left := tmp_path / f".000007-20270115T080000Z{PART}.new").write_bytes(b"half")
     Ring(RecordConfig(str(tmp_path)), run=Run())
     assert not left.exists()
 
 
-def test_a_file_that_somebody_removes_meanwhile_costs_nothing(
+def test_a_file_that_another_process_removes_meanwhile_does_no_harm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The file disappears between the listing and the look at it.

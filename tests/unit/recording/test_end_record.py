@@ -63,7 +63,7 @@ def test_a_chunk_that_unpacks_to_megabytes_is_not_unpacked(case: str, tmp_path: 
         tracemalloc.stop()
 
 
-def test_a_recording_of_the_daemon_ends_within_a_fraction_of_the_bytes_that_are_read(
+def test_the_end_record_lies_well_within_the_bytes_that_are_searched(
     tmp_path: Path,
 ) -> None:
     tape, path = Tape(), tmp_path / "a.mcap"
@@ -89,13 +89,15 @@ def test_a_recording_of_the_daemon_ends_within_a_fraction_of_the_bytes_that_are_
         pytest.param(FRONT + BACK.replace(b"wall_ns", b"wall\xff\xff\xff") + footer(0), id="text"),
     ],
 )
-def test_a_file_without_a_valid_end_has_none(data: bytes, tmp_path: Path) -> None:
+def test_a_file_without_a_valid_end_has_no_end_record(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(data)
     assert read_end(path) is None
 
 
-def test_many_names_of_the_record_take_a_time_in_proportion(tmp_path: Path) -> None:
+def test_the_time_to_search_many_names_of_the_record_is_proportional_to_their_number(
+    tmp_path: Path,
+) -> None:
     """Only the last one that has the form of the record is decoded."""
     path, name = tmp_path / "a.mcap", struct.pack("<I", len(END)) + END.encode()
     path.write_bytes(FRONT + BACK + name * 4000 + footer(0))

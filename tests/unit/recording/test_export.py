@@ -56,7 +56,7 @@ TOPICS = {
 }  # fmt: skip
 
 
-def test_the_library_of_mcap_finds_it_finished_indexed_and_compressed(
+def test_the_mcap_library_finds_the_export_finished_indexed_and_compressed(
     path: Path, tmp_path: Path
 ) -> None:
     new = tmp_path / "new.mcap"
@@ -93,7 +93,7 @@ def counted(reader: Any) -> Counter[str]:
     return counts
 
 
-def test_rosbags_reads_every_message_by_what_stands_in_the_file_alone(
+def test_rosbags_reads_every_message_with_the_definitions_in_the_file(
     path: Path, tmp_path: Path
 ) -> None:
     recording = Recording(path)
@@ -108,9 +108,7 @@ def test_rosbags_reads_every_message_by_what_stands_in_the_file_alone(
     assert bag.total() == one.count == other.count
 
 
-def test_a_bag_is_a_directory_whose_metadata_are_those_of_its_file(
-    path: Path, tmp_path: Path
-) -> None:
+def test_a_bag_is_a_directory_whose_metadata_match_its_file(path: Path, tmp_path: Path) -> None:
     export(Recording(path), tmp_path / "bag", "rosbag2")
     assert {one.name for one in (tmp_path / "bag").iterdir()} == {"bag_0.mcap", "metadata.yaml"}
     with Reader(tmp_path / "bag") as reader:
@@ -125,7 +123,7 @@ def test_a_bag_is_a_directory_whose_metadata_are_those_of_its_file(
     assert set(latched.values()) == {"VOLATILE"}
 
 
-def test_a_namespace_is_in_front_of_every_topic(path: Path, tmp_path: Path) -> None:
+def test_every_topic_begins_with_the_namespace(path: Path, tmp_path: Path) -> None:
     config = replace(Config(), ros=replace(Config().ros, namespace="robot1"))
     export(Recording(path), tmp_path / "new.mcap", "mcap", config)
     with (tmp_path / "new.mcap").open("rb") as stream:
@@ -134,7 +132,7 @@ def test_a_namespace_is_in_front_of_every_topic(path: Path, tmp_path: Path) -> N
     assert {one.topic for one in summary.channels.values()} == {f"/robot1{one}" for one in TOPICS}
 
 
-def test_only_what_was_in_a_time_is_written(path: Path, tmp_path: Path) -> None:
+def test_only_messages_of_the_time_span_are_written(path: Path, tmp_path: Path) -> None:
     new = tmp_path / "new.mcap"
     begin_ns, end_ns = START.wall_ns + 5 * 10**8, START.wall_ns + 10**9
     export(Recording(path), new, "mcap", span=Span(0.5, 1.0))
@@ -146,14 +144,16 @@ def test_only_what_was_in_a_time_is_written(path: Path, tmp_path: Path) -> None:
     assert end_ns - 20_000_000 < max(times) <= end_ns
 
 
-def test_a_time_with_nothing_in_it_writes_nothing(path: Path, tmp_path: Path) -> None:
+def test_a_time_span_without_messages_writes_no_file(path: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nothing in that span of time"):
         export(Recording(path), tmp_path / "new.mcap", "mcap", span=Span(1000.0))
     assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_stands_there_stays_unless_it_is_to_go(kind: Kind, path: Path, tmp_path: Path) -> None:
+def test_an_existing_file_is_replaced_only_with_force(
+    kind: Kind, path: Path, tmp_path: Path
+) -> None:
     new, recording = tmp_path / "new", Recording(path)
     first = export(recording, new, kind)
     with pytest.raises(FileExistsError):
@@ -164,7 +164,7 @@ def test_what_stands_there_stays_unless_it_is_to_go(kind: Kind, path: Path, tmp_
     assert [*tmp_path.iterdir()] == [new]
 
 
-def test_a_directory_that_is_no_bag_never_goes(path: Path, tmp_path: Path) -> None:
+def test_a_directory_that_is_not_a_bag_is_never_replaced(path: Path, tmp_path: Path) -> None:
     new = tmp_path / "thesis"
     new.mkdir()
     (new / "chapter").write_text("1")
@@ -175,7 +175,7 @@ def test_a_directory_that_is_no_bag_never_goes(path: Path, tmp_path: Path) -> No
     assert [*tmp_path.iterdir()] == [new]
 
 
-def test_a_bag_with_anything_else_in_it_never_goes(path: Path, tmp_path: Path) -> None:
+def test_a_bag_with_other_files_in_it_is_never_replaced(path: Path, tmp_path: Path) -> None:
     for name in ("notes.txt", "photos", "kept.mcap"):
         new = tmp_path / f"bag {name}"
         export(Recording(path), new, "rosbag2")
@@ -193,7 +193,7 @@ def test_a_bag_with_anything_else_in_it_never_goes(path: Path, tmp_path: Path) -
         assert sorted(new.iterdir()) == before
 
 
-def test_a_link_to_a_bag_goes_and_the_bag_stays(path: Path, tmp_path: Path) -> None:
+def test_a_link_to_a_bag_is_replaced_and_the_bag_stays(path: Path, tmp_path: Path) -> None:
     bag, link = tmp_path / "bag", tmp_path / "link"
     export(Recording(path), bag, "rosbag2")
     link.symlink_to(bag)
@@ -214,7 +214,7 @@ def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> Non
     assert [*tmp_path.iterdir()] == [bag]
 
 
-def test_what_is_no_file_never_goes(path: Path, tmp_path: Path) -> None:
+def test_a_device_or_a_pipe_is_never_replaced(path: Path, tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for kind in KINDS:
@@ -223,7 +223,7 @@ def test_what_is_no_file_never_goes(path: Path, tmp_path: Path) -> None:
     assert pipe.is_fifo()
 
 
-def test_a_recording_never_goes(path: Path, tmp_path: Path) -> None:
+def test_a_recording_is_never_replaced(path: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     before = path.read_bytes()
     other.write_bytes(before)
@@ -243,7 +243,7 @@ def umask(mask: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])
-def test_who_may_read_it_is_what_the_umask_says(mask: int, path: Path, tmp_path: Path) -> None:
+def test_the_umask_decides_who_may_read_an_export(mask: int, path: Path, tmp_path: Path) -> None:
     begin = Span(end=0.1)
     with umask(mask):
         export(Recording(path), tmp_path / "a.csv", "csv", span=begin)
@@ -253,7 +253,7 @@ def test_who_may_read_it_is_what_the_umask_says(mask: int, path: Path, tmp_path:
     assert stat.S_IMODE((tmp_path / "bag").stat().st_mode) == 0o777 & ~mask
 
 
-def test_of_a_recording_that_was_cut_what_is_whole_is_written(path: Path, tmp_path: Path) -> None:
+def test_the_readable_part_of_a_cut_recording_is_exported(path: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     begin, end = chunks(path.read_bytes())[-1]
     cut.write_bytes(path.read_bytes()[: (begin + end) // 2])
@@ -267,7 +267,7 @@ def test_of_a_recording_that_was_cut_what_is_whole_is_written(path: Path, tmp_pa
     assert summary.statistics.message_count == done.count > 100
 
 
-def test_steps_that_are_missing_end_it_and_are_told(path: Path, tmp_path: Path) -> None:
+def test_an_export_ends_at_missing_steps_and_reports_them(path: Path, tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     begin, end = chunks(data)[-2]
     data[(begin + end) // 2] ^= 0xFF
@@ -279,7 +279,7 @@ def test_steps_that_are_missing_end_it_and_are_told(path: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_of_a_file_cut_and_damaged_anywhere_something_is_written_or_it_is_said_why_not(
+def test_an_export_of_a_damaged_file_writes_messages_or_says_why_not(
     seed: int, path: Path, tmp_path: Path
 ) -> None:
     dice = random.Random(seed)
@@ -303,13 +303,13 @@ def test_of_a_file_cut_and_damaged_anywhere_something_is_written_or_it_is_said_w
         assert done.trouble or not recording.whole
 
 
-def test_how_far_it_has_come_is_told_now_and_then(path: Path, tmp_path: Path) -> None:
+def test_an_export_reports_its_progress(path: Path, tmp_path: Path) -> None:
     told: list[int] = []
     export(Recording(path), tmp_path / "new.csv", "csv", progress=told.append)
     assert told[0] >= START.wall_ns
     assert told == sorted(told)
 
 
-def test_a_recording_without_a_gyro_is_no_use_for_calibration(path: Path) -> None:
+def test_calibration_refuses_a_recording_without_a_gyro(path: Path) -> None:
     with pytest.raises(RecordingError, match="no gyro"):
         measured(Recording(path))

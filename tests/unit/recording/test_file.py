@@ -47,7 +47,7 @@ def numbers(path: Path) -> list[int]:
     return [step.number for step in steps(Recording(path))]
 
 
-def test_all_comes_back(tape: Tape, whole: Path) -> None:
+def test_all_recorded_data_is_read_back(tape: Tape, whole: Path) -> None:
     recording = Recording(whole)
     read = list(steps(recording))
     assert [step.inputs for step in read] == [taken.inputs for taken in tape.taken]
@@ -57,7 +57,7 @@ def test_all_comes_back(tape: Tape, whole: Path) -> None:
     assert replay_file(recording).comparison.same
 
 
-def test_the_formats_own_reader_reads_it(tape: Tape, whole: Path) -> None:
+def test_the_mcap_library_reads_a_recording(tape: Tape, whole: Path) -> None:
     with whole.open("rb") as stream:
         reader = make_reader(stream)
         summary = reader.get_summary()
@@ -111,14 +111,12 @@ def test_an_idle_day_is_less_than_90_mb_and_one_of_driving_less_than_400(
     assert 0 < (much - little) / ((ended_ns - began_ns) / 1e9) * 86_400 < most
 
 
-def test_the_service_and_its_group_may_read_it_and_nobody_else(whole: Path) -> None:
+def test_only_the_service_and_its_group_may_read_a_recording(whole: Path) -> None:
     assert whole.stat().st_mode & 0o777 == MODE == 0o640
 
 
 @pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
-def test_of_a_file_that_was_cut_anywhere_every_whole_chunk_is_read(
-    whole: Path, tmp_path: Path, cuts: int
-) -> None:
+def test_every_complete_chunk_of_a_cut_file_is_read(whole: Path, tmp_path: Path, cuts: int) -> None:
     data, dice, path = whole.read_bytes(), random.Random(1), tmp_path / "cut.mcap"
     (first, _), *_ = ends = chunks(data)
     every = numbers(whole)
@@ -184,7 +182,7 @@ def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
             assert numbers(cut)[: len(safe)] == safe
 
 
-def test_a_chunk_covers_about_ten_seconds_and_a_clock_that_is_set_ends_it(tmp_path: Path) -> None:
+def test_a_chunk_covers_about_ten_seconds_and_a_jump_of_the_clock_ends_it(tmp_path: Path) -> None:
     path = tmp_path / "long.mcap"
     writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
     for second in (*range(25), 1_000_000, 3):
@@ -210,7 +208,7 @@ def test_a_chunk_has_at_most_about_a_mebibyte(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
-def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
+def test_a_file_that_was_cut_before_its_first_chunk_is_refused_with_a_message(
     whole: Path, tmp_path: Path, cuts: int
 ) -> None:
     data, dice, path = whole.read_bytes(), random.Random(5), tmp_path / "cut.mcap"
@@ -230,7 +228,7 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
 
 
 @pytest.mark.parametrize("files", [15, pytest.param(200, marks=pytest.mark.slow)])
-def test_of_a_file_with_damaged_chunks_all_others_are_read(
+def test_all_undamaged_chunks_of_a_damaged_file_are_read(
     whole: Path, tmp_path: Path, files: int
 ) -> None:
     data, dice, path = whole.read_bytes(), random.Random(2), tmp_path / "damaged.mcap"
@@ -267,9 +265,7 @@ def test_a_chunk_whose_head_is_damaged_costs_nothing(
     assert numbers(path) == numbers(whole)
 
 
-def test_where_two_chunks_beside_one_another_are_damaged_all_others_are_read(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_two_neighbouring_damaged_chunks_cost_no_other_chunk(whole: Path, tmp_path: Path) -> None:
     """The first chunk claims the length of both, and its content is damaged as well."""
     bad, path = bytearray(whole.read_bytes()), tmp_path / "two.mcap"
     (begin, middle), (_, end) = chunks(bad)[1:3]
@@ -283,7 +279,7 @@ def test_where_two_chunks_beside_one_another_are_damaged_all_others_are_read(
     assert (recording.ended, recording.whole) == (True, False)
 
 
-def test_of_two_damaged_chunks_beside_one_another_both_beginnings_are_read(tmp_path: Path) -> None:
+def test_the_beginnings_of_two_neighbouring_damaged_chunks_are_read(tmp_path: Path) -> None:
     path = tmp_path / "two.mcap"
     writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
     for _ in range(4):
@@ -305,7 +301,7 @@ def test_of_two_damaged_chunks_beside_one_another_both_beginnings_are_read(tmp_p
     assert (recording.damaged, recording.ended) == (2, True)
 
 
-def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_path: Path) -> None:
+def test_random_bytes_in_a_file_raise_only_recording_errors(whole: Path, tmp_path: Path) -> None:
     data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
     said: list[str] = []
     for _ in range(40):
@@ -322,7 +318,7 @@ def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_p
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
-def test_another_file_is_refused_in_words(data: bytes, tmp_path: Path) -> None:
+def test_a_file_of_another_program_is_refused_with_a_message(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "other"
     path.write_bytes(data)
     with pytest.raises(RecordingError, match="not a recording of acsard"):
@@ -332,7 +328,7 @@ def test_another_file_is_refused_in_words(data: bytes, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["wall_ns", "mono_ns", "started_ns"])
-def test_a_time_that_no_calendar_has_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_time_outside_of_the_calendar_is_refused(name: str, tmp_path: Path) -> None:
     now = Config()
     about = About(now.robot.id, "0.1.0", "3.11.0", 1, 2, "\n".join(document(effective(now))))
     path = tmp_path / "far.mcap"
@@ -341,7 +337,7 @@ def test_a_time_that_no_calendar_has_is_refused(name: str, tmp_path: Path) -> No
         Recording(path)
 
 
-def test_an_event_of_no_time_is_none(tape: Tape, tmp_path: Path) -> None:
+def test_an_event_without_a_valid_time_is_refused(tape: Tape, tmp_path: Path) -> None:
     path = tmp_path / "far.mcap"
     tape.write(path, Config())
     recording, far = Recording(path), b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'
@@ -352,7 +348,7 @@ def test_an_event_of_no_time_is_none(tape: Tape, tmp_path: Path) -> None:
         rewrite(Recording(tmp_path / "new.mcap"), tmp_path / "other.mcap")
 
 
-def test_what_was_cut_becomes_a_finished_file(whole: Path, tmp_path: Path) -> None:
+def test_a_cut_file_is_rewritten_as_a_finished_file(whole: Path, tmp_path: Path) -> None:
     cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
     cut.write_bytes(whole.read_bytes()[: chunks(whole.read_bytes())[3][1] + 20])
     rewrite(Recording(cut), new)
@@ -364,7 +360,7 @@ def test_what_was_cut_becomes_a_finished_file(whole: Path, tmp_path: Path) -> No
         assert len(list(make_reader(stream).iter_messages())) > 0
 
 
-def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_path: Path) -> None:
+def test_a_replay_ends_at_missing_steps_and_reports_them(whole: Path, tmp_path: Path) -> None:
     data, path = whole.read_bytes(), tmp_path / "gap.mcap"
     start, _ = chunks(data)[2]
     path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
@@ -374,9 +370,7 @@ def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_pat
     assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
 
 
-def test_a_finished_file_says_at_its_end_what_happened(
-    tape: Tape, whole: Path, tmp_path: Path
-) -> None:
+def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_path: Path) -> None:
     first, last = tape.taken[0].inputs.now, tape.taken[-1].inputs.now
     said = read_end(whole)
     assert said is not None

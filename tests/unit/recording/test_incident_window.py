@@ -10,7 +10,7 @@ def kind(around: IncidentWindow[str]) -> Kind:
     return around.kind
 
 
-def test_what_ended_less_than_a_minute_before_it_is_kept_once() -> None:
+def test_a_file_that_ended_less_than_a_minute_before_an_incident_is_retained_once() -> None:
     around = IncidentWindow[str]()
     for number in range(4):
         around.begin(number * AROUND_NS // 2)
@@ -21,7 +21,7 @@ def test_what_ended_less_than_a_minute_before_it_is_kept_once() -> None:
     assert around.happened(2 * AROUND_NS + 2) == []
 
 
-def test_what_begins_less_than_a_minute_after_it_is_near() -> None:
+def test_a_file_that_begins_less_than_a_minute_after_an_incident_is_near() -> None:
     around = IncidentWindow[str]()
     around.begin(0)
     assert kind(around) == "plain"
@@ -35,7 +35,7 @@ def test_what_begins_less_than_a_minute_after_it_is_near() -> None:
     assert around.happened(10 + AROUND_NS) == []
 
 
-def test_a_restart_goes_on_with_what_was_before_it() -> None:
+def test_incidents_count_over_a_restart() -> None:
     around = IncidentWindow[str]()
     around.earlier("plain", "plain", -5)
     around.earlier("near", "near", -5)
@@ -48,7 +48,7 @@ def test_a_restart_goes_on_with_what_was_before_it() -> None:
     assert kind(other) == "near"
 
 
-def test_a_crash_before_this_run_is_something_that_happened() -> None:
+def test_a_crash_before_this_run_is_an_incident() -> None:
     around = IncidentWindow[str]()
     around.earlier_happened(-AROUND_NS)
     around.begin(0)

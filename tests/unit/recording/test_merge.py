@@ -30,7 +30,7 @@ def test_the_same_configuration_changes_nothing() -> None:
     assert freeze(robot, Memory()) == before
 
 
-def test_what_follows_from_the_configuration_is_of_the_other_and_what_happened_stays() -> None:
+def test_configured_values_change_and_values_of_the_drive_stay() -> None:
     other = replace(
         PLAIN,
         drive=replace(PLAIN.drive, wheel_radius=0.1),
@@ -46,7 +46,7 @@ def test_what_follows_from_the_configuration_is_of_the_other_and_what_happened_s
     assert robot._kinematics is robot._odometry._kinematics
 
 
-def test_a_part_that_the_state_does_not_know_begins_as_a_new_one_does() -> None:
+def test_a_part_that_the_state_lacks_comes_from_a_new_robot() -> None:
     robot = driven()
     del robot._answered
     adopt(robot, Robot(PLAIN), Robot(PLAIN))

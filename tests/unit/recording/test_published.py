@@ -31,7 +31,7 @@ def driven() -> Tape:
     return tape
 
 
-def test_a_switched_off_transform_is_not_said() -> None:
+def test_a_transform_that_is_switched_off_is_not_published() -> None:
     tape, config = driven(), Config()
     quiet = replace(
         config,
@@ -42,7 +42,7 @@ def test_a_switched_off_transform_is_not_said() -> None:
     assert names(said(tape, config)) - names(said(tape, quiet)) == {"tf", "tf_static"}
 
 
-def test_other_parameters_move_the_pose_and_nothing_that_came_in() -> None:
+def test_other_parameters_change_the_pose_but_not_the_received_commands() -> None:
     tape, config = driven(), Config()
     wider = replace(config, drive=replace(config.drive, wheel_separation=0.6))
     then, now = said(tape, config), said(tape, wider)
@@ -53,7 +53,7 @@ def test_other_parameters_move_the_pose_and_nothing_that_came_in() -> None:
     assert heard[0] == heard[1] != []
 
 
-def test_a_message_went_when_its_step_was_and_a_command_came_before() -> None:
+def test_odometry_is_published_after_its_sample_and_a_command_at_its_arrival() -> None:
     published = said(driven(), Config())
     odom = [m for m in published if m.channel.name == "odom"]
     assert all(m.message.header.stamp.to_ns() <= m.wall_ns for m in odom)
@@ -63,7 +63,7 @@ def test_a_message_went_when_its_step_was_and_a_command_came_before() -> None:
     assert all(m.message.header.stamp.to_ns() == m.wall_ns for m in heard)
 
 
-def test_what_no_recording_knows_is_not_said() -> None:
+def test_values_that_a_recording_lacks_are_not_published() -> None:
     published = said(driven(), Config())
     rows = {
         row.name for m in published if m.channel.name == "diagnostics" for row in m.message.status

@@ -23,13 +23,13 @@ def estimates() -> list[Estimate]:
     return [estimate for taken in tape.taken for estimate in taken.outputs.estimates]
 
 
-def test_poses_are_told_in_millionths() -> None:
+def test_poses_are_rounded_to_millionths() -> None:
     (first, *_) = estimates()
     turned = replace(first, pose=Pose(1.0000004, -2.0000006, 3.1415926))
     assert microposes([turned]) == ((1_000_000, -2_000_001, 3_141_593),)
 
 
-def test_a_checksum_goes_on_and_sees_every_bit() -> None:
+def test_a_checksum_continues_and_covers_every_bit() -> None:
     every = estimates()
     assert checksum(every[5:], checksum(every[:5], 0)) == checksum(every, 0)
     last = every[-1]
@@ -39,7 +39,7 @@ def test_a_checksum_goes_on_and_sees_every_bit() -> None:
     assert checksum([*every[:-1], turned], 0) != checksum(every, 0)
 
 
-def test_what_came_into_a_step_that_did_not_end_comes_back_whole() -> None:
+def test_the_inputs_of_an_unfinished_step_are_read_back() -> None:
     tape = Tape()
     world = World(recorder=tape)
     world.drive(0.5, 0.2, seconds=0.5)

@@ -79,7 +79,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     return Bench(tmp_path, monkeypatch)
 
 
-def test_a_drive_is_recorded_and_lives_again(bench: Bench) -> None:
+def test_a_recorded_drive_replays_bit_by_bit(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(2.0)
     (path,) = bench.end()
@@ -106,7 +106,7 @@ def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
     assert result.comparison.steps == bench.world.steps
 
 
-def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
+def test_a_file_that_begins_with_a_state_replays_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 3_000_000_000)
@@ -123,7 +123,7 @@ def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
     assert count == bench.world.steps
 
 
-def test_a_loop_that_is_not_heard_loses_steps_counts_them_and_never_waits(
+def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_waits(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "MAX_QUEUED_STEPS", most := 1000)
@@ -146,7 +146,7 @@ def test_a_loop_that_is_not_heard_loses_steps_counts_them_and_never_waits(
     assert after.name.endswith(KEPT) == before.name.endswith(KEPT)
 
 
-def test_a_disk_that_takes_nothing_is_said_tried_again_and_costs_only_records(
+def test_a_disk_that_refuses_is_reported_and_tried_again_and_driving_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     where = tmp_path / "record"
@@ -193,7 +193,7 @@ def happen_fault(world: World) -> None:
     [happen_stop, happen_fault]
     + [pytest.param(other, marks=pytest.mark.slow) for other in (happen_loss, happen_silence)],
 )
-def test_the_minute_before_and_after_what_happened_is_kept(
+def test_the_minute_before_and_after_an_incident_is_retained(
     happen: Callable[[World], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minute = 6  # one tenth of a minute in s, to save time
@@ -234,7 +234,7 @@ def die(bench: Bench) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("after_s", [5.0, 300.0])
-def test_the_minute_before_and_after_a_crash_is_kept(
+def test_the_minute_before_and_after_a_crash_is_retained(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
@@ -259,7 +259,7 @@ def test_the_minute_before_and_after_a_crash_is_kept(
     ("after_s", "near"),
     [(20.0, True)] + [pytest.param(s, False, marks=pytest.mark.slow) for s in (70.0, -20.0)],
 )
-def test_the_minute_before_and_after_what_happened_is_kept_over_a_restart(
+def test_the_minute_around_an_incident_is_retained_over_a_restart(
     after_s: float,
     near: bool,
     fault_before: bool,
@@ -308,7 +308,7 @@ def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("broken", ["robot", "port"])
-def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_it_ended(
+def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     broken: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
@@ -348,7 +348,7 @@ def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_i
     assert replay_file(Recording(new)) == result
 
 
-def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
+def test_the_text_of_a_bug_is_shortened_and_printable(bench: Bench) -> None:
     bench.world.run(1.0)
     bench.write()
     (path,) = ends_by(bench, ValueError("\x1b[2J" + "x" * 1000))
@@ -359,7 +359,7 @@ def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
     assert (told.isprintable(), len(told) < 300) == (True, True)
 
 
-def test_a_fault_of_our_own_that_cannot_be_told_is_one_all_the_same(bench: Bench) -> None:
+def test_a_bug_whose_text_cannot_be_produced_is_still_recorded(bench: Bench) -> None:
     class MuteError(Exception):
         def __str__(self) -> str:
             raise ValueError
@@ -371,7 +371,7 @@ def test_a_fault_of_our_own_that_cannot_be_told_is_one_all_the_same(bench: Bench
     assert (last.cut, last.why) == ("bug", "MuteError")
 
 
-def test_what_came_into_the_step_is_left_out_where_no_file_takes_it(bench: Bench) -> None:
+def test_inputs_that_cannot_be_encoded_are_left_out(bench: Bench) -> None:
     bench.world.run(1.0)
     tape = Tape()
     World(recorder=tape).run(0.1)
@@ -386,15 +386,13 @@ def test_what_came_into_the_step_is_left_out_where_no_file_takes_it(bench: Bench
 
 
 @pytest.mark.parametrize("error", [None, asyncio.CancelledError()])
-def test_an_end_that_was_asked_for_is_no_fault_of_our_own(
-    error: BaseException | None, bench: Bench
-) -> None:
+def test_a_requested_end_is_not_a_bug(error: BaseException | None, bench: Bench) -> None:
     bench.world.run(1.0)
     bench.recorder.close(error)
     assert cuts(listed(bench.where)) == [("mcap", "")]
 
 
-def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_in_the_first_step_is_recorded(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.world.bus.arrivals.append(Arrival("stop", True, b"", "", bench.world.now_ns, None, ""))
     break_robot(monkeypatch)
     with pytest.raises(ZeroDivisionError) as raised:
@@ -408,9 +406,7 @@ def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.Monk
     assert last.said == "start"
 
 
-def test_the_minute_before_a_fault_of_our_own_is_kept(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_minute_before_a_bug_is_retained(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(6.0)
@@ -421,7 +417,7 @@ def test_the_minute_before_a_fault_of_our_own_is_kept(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jumps", [(20,), (20, -20), (-20,)])
-def test_a_clock_that_is_set_costs_no_recording(
+def test_a_jump_of_the_clock_costs_no_recording(
     jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot without a real-time clock was off for weeks.
@@ -447,7 +443,7 @@ def test_a_clock_that_is_set_costs_no_recording(
     assert seen <= there()
 
 
-def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
+def test_a_file_that_the_disk_cut_keeps_its_retention_class(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(2.0)
     bench.world.call("stop")
@@ -515,7 +511,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
         (False, ValueError(BUG), ("kept.mcap", "crash")),
     ],
 )
-def test_an_end_that_the_disk_was_too_slow_for_is_no_crash_unless_it_was_one(
+def test_an_end_that_the_disk_was_too_slow_for_counts_as_a_crash_only_after_a_crash(
     happened: bool,
     error: Exception | None,
     told: tuple[str, str],
@@ -553,7 +549,7 @@ def numbers_of(paths: list[Path]) -> list[int]:
     return [step.number for path in paths for step in steps(Recording(path))]
 
 
-def test_what_a_disk_did_not_take_any_more_is_counted_to_the_step(eager: Bench) -> None:
+def test_steps_that_the_disk_refused_are_counted_exactly(eager: Bench) -> None:
     (part,) = listed(eager.where)
     with files_of_at_most(part.stat().st_size + 20):
         rounds(eager, 1)
@@ -567,7 +563,7 @@ def test_what_a_disk_did_not_take_any_more_is_counted_to_the_step(eager: Bench) 
 
 
 @pytest.mark.parametrize("over", [False, True])
-def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
+def test_steps_that_the_disk_did_not_sync_are_counted_exactly(
     over: bool, eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The sync fails for a chunk, or at the end of a file."""
@@ -590,7 +586,7 @@ def cuts(paths: list[Path]) -> list[tuple[str, str]]:
     return [(p.name.partition(".")[2], last.cut) for p in paths if (last := read_end(p))]
 
 
-def test_what_a_crash_has_cut_stays_a_crash_s_however_late_it_is_made_whole(
+def test_a_file_that_a_crash_cut_keeps_this_cause_however_late_it_is_finished(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     die(eager)
@@ -603,7 +599,7 @@ def test_what_a_crash_has_cut_stays_a_crash_s_however_late_it_is_made_whole(
     assert cuts(again.end()) == [("kept.mcap", "crash"), ("mcap", "disk"), ("mcap", "")]
 
 
-def test_each_file_that_the_disk_cut_stays_what_it_was(
+def test_each_file_that_the_disk_cut_keeps_its_class_and_cause(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     eager.world.call("stop")
@@ -616,7 +612,7 @@ def test_each_file_that_the_disk_cut_stays_what_it_was(
     assert cuts(eager.end()) == told
 
 
-def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
+def test_a_file_whose_end_the_disk_refuses_has_the_cause_disk(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     eager.recorder._request_state()
@@ -638,7 +634,7 @@ def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
         (False, ValueError(BUG), ("kept.mcap", "crash")),
     ],
 )
-def test_a_disk_that_refuses_the_end_is_no_crash_to_the_next_daemon(
+def test_a_disk_that_refuses_the_end_does_not_look_like_a_crash_to_the_next_daemon(
     happened: bool,
     error: Exception | None,
     told: tuple[str, str],
@@ -660,7 +656,7 @@ def test_a_disk_that_refuses_the_end_is_no_crash_to_the_next_daemon(
     assert not list(eager.where.glob(".0*"))
 
 
-def test_a_disk_that_hangs_holds_up_the_end_of_the_daemon_for_a_moment_only(
+def test_a_disk_that_hangs_delays_the_end_of_the_daemon_only_briefly(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     goes = threading.Event()
@@ -678,7 +674,7 @@ def test_a_disk_that_hangs_holds_up_the_end_of_the_daemon_for_a_moment_only(
     eager.recorder._thread.join(20.0)
 
 
-def test_what_is_kept_does_not_go_one_by_one_for_a_disk_that_refuses_all_the_same(
+def test_protected_files_are_not_all_deleted_for_a_disk_that_keeps_refusing(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk may lack inodes, for example, and another program takes each one that is freed."""
@@ -700,7 +696,9 @@ def test_what_is_kept_does_not_go_one_by_one_for_a_disk_that_refuses_all_the_sam
     assert len(again.end()) == 5
 
 
-def test_what_cannot_be_made_whole_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_cannot_be_finished_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "000001-20270115T080000Z.mcap.part"
     Writing(path, About("acsar", "9.0", "3.13", 1, 2, format="later")).close()
     bench = Bench(tmp_path, monkeypatch)
@@ -711,7 +709,7 @@ def test_what_cannot_be_made_whole_is_said(tmp_path: Path, monkeypatch: pytest.M
     assert len(bench.end()) == 2
 
 
-def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -> None:
+def test_a_directory_that_was_removed_is_reported_and_created_again(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(2.0)
     shutil.rmtree(bench.where)
@@ -726,7 +724,9 @@ def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -
     assert (result.comparison.same, result.trouble) == (True, "")
 
 
-def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_control_loop_only_appends_to_the_queue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A thousand steps pass while the thread hangs in a sync."""
     asked, goes, sync = threading.Event(), threading.Event(), os.fsync
     who = set[str]()
@@ -759,7 +759,7 @@ def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert len(numbers_of(listed(tmp_path))) == 1001
 
 
-def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_contains_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tls = tmp_path / "tls"
     tls.mkdir()
     for name in ("key.pem", "cert.pem", "ca.pem"):
@@ -781,7 +781,7 @@ def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert not any(b"BEGIN" in data for data in read)
 
 
-def test_a_recording_and_what_is_exported_of_it_tell_where_keys_are_and_hold_none(
+def test_recordings_and_exports_name_the_paths_of_keys_and_contain_no_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     certificates, where = tmp_path / "tls", tmp_path / "record"

@@ -54,7 +54,7 @@ def read_by_the_library(path: Path) -> list[tuple[str, int, bytes]]:
 
 
 @pytest.mark.parametrize("room", [False, True])
-def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
+def test_all_readable_data_stays_and_the_end_record_names_the_cut(
     data: bytes, room: bool, tmp_path: Path
 ) -> None:
     part, whole, dice = tmp_path / "a.part", tmp_path / "a.mcap", random.Random(4)
@@ -81,7 +81,7 @@ def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
 
 
 @pytest.mark.parametrize("torn", [b"", b"torn", bytes(700)])
-def test_a_disk_that_takes_no_end_costs_no_chunk_and_that_is_told(
+def test_a_disk_that_refuses_the_end_costs_no_chunk_and_is_reported(
     data: bytes, torn: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk without free space repeats its error, sometimes only at a sync."""
@@ -100,7 +100,7 @@ def test_a_disk_that_takes_no_end_costs_no_chunk_and_that_is_told(
     assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
 
 
-def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(
+def test_a_file_finished_in_place_has_the_cause_and_the_summary(
     data: bytes, tmp_path: Path
 ) -> None:
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
@@ -112,7 +112,7 @@ def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(
     assert last.said == "start, 1 change of commander, 1 stop (stopped by unnamed (native))"
 
 
-def test_a_chunk_that_is_torn_at_the_end_goes_and_one_between_others_stays(
+def test_a_torn_last_chunk_is_removed_and_a_damaged_chunk_between_others_stays(
     data: bytes, tmp_path: Path
 ) -> None:
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
@@ -144,9 +144,7 @@ def test_damage_that_a_copy_leaves_out_is_reported(
 
 
 @pytest.mark.parametrize("room", [False, True])
-def test_a_damaged_head_costs_nothing_of_what_is_behind_it(
-    data: bytes, room: bool, tmp_path: Path
-) -> None:
+def test_a_damaged_head_costs_no_message_after_it(data: bytes, room: bool, tmp_path: Path) -> None:
     part, whole, before = tmp_path / "a.part", tmp_path / "a.mcap", tmp_path / "b.mcap"
     before.write_bytes(data)
     bad = bytearray(data[: chunks(data)[-1][1]])
@@ -167,7 +165,7 @@ def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_
 
 
 @pytest.mark.parametrize("room", [False, True])
-def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
+def test_a_chunk_that_still_grew_keeps_all_its_seconds(
     growing: bytes, room: bool, tmp_path: Path
 ) -> None:
     part, whole, dice, counts = tmp_path / "a.part", tmp_path / "a.mcap", random.Random(6), set()
@@ -297,7 +295,7 @@ def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file
     assert len(messages(whole)) == count
 
 
-def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:
+def test_an_empty_file_is_removed_and_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     for content, told in ((b"", ""), (b"\x89MC", "it has no beginning")):
         part.write_bytes(content)

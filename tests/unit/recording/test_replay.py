@@ -12,7 +12,7 @@ from tests.scenarios.world import World
 
 
 @pytest.mark.slow
-def test_it_counts_lines_poses_and_modes_and_knows_the_end() -> None:
+def test_a_replay_counts_lines_poses_and_modes_and_has_the_last_pose() -> None:
     tape = Tape()
     world = World(recorder=tape)
     world.drive(0.5, seconds=2.0)

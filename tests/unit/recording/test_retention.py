@@ -33,18 +33,18 @@ def files(*kinds: Kind, size: int = 1000, this_run: bool = False) -> list[Ended]
     ]
 
 
-def test_nothing_goes_where_there_is_room() -> None:
+def test_nothing_is_deleted_while_there_is_room() -> None:
     assert to_delete(files("plain", "kept", "near"), BOUNDS, WIDE) == set()
 
 
-def test_the_oldest_go_first_and_what_is_kept_last() -> None:
+def test_the_oldest_files_go_first_and_protected_files_last() -> None:
     ended = files("kept", "near", "plain", "plain", "plain")
     bounds = Bounds(3000 + LEAST_BYTES, -math.inf)
     assert to_delete(ended, bounds, WIDE) == {"3", "4"}
     assert to_delete(ended, bounds._replace(size=1000 + LEAST_BYTES), WIDE) == {"1", "3", "4", "5"}
 
 
-def test_what_is_near_goes_with_what_happened() -> None:
+def test_near_files_are_protected_as_long_as_their_incident() -> None:
     turns: list[Kind] = ["plain", "kept"]
     ended = files("near", "kept", "near", *turns * KEPT_FILES)
     old = Bounds(10**10, math.inf)
@@ -52,13 +52,13 @@ def test_what_is_near_goes_with_what_happened() -> None:
     assert {"1", "3"} & to_delete(ended[:-1], old, WIDE) == set()
 
 
-def test_too_old_is_what_no_run_of_now_has_ended() -> None:
+def test_only_files_of_earlier_runs_can_be_too_old() -> None:
     bounds = BOUNDS._replace(oldest_s=250.0)
     assert to_delete(files("plain", "plain", "plain"), bounds, WIDE) == {"1", "2"}
     assert to_delete(files("plain", "plain", "plain", this_run=True), bounds, WIDE) == set()
 
 
-def test_a_part_of_the_disk_is_left_to_others_but_not_for_what_is_kept_or_the_newest() -> None:
+def test_protected_files_and_the_newest_do_not_make_room_for_other_programs() -> None:
     ended = files("kept", "plain", "plain", "plain", "plain")
     disk = Disk(100_000, 5000)
     assert to_delete(ended, BOUNDS, disk) == set()
@@ -66,19 +66,19 @@ def test_a_part_of_the_disk_is_left_to_others_but_not_for_what_is_kept_or_the_ne
     assert to_delete(ended, BOUNDS, disk._replace(free=1000)) == {"2", "3", "4"}
 
 
-def test_where_no_room_is_left_at_all_everything_gives_way_to_what_comes() -> None:
+def test_if_the_disk_is_nearly_full_all_files_make_room_for_the_next() -> None:
     ended = files("kept", "plain", "near", size=400)
     assert to_delete(ended, BOUNDS, Disk(100_000, 0)) == {"1", "2", "3"}
     assert to_delete(ended, BOUNDS, Disk(100_000, 300)) == {"2", "3"}
 
 
-def test_a_disk_that_refuses_whatever_it_says_gets_one_back() -> None:
+def test_a_disk_that_refuses_despite_free_space_gets_one_file_deleted() -> None:
     assert to_delete(files("kept", "plain", "plain"), BOUNDS, WIDE, freed=0) == {"2"}
     assert to_delete(files("kept"), BOUNDS, WIDE, freed=0) == {"1"}
     assert to_delete([], BOUNDS, WIDE, freed=0) == set()
 
 
-def test_a_disk_that_refuses_all_the_same_gets_none_that_is_kept_and_no_more_than_a_file() -> None:
+def test_a_disk_that_keeps_refusing_gets_no_protected_file_and_at_most_one_more() -> None:
     assert to_delete(files("kept", "plain", "plain"), BOUNDS, WIDE, freed=1) == {"2"}
     assert to_delete(files("kept", "near"), BOUNDS, WIDE, freed=1) == set()
     assert to_delete(files("kept", "plain"), BOUNDS, WIDE, freed=LEAST_BYTES) == set()
@@ -86,19 +86,19 @@ def test_a_disk_that_refuses_all_the_same_gets_none_that_is_kept_and_no_more_tha
     assert to_delete(files("kept", "near", size=400), BOUNDS, low, freed=1) == {"1", "2"}
 
 
-def test_a_file_has_a_hundredth_of_what_all_may_have_on_this_disk() -> None:
+def test_a_file_may_take_a_hundredth_of_the_total_size() -> None:
     assert share(10**9, 0, WIDE) == 10**7
     assert share(10**9, 10**8, Disk(10**9, 15 * 10**7)) == 2 * 10**6
     assert share(10**9, 0, Disk(10**6, 0)) == LEAST_BYTES
 
 
-def test_of_a_large_disk_others_have_a_gigabyte() -> None:
+def test_other_programs_keep_a_gigabyte_of_a_large_disk() -> None:
     assert Disk(10**12, 10**9).low is False
     assert Disk(10**12, 10**9 - 1).low is True
     assert Disk(10**9, 10**8).low is False
 
 
-def test_a_clock_is_believed_that_was_not_set_for_a_while() -> None:
+def test_a_clock_is_trusted_a_while_after_its_last_jump() -> None:
     clock = ClockWatch()
     assert not clock.trusted(Instant(STEADY_NS, 0))
     assert clock.jump_ns(Instant(0, DAY_NS)) == 0

@@ -24,7 +24,7 @@ def loaded(text: str) -> Any:
         (Qos(5, best_effort=True), 5, 2, 2),
     ],
 )
-def test_a_quality_of_service_is_told_by_the_numbers_of_rmw(
+def test_qos_policies_are_written_as_the_numbers_of_rmw(
     qos: Qos, depth: int, reliability: int, durability: int
 ) -> None:
     (said,) = loaded(offered(qos))
@@ -33,7 +33,7 @@ def test_a_quality_of_service_is_told_by_the_numbers_of_rmw(
     assert said["avoid_ros_namespace_conventions"] is False
 
 
-def test_the_topics_of_a_file_are_told_whatever_they_are_called() -> None:
+def test_topics_are_written_whatever_their_names() -> None:
     topics = [
         Topic("/odom", "nav_msgs/msg/Odometry", Qos(), 7),
         Topic("/cmd_vel_in/off", "geometry_msgs/msg/TwistStamped", Qos(), 2),

@@ -80,12 +80,12 @@ PARTS: dict[str, st.SearchStrategy[object]] = {
 INPUTS = st.builds(Inputs, **PARTS)
 
 
-def test_whatever_comes_into_a_step_is_recorded() -> None:
+def test_every_field_of_the_inputs_is_recorded() -> None:
     assert set(PARTS) == set(Inputs.__struct_fields__)
 
 
 @given(st.lists(INPUTS, min_size=1, max_size=6), st.integers(0, 1 << 40))
-def test_all_that_can_come_in_comes_back(inputs: list[Inputs], first: int) -> None:
+def test_all_inputs_are_read_back(inputs: list[Inputs], first: int) -> None:
     outputs = Robot(Config()).step(Inputs(Instant(1, 2), True, True))
     steps = decode(encode(first, [Taken(one, outputs, b"other") for one in inputs]))
     assert [step.inputs for step in steps] == inputs
@@ -101,7 +101,7 @@ def driven() -> list[Taken]:
     return tape.taken
 
 
-def test_what_went_out_comes_back() -> None:
+def test_all_outputs_are_read_back() -> None:
     for at in range(0, len(driven()), 100):
         batch = driven()[at : at + 100]
         for taken, step in zip(batch, decode(encode(at, batch)), strict=True):
@@ -112,14 +112,14 @@ def test_what_went_out_comes_back() -> None:
             assert said.events == outputs.events
 
 
-def test_a_second_at_rest_takes_little() -> None:
+def test_a_second_at_rest_takes_few_bytes() -> None:
     tape = Tape()
     World(recorder=tape).run(3.0)
     batch = tape.taken[-200:]
     assert len(zstandard.compress(encode(0, batch))) < 5 * len(batch)
 
 
-def test_steps_at_one_time_come_back_in_their_order() -> None:
+def test_steps_with_equal_times_keep_their_order() -> None:
     tick, other = Inputs(Instant(5, 5), True, True), Inputs(Instant(5, 5), False, True)
     outputs = Robot(Config()).step(tick)
     for inputs in ([tick, other, other], [other, tick], [tick, other, tick, other]):
@@ -127,7 +127,7 @@ def test_steps_at_one_time_come_back_in_their_order() -> None:
         assert [step.inputs for step in steps] == inputs
 
 
-def test_bytes_that_are_no_batch_are_refused_and_never_more() -> None:
+def test_damaged_bytes_raise_only_batch_errors() -> None:
     whole, dice = encode(0, driven()[:100]), random.Random(1)
     for _ in range(500):
         data = bytearray(whole)
@@ -167,12 +167,12 @@ def with_rare(batch: Batch, rare: Rare) -> Batch:
 
 @each("far", [1 << 62, (1 << 63) - 1, -(1 << 63)])
 @each("name", ["mono_ns", "offset_ns", "unit"])
-def test_a_time_that_no_clock_shows_is_refused(name: str, far: int, batch: Batch) -> None:
+def test_a_time_out_of_range_is_refused(name: str, far: int, batch: Batch) -> None:
     with pytest.raises(BatchError, match=r"out of range|>= 1"):
         steps_of(replace(batch, **{name: far}))
 
 
-def test_a_read_of_an_age_that_no_clock_shows_is_refused(batch: Batch) -> None:
+def test_a_read_with_an_age_out_of_range_is_refused(batch: Batch) -> None:
     rows = list(batch.rows)
     index = next(index for index, row in enumerate(rows) if row.reads)
     read = rows[index].reads[0]
@@ -190,17 +190,17 @@ def test_a_read_of_an_age_that_no_clock_shows_is_refused(batch: Batch) -> None:
     ],
     ids=["pose", "rate", "variance"],
 )
-def test_a_number_that_no_step_gets_is_refused(rare: Rare, batch: Batch) -> None:
+def test_a_number_that_is_not_finite_is_refused(rare: Rare, batch: Batch) -> None:
     with pytest.raises(BatchError, match="is not finite"):
         steps_of(with_rare(batch, rare))
 
 
-def test_a_command_that_the_robot_refuses_itself_is_recorded(batch: Batch) -> None:
+def test_a_command_that_the_robot_refuses_is_recorded(batch: Batch) -> None:
     rare = Rare(commands=(Command("app", Twist(math.nan, 0.0), 1),))
     assert steps_of(with_rare(batch, rare)) == steps_of(batch) == 100
 
 
-def test_a_batch_without_what_every_first_step_has_or_of_too_many_steps_is_refused(
+def test_a_batch_with_an_incomplete_first_step_or_too_many_steps_is_refused(
     batch: Batch,
 ) -> None:
     assert batch.rows[0].rare is not None
@@ -209,7 +209,7 @@ def test_a_batch_without_what_every_first_step_has_or_of_too_many_steps_is_refus
             steps_of(replace(batch, rows=rows))
 
 
-def test_a_line_in_whose_place_none_or_another_was_sent_comes_back() -> None:
+def test_a_line_that_was_not_sent_or_was_replaced_is_read_back() -> None:
     tick = Inputs(Instant(5, 5), True, True)
     outputs = Robot(Config()).step(tick)
     sent = [None, b"", outputs.line, b"other"]

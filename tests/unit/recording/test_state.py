@@ -20,7 +20,7 @@ from acsard.recording.export import export
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import DisplayReplay, replay_file
 from acsard.recording.state import StateError, freeze, thaw
-from acsard.report.course import Course
+from acsard.report.report_data import ReportData
 from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -28,7 +28,7 @@ from tests.scenarios.world import World
 MEMORY = Memory(b"line", 5, None, 7, 8)
 
 
-def test_it_comes_back_as_it_was() -> None:
+def test_a_robot_is_read_back_unchanged() -> None:
     world = World()
     world.drive(0.5, 0.3, seconds=2.0)
     memory = world.loop._guard.memory
@@ -40,7 +40,7 @@ def test_it_comes_back_as_it_was() -> None:
     assert freeze(thaw(again).robot, Memory()) == again
 
 
-def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
+def test_senders_of_one_command_soon_leave_the_state() -> None:
     """The state is saved in a step of the loop whenever a file begins, so it must stay small."""
     freshness = Freshness()
     for number in range(5000):
@@ -53,12 +53,12 @@ def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
 
 
 @each("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])
-def test_what_is_no_robot_is_refused(value: object) -> None:
+def test_bytes_that_are_not_a_robot_are_refused(value: object) -> None:
     with pytest.raises(StateError):
         thaw(pickle.dumps(value))
 
 
-def test_damaged_bytes_are_refused_in_words(tmp_path: Path) -> None:
+def test_damaged_bytes_are_refused_with_a_message(tmp_path: Path) -> None:
     data = freeze(World().loop.robot, Memory())
     with pytest.raises(StateError, match="this version"):
         thaw(data[:1000])
@@ -67,7 +67,7 @@ def test_damaged_bytes_are_refused_in_words(tmp_path: Path) -> None:
     assert isinstance(thaw(data).robot, Robot)
 
 
-def test_whatever_bit_is_another_it_is_a_robot_or_refused() -> None:
+def test_with_any_bit_flipped_the_bytes_are_a_robot_or_refused() -> None:
     data, dice, refused = freeze(World().loop.robot, Memory()), random.Random(1), list[str]()
     for _ in range(60):
         bad = bytearray(data)
@@ -91,7 +91,7 @@ def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
     return Recording(path)
 
 
-def test_what_a_part_of_an_older_robot_lacks_begins_as_in_a_new_one(tmp_path: Path) -> None:
+def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Path) -> None:
     def forget(robot: Robot) -> None:
         for wheel in robot._sanity._wheels:
             del wheel.suspected
@@ -120,7 +120,7 @@ def taped() -> Tape:
 
 
 @pytest.mark.parametrize("how", SPOILERS)
-def test_a_robot_with_something_else_in_place_of_a_part_is_a_sentence(
+def test_a_robot_with_a_wrong_part_is_refused_with_a_message(
     how: str, taped: Tape, tmp_path: Path
 ) -> None:
     robot, memory = thaw(taped.states[100])
@@ -145,21 +145,21 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
 def drawn(recording: Recording) -> None:
     """Replay a recording as a report does."""
     looked = DisplayReplay(recording)
-    course = Course(looked.config)
+    report = ReportData(looked.config)
     with looked.state_errors():
         for step, outputs, robot in looked.steps():
-            course.step(step, outputs, robot)
+            report.step(step, outputs, robot)
     if looked.notes:
         raise RecordingError(looked.notes[0])
 
 
-def test_a_search_that_a_stranger_has_begun_ends() -> None:
+def test_a_forged_state_cannot_make_a_search_endless() -> None:
     search = Search({1.0: 3})
     search._tried = -(1 << 60)
     assert not search.go_on()
 
 
-def test_what_no_new_robot_has_is_a_sentence_and_no_traceback(tmp_path: Path) -> None:
+def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Path) -> None:
     def forget(robot: Robot) -> None:
         for sender in robot._arbiter._sources["app"].senders.values():
             del sender.arrived_ns

@@ -28,7 +28,7 @@ def driven() -> Tape:
     return tape
 
 
-def test_it_begins_and_ends_with_the_daemon_and_tells_each_drive() -> None:
+def test_the_timeline_has_the_start_each_drive_and_the_end() -> None:
     tape = driven()
     told = story(tape)
     assert (told[0].name, told[-1].name) == ("start", "end")
@@ -39,7 +39,7 @@ def test_it_begins_and_ends_with_the_daemon_and_tells_each_drive() -> None:
     assert [one.seconds for one in told] == sorted(one.seconds for one in told)
 
 
-def test_a_silence_of_a_computer_that_did_not_run_is_not_told_as_the_boards() -> None:
+def test_a_host_stall_is_not_called_a_silence_of_the_board() -> None:
     tape = Tape()
     world = World(BOARD, recorder=tape)
     world.drive(0.5, seconds=1.0)
@@ -57,7 +57,7 @@ def test_a_silence_of_a_computer_that_did_not_run_is_not_told_as_the_boards() ->
     assert summary(told) == "1 computer stall, 1 board silence"
 
 
-def test_what_is_heard_in_a_silence_is_no_other_silence() -> None:
+def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
     tape = Tape()
     world = World(BOARD, recorder=tape)
     world.run(1.0)
@@ -72,12 +72,12 @@ def test_what_is_heard_in_a_silence_is_no_other_silence() -> None:
     assert summary([entry_of(one, 1) for one in said]) == "1 board silence"
 
 
-def test_steps_that_are_missing_are_said() -> None:
+def test_missing_steps_are_reported() -> None:
     gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
     assert gaps == ["60 steps are missing before this one"]
 
 
-def test_a_list_says_who_stopped_it_and_how_often_what_happened() -> None:
+def test_a_summary_names_who_stopped_the_robot_and_counts_the_incidents() -> None:
     events = [
         TimelineEntry(1.0, "stop", "stopped", by="joe"),
         TimelineEntry(2.0, "stop", "stopped", by="joe"),

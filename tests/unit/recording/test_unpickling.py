@@ -47,7 +47,9 @@ def said() -> dict[str, str]:
 
 
 @each("name", ATTACKS)
-def test_an_attack_is_refused_in_words_and_does_nothing(name: str, said: dict[str, str]) -> None:
+def test_an_attack_is_refused_with_a_message_and_has_no_effect(
+    name: str, said: dict[str, str]
+) -> None:
     words = said[name]
     assert "the state at its start" in words
     assert words.isprintable()
@@ -63,7 +65,7 @@ def test_an_attack_is_refused_in_words_and_does_nothing(name: str, said: dict[st
         Mode.DRIVING, Twist(0.5, 1.0),
     ],
 )  # fmt: skip
-def test_a_value_comes_back_as_it_was(value: object) -> None:
+def test_a_value_is_read_back_unchanged(value: object) -> None:
     again = unpickle(pickled(value), part_class)
     assert again == value
     assert type(again) is type(value)
@@ -79,14 +81,14 @@ def pickled(value: object) -> bytes:
     return written.getvalue()
 
 
-def test_what_is_there_twice_is_one_thing() -> None:
+def test_a_part_that_occurs_twice_stays_one_object() -> None:
     inner = [1]
     again = unpickle(pickled((inner, [inner])), part_class)
     assert isinstance(again, tuple)
     assert again[0] is again[1][0]
 
 
-def test_what_is_nested_is_read_down_to_a_depth_and_what_doubles_up_to_a_size() -> None:
+def test_nesting_is_limited_in_depth_and_doubling_in_size() -> None:
     def nested(times: int) -> bytes:
         return whole(pickle.EMPTY_TUPLE + pickle.TUPLE1 * times)
 
@@ -99,7 +101,7 @@ def test_what_is_nested_is_read_down_to_a_depth_and_what_doubles_up_to_a_size() 
         unpickle(whole(doubled(most + 1)), part_class)
 
 
-def test_a_robot_with_all_there_is_has_room() -> None:
+def test_the_largest_robot_is_within_the_limits() -> None:
     tape = Tape(every=100)
     world = World(CHECKED, recorder=tape)
     drive_through_faults(world, 1.0)

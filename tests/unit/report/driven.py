@@ -1,4 +1,4 @@
-"""Drives of the simulator as paths, for the tests of the report."""
+"""Drives of the simulator as data of a report, for the tests of the report."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ from functools import lru_cache
 from acsard.core.config.settings import Config
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import Replay
-from acsard.report.course import Course
+from acsard.report.report_data import ReportData
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
 
-def course_of(
+def report_of(
     drive: Callable[[World], None], begin: float | None = None, end: float | None = None
-) -> tuple[Course, list[Step]]:
-    """Return the path of a drive and its steps."""
+) -> tuple[ReportData, list[Step]]:
+    """Return the report's data of a drive, and the steps of the drive."""
     config, tape = Config(), Tape()
     world = World(config, recorder=tape)
     drive(world)
     steps = tape.steps()
-    return followed(steps, config, begin, end), steps
+    return report_from(steps, config, begin, end), steps
 
 
-def followed(
+def report_from(
     steps: list[Step],
     config: Config | None = None,
     begin: float | None = None,
     end: float | None = None,
-) -> Course:
-    """Return the path of these steps."""
+) -> ReportData:
+    """Return the report's data of these steps."""
     config = config or Config()
-    course, replay = Course(config, begin, end), Replay(config)
+    report, replay = ReportData(config, begin, end), Replay(config)
     for step in steps:
         replay.step(step)
         assert replay.outputs is not None
-        course.step(step, replay.outputs, replay.robot)
-    course.end()
-    return course
+        report.step(step, replay.outputs, replay.robot)
+    report.end()
+    return report
 
 
 def two_drivers(world: World) -> None:
-    """Drive by nav, let teleop take over, stop and clear, then send from an unknown source."""
+    """Drive with nav, let teleop take over, stop and clear, then send from an unknown source."""
     world.drive(0.5, 0.3, seconds=2.0, source="nav", hz=10.0)
     for n in range(40):
         world.send(0.5, 0.3, "nav")
@@ -57,6 +57,6 @@ def two_drivers(world: World) -> None:
 
 
 @lru_cache
-def drive_of_two() -> tuple[Course, list[Step]]:
-    """Return the drive with two commanders, which no test changes."""
-    return course_of(two_drivers)
+def drive_of_two() -> tuple[ReportData, list[Step]]:
+    """Return the drive with two sources, which no test changes."""
+    return report_of(two_drivers)

@@ -1,4 +1,4 @@
-"""Reads the content of a plot, for the tests."""
+"""Reads the content of a picture, for the tests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import binascii
 import struct
 from typing import Any
 
-from acsard.report.drawing import Figure
+from acsard.report.plot_elements import Figure
 
 
 def column(packed: dict[str, str]) -> list[float]:

@@ -13,10 +13,10 @@ import pytest
 
 from acsard.core.values import Command, Event, Refusal, Twist
 from acsard.recording.recorded_steps import Step
-from acsard.report.account import Origin
-from acsard.report.course import Course, Mark
-from acsard.report.page import MOST_OPEN, escaped, page
-from tests.unit.report.driven import drive_of_two, followed
+from acsard.report.page import MAX_OPEN, escaped, page
+from acsard.report.report_data import Mark, ReportData
+from acsard.report.report_text import Origin
+from tests.unit.report.driven import drive_of_two, report_from
 
 EVIL = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\'"&lt;\u202e\x00<!--'
 
@@ -24,7 +24,7 @@ LIBRARY = "var Plotly = {};"
 
 
 class Read(HTMLParser):
-    """The elements that a browser would see."""
+    """The elements of a page that a browser would see."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ def origin(**others: str) -> Origin:
 
 
 def evil_steps() -> list[Step]:
-    """Return a drive in which all text from others is hostile."""
+    """Return a drive in which all text of unknown origin is hostile."""
     from msgspec.structs import replace
 
     _, steps = drive_of_two()
@@ -77,10 +77,12 @@ def evil_steps() -> list[Step]:
 
 @lru_cache
 def evil() -> str:
-    return page(followed(evil_steps()), origin(file=EVIL, robot=EVIL, version=EVIL), LIBRARY, clock)
+    return page(
+        report_from(evil_steps()), origin(file=EVIL, robot=EVIL, version=EVIL), LIBRARY, clock
+    )
 
 
-def test_no_word_of_a_stranger_is_markup_or_program() -> None:
+def test_no_text_of_a_stranger_becomes_markup_or_code() -> None:
     read = Read(evil())
     assert not {"img", "iframe", "object", "a", "link"} & {tag for tag, _ in read.tags}
     assert all(not name.startswith("on") for _, attrs in read.tags for name in attrs)
@@ -93,7 +95,7 @@ def test_no_word_of_a_stranger_is_markup_or_program() -> None:
     assert sum("<script>alert(1)</script>" in words for words in read.words) >= 4
 
 
-def test_what_the_pictures_say_is_not_even_their_librarys_markup() -> None:
+def test_texts_in_the_pictures_contain_no_markup_of_plotly() -> None:
     (pictures,) = [text for attrs, text in Read(evil()).scripts if attrs.get("id") == "pictures"]
     assert "<" not in pictures
     traces = [trace for figure in json.loads(pictures) for trace in figure["data"]]
@@ -105,9 +107,9 @@ def test_what_the_pictures_say_is_not_even_their_librarys_markup() -> None:
     assert tags <= {"<b>", "</b>", "<br>"}
 
 
-def test_it_loads_nothing_and_only_its_own_programs_may_run() -> None:
-    course, _ = drive_of_two()
-    text = page(course, origin(), LIBRARY, clock)
+def test_the_page_loads_nothing_and_runs_only_its_own_scripts() -> None:
+    report, _ = drive_of_two()
+    text = page(report, origin(), LIBRARY, clock)
     assert re.findall(r"(?:https?:)?//[\w.]+\.\w+", text) == []
     read = Read(text)
     assert all(not {"src", "href"} & set(attrs) for _, attrs in read.tags)
@@ -123,10 +125,10 @@ def test_it_loads_nothing_and_only_its_own_programs_may_run() -> None:
         assert f"'sha256-{digest}'" in policy
 
 
-def test_every_event_has_a_row_with_who_asked() -> None:
-    course, _ = drive_of_two()
-    words = Read(page(course, origin(), LIBRARY, clock)).words
-    marks = course.marks.all()
+def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
+    report, _ = drive_of_two()
+    words = Read(page(report, origin(), LIBRARY, clock)).words
+    marks = report.marks.all()
     assert f"All {len(marks)} events" in words
     for mark in marks:
         assert escaped_words(mark) in words
@@ -137,27 +139,27 @@ def escaped_words(mark: Mark) -> str:
     return mark.text or mark.name.replace("_", " ")
 
 
-def test_what_is_missing_is_said_on_top() -> None:
+def test_missing_steps_are_reported_at_the_top() -> None:
     _, steps = drive_of_two()
-    course = followed(steps[:200] + steps[260:])
+    report = report_from(steps[:200] + steps[260:])
     notes = Origin("a", "r", "1", "3", ("no end: cut off, or still being recorded",))
-    words = Read(page(course, notes, LIBRARY, clock)).words
+    words = Read(page(report, notes, LIBRARY, clock)).words
     assert "no end: cut off, or still being recorded" in words
     assert any(text.startswith("60 steps are missing: ") for text in words)
 
 
-@pytest.mark.parametrize(("count", "opened"), [(MOST_OPEN, True), (MOST_OPEN + 1, False)])
+@pytest.mark.parametrize(("count", "opened"), [(MAX_OPEN, True), (MAX_OPEN + 1, False)])
 def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
     from acsard.core.config.settings import Config
 
-    course = Course(Config())
+    report = ReportData(Config())
     for n in range(count):
-        course.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None))
+        report.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None))
     (details,) = [
-        a for tag, a in Read(page(course, origin(), LIBRARY, clock)).tags if tag == "details"
+        a for tag, a in Read(page(report, origin(), LIBRARY, clock)).tags if tag == "details"
     ]
     assert ("open" in details) is opened
 
 
-def test_escaped_is_one_line_of_text() -> None:
+def test_escaped_text_has_one_line() -> None:
     assert escaped('<a href="x">\n&') == "&lt;a href=&quot;x&quot;&gt; &amp;"

@@ -13,6 +13,7 @@ from acsard.web.callers import (
     Asked,
     RefusedError,
     Who,
+    by_listed_page,
     cookie_name,
     host_name,
     is_loopback,
@@ -20,6 +21,7 @@ from acsard.web.callers import (
     place,
     require_own_origin,
     tokens_in,
+    tokens_offered,
     unmapped,
 )
 from tests.each import each
@@ -165,3 +167,25 @@ def test_an_ipv6_address_counts_by_its_network_and_an_ipv4_address_by_itself() -
         "2001:db8:1:2::/64", "2001:db8:1:2::/64", "2001:db8:1:3::/64", "192.168.1.7", "",
     ]  # fmt: skip
     assert network_of("fe80::1%eth0") == "fe80::/64"
+
+
+def test_only_a_listed_origin_in_full_is_listed() -> None:
+    origins = {"http://127.0.0.1:5173", "https://panel.example"}
+    for origin, listed in {
+        "http://127.0.0.1:5173": True,
+        "HTTPS://panel.example": True,
+        "http://127.0.0.1:51730": False,
+        "http://127.0.0.1": False,
+        "https://panel.example.evil.example": False,
+        "https://panel.example:8443": False,
+        "null": False,
+        "": False,
+        None: False,
+    }.items():
+        asked = Asked("127.0.0.1", False, "localhost:8080", origin)
+        assert by_listed_page(asked, origins) == listed, origin
+
+
+def test_a_token_may_be_the_name_of_a_subprotocol() -> None:
+    assert tokens_offered("acsard, acsard.token.a-B_9") == ["a-B_9"]
+    assert tokens_offered("acsard") == tokens_offered("") == tokens_offered("token.x") == []

@@ -24,7 +24,7 @@ def test_what_cannot_be_sent_is_dropped_and_the_next_one_is_looked_at() -> None:
     hand = Hand(broken, counts)
     senders = {name: (Commander(), Sender(name)) for name in "ab"}
     for name in "aba":
-        hand.give(*senders[name], AHEAD)
+        hand.give("app", *senders[name], AHEAD)
         hand.outbox.flush(PATIENCE_S)
     assert counts.all() == {"commands_dropped": 3}
     assert not hand.outbox.dead.done()
@@ -34,14 +34,15 @@ def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
     put: list[Any] = []
 
     class Fake:
-        def put(self, twist: Any, signature: Any) -> None:
+        def put(self, twist: Any, signature: Any, source: str) -> None:
+            assert source == "teleop"
             put.append((twist.linear.x, twist.angular.z, unpack(signature.pack())))
 
     fake: Any = Fake()
     counts = Counts()
     hand, commander, sender = Hand(lambda: fake, counts), Commander(), Sender("joe/aa")
     for stamp_ns in (1000, 2000):
-        hand.give(commander, sender, Wish(Twist(0.2, -0.5), stamp_ns, steady=True))
+        hand.give("teleop", commander, sender, Wish(Twist(0.2, -0.5), stamp_ns, steady=True))
         hand.outbox.flush(PATIENCE_S)
     assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
     signed = [one for *_, one in put]

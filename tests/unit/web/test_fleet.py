@@ -22,7 +22,7 @@ from tests.unit.web.test_metrics import STATE
 
 PATIENCE_S = 20.0
 
-ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
+ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 INFO = Info("r2", "1.2.3", 42, "/dev/pts/3", True, 100.0, [], [])
 

@@ -30,7 +30,7 @@ OWN = [*own_addresses(), "203.0.113.9", "2001:db8::9"]
 @pytest.fixture
 def tls(tmp_path: Path) -> str:
     """Make a certificate for all addresses of this machine and for some that it does not have."""
-    Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", OWN, 1)
+    Authority.make(tmp_path / "tls", "test", 1, OWN).issue(tmp_path / "tls", "robot", OWN, 1)
     return str(tmp_path / "tls")
 
 

@@ -21,7 +21,7 @@ from acsard.web.robots import LOOK_S, About, Robots
 from acsard.web.streams import Stream
 from tests.unit.top.screens import STATE
 
-ABOUT = About("1", False, 1.0, 4.0, 10.0, "")
+ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
 def sample_of(state: RobotState) -> Any:

@@ -25,7 +25,7 @@ from acsard.calibration.guided.tape_readings import (
 from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.runs import Run
 from acsard.core.config.settings import DriveConfig
-from tests.unit.calibration.cut import BASE, IDEAL, log_of
+from tests.unit.calibration.cut import BASE, IDEAL, log_of, table
 from tests.unit.calibration.guided.played import Player, usual_setup
 from tests.unit.calibration.robots import Plan, Robot, drive
 
@@ -39,7 +39,7 @@ TRUE = {"chi": 1.5, "left": 0.98, "right": 1.01}
 def driven(plan: Plan) -> tuple[Run, complex, float]:
     """Return the wheel log of a robot without noise, its true end position and its true heading."""
     made = drive(replace(Robot(), **(IDEAL | TRUE)), plan)  # type: ignore[arg-type]
-    run = log_of(made.csv(gyro=False)).runs[0]
+    run = log_of(table(made, gyro=False)).runs[0]
     return run, complex(made.where[-1]), float(made.yaw[-1])
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from acsard.core.link.check import Checked, Reading, seal, unseal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.lines import MAX_LINE
+from tests.each import each
 from tests.vectors.lines import SEED_LINE
 
 PLAIN = SEED_LINE + b"\r\n"
@@ -78,12 +79,12 @@ def test_what_was_sealed_is_unsealed(sequence: int, text: str) -> None:
     assert unseal(sealed.removesuffix(b"\r\n")) == Checked(text.encode(), sequence, None)
 
 
-@pytest.mark.parametrize("line", [SEED_LINE, SEED_LINE + b",", b"", b"hello", SEED_LINE[:9]])
+@each("line", [SEED_LINE, SEED_LINE + b",", b"", b"hello", SEED_LINE[:9]])
 def test_a_line_without_suffix_is_unchecked(line: bytes) -> None:
     assert reason(line) == "without_crc"
 
 
-@pytest.mark.parametrize(
+@each(
     "body",
     [
         SEED_LINE + b"#0",
@@ -108,7 +109,7 @@ def test_a_suffix_of_another_form_is_wrong_even_under_a_right_check(body: bytes)
     assert reason(closed(body)) == "crc_error"
 
 
-@pytest.mark.parametrize(
+@each(
     "line",
     [REPLY[:-1], REPLY + b"1", REPLY + b" ", REPLY + b",", b" " + REPLY, REPLY.lower(),
      REPLY[:-4] + b"585f", REPLY[:-5], REPLY[:-4], REPLY + REPLY, b"\x00" + REPLY],

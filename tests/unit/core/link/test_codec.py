@@ -144,7 +144,7 @@ def test_a_line_is_read_in_every_accepted_form(codec: Codec, line: bytes, motors
     assert codec.decode(line).as_tuple() == motors
 
 
-@pytest.mark.parametrize(("line", "motors"), ACCEPTED)
+@each(("line", "motors"), ACCEPTED)
 def test_the_dialect_written_does_not_change_what_is_read(line: bytes, motors: Motors) -> None:
     assert Codec(WheelMap(), trailing_comma=True).decode(line).as_tuple() == motors
 
@@ -247,12 +247,12 @@ def independent(line: bytes) -> Motors | None:
     return found[97], found[98], found[99], found[100]
 
 
-@pytest.mark.parametrize(("line", "motors"), ACCEPTED)
+@each(("line", "motors"), ACCEPTED)
 def test_the_independent_reader_accepts_what_is_accepted(line: bytes, motors: Motors) -> None:
     assert independent(line) == motors
 
 
-@pytest.mark.parametrize("line", [line for line, _ in REFUSED])
+@each("line", [line for line, _ in REFUSED])
 def test_the_independent_reader_refuses_what_is_refused(line: bytes) -> None:
     assert independent(line) is None
 

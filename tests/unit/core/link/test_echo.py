@@ -12,6 +12,7 @@ from acsard.core.config.settings import WheelMap
 from acsard.core.link.codec import Codec
 from acsard.core.link.negotiation import LINES, REPORTS, EchoDetector
 from acsard.core.values import WheelSpeeds
+from tests.each import each
 
 CODEC = Codec(WheelMap())
 
@@ -80,7 +81,7 @@ def test_one_report_that_differs_begins_the_run_anew() -> None:
     assert found == [False] * (REPORTS - 1) + [True]
 
 
-@pytest.mark.parametrize("lag", range(LINES))
+@each("lag", range(LINES))
 def test_an_echo_is_found_however_many_lines_later_it_comes(lag: int) -> None:
     bench = Bench()
     found = [bench.exchange(step // 7 % 40 * 0.5, lag=lag) for step in range(200)]

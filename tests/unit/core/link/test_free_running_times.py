@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acsard.core.link.sample_time import FreeRunningTimes
+from tests.each import each
 
 MS = 1_000_000
 PERIOD = 0.01
@@ -252,7 +253,7 @@ def forgets(bench: Bench, lines: Iterable[Callable[[], None]]) -> bool:
     return False
 
 
-@pytest.mark.parametrize("period", [0.005, 0.0093, 0.0108, 0.02, 0.05])
+@each("period", [0.005, 0.0093, 0.0108, 0.02, 0.05])
 def test_another_period_is_found_out_and_found(period: float) -> None:
     bench = Bench().found()
     began = bench.time_ns()

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from acsard.core.link.check import ASK_NOTHING, ASK_SAMPLE, seal
 from acsard.core.link.line_gate import Gate
+from tests.each import each
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
@@ -82,8 +83,8 @@ def test_what_was_made_more_than_a_period_ago_does_not_go(period_ms: int) -> Non
     assert wire.offer(GO, 300 + period_ms, made_ms=300) == "sent"
 
 
-@pytest.mark.parametrize("letters", [None, b"", ASK_NOTHING, ASK_SAMPLE])
-@pytest.mark.parametrize("stop", [STOP, COMMA_STOP])
+@each("letters", [None, b"", ASK_NOTHING, ASK_SAMPLE])
+@each("stop", [STOP, COMMA_STOP])
 def test_a_stop_is_never_too_old_in_whatever_form(stop: bytes, letters: bytes | None) -> None:
     line = stop if letters is None else seal(stop, 7, letters)
     wire = Wire(stop=stop).started()

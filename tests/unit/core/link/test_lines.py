@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import pickle
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.link.lines import MAX_LINE, LineReader
+from tests.each import each
 from tests.vectors.lines import SEED_LINE, SEED_REPLY, ZERO
 
 pieces = st.one_of(
@@ -89,7 +89,7 @@ def test_the_longest_line_has_128_bytes_with_its_end() -> None:
     assert reader.too_long == 2
 
 
-@pytest.mark.parametrize("length", [1, 7, 127, 128, 129, 1000])
+@each("length", [1, 7, 127, 128, 129, 1000])
 def test_after_an_over_long_line_the_next_newline_resynchronises(length: int) -> None:
     reader, noise = LineReader(), b"x" * 1000
     chunks = [noise[i : i + length] for i in range(0, 1000, length)]

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.link.sample_time import PromptedTimes
+from tests.each import each
 
 MS = 1_000_000
 DELAY_MS = 9.0
@@ -208,20 +209,20 @@ def batched(
     return told
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_of_a_batched_link_each_answer_has_its_line(seed: int) -> None:
     bench = Bench()
     assert batched(bench, seed, 300) == pytest.approx(1990.0, abs=0.1)
     assert not bench.prompts.lossy
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_an_answer_lost_on_a_batched_link_is_noticed_soon(seed: int) -> None:
     bench = Bench()
     assert batched(bench, seed, 300, lost=(150,)) == pytest.approx(1990.0, abs=0.1)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_two_lost_answers_that_happen_to_be_near_each_other_leave_the_lines_their_clock(
     seed: int,
 ) -> None:

@@ -16,6 +16,7 @@ from acsard.core.link.feedback import APART_NS, Feedback
 from acsard.core.link.link_state import BAD_LINES, GOOD_LINES
 from acsard.core.link.session import LONG_GAP_NS, McuSession
 from acsard.core.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
+from tests.each import each
 from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
 
 MS = 1_000_000
@@ -185,7 +186,7 @@ def test_a_stale_link_whose_port_closes_is_down() -> None:
     assert bench.link() == "down"
 
 
-@pytest.mark.parametrize("lines", range(5))
+@each("lines", range(5))
 def test_a_reopened_port_is_booting_whatever_came_before(lines: int) -> None:
     bench = Bench().open()
     bench.wait(10, GOOD * lines)
@@ -213,7 +214,7 @@ def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_after() -> 
 # silence
 
 
-@pytest.mark.parametrize(
+@each(
     ("rate_hz", "reply_period", "quiet_ms"),
     [
         (100.0, 0.0, 100),  # the minimum
@@ -522,7 +523,7 @@ def test_an_mcu_without_the_check_is_driven_plainly() -> None:
     assert bench.session.rejects == {}
 
 
-@pytest.mark.parametrize(
+@each(
     ("line", "reason"),
     [
         (GOOD, "without_crc"),

@@ -18,6 +18,7 @@ from acsard.core.link.quantization import (
     WheelCounter,
 )
 from acsard.core.link.quantization_step import STEEP, Search
+from tests.each import each
 
 PERIOD = 0.01
 
@@ -52,7 +53,7 @@ def learned(counts: int, lines: int = 2000) -> WheelCounter:
     return wheel
 
 
-@pytest.mark.parametrize("counts", [16, 20, 96, 400, 1000, 4000])
+@each("counts", [16, 20, 96, 400, 1000, 4000])
 def test_a_wheel_that_turns_about_shows_its_counts(counts: int) -> None:
     wheel = learned(counts)
     assert wheel.show(PERIOD)

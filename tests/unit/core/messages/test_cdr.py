@@ -403,7 +403,7 @@ def test_the_options_of_the_header_do_not_matter(options: bytes) -> None:
      b"\1\0\0\0", b"\1\1\0\0", b"\xff" * 4, b"{}\0\0"],
 )  # fmt: skip
 def test_no_other_header_is_read(head: bytes) -> None:
-    with pytest.raises(CdrError):
+    with pytest.raises(CdrError, match="header"):
         Cdr(Twist).decode(head + bytes(48) if len(head) == 4 else head)
 
 

@@ -12,6 +12,7 @@ from acsard.core.messages.permissions import (
 )
 from acsard.core.messages.topics import FOLLOWED, PUBLISHED, TOPICS
 from acsard.core.values import ROLES, Role
+from tests.each import each
 
 
 @pytest.mark.parametrize("role", ["", *ROLES])
@@ -44,7 +45,7 @@ def test_a_published_key_is_granted_with_its_twin_in_json() -> None:
     }
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "role"),
     [
         ("odom", "viewer"),

@@ -18,6 +18,7 @@ from acsard.core.motion.arbiter_text import (
 )
 from acsard.core.motion.modes import Mode
 from acsard.core.values import REST, Event, Refusal, Twist, Wait
+from tests.each import each
 
 SENTENCES = [
     (Wait("nothing"), ""),
@@ -59,7 +60,7 @@ SENTENCES = [
 ]
 
 
-@pytest.mark.parametrize(("wait", "text"), SENTENCES)
+@each(("wait", "text"), SENTENCES)
 def test_what_a_source_waits_for_is_a_sentence(wait: Wait, text: str) -> None:
     assert waiting(wait) == text
 

@@ -11,6 +11,7 @@ import pytest
 
 from acsard.core.motion.freshness import Freshness, Verdict
 from acsard.core.values import NS_PER_S, Command
+from tests.each import each
 from tests.unit.core.motion.commanders import GO, MS
 
 PERIOD = 50 * MS
@@ -61,7 +62,7 @@ FALL = (PERIOD, DRIFT - 50 * MS)
 """A command that is 50 ms earlier than the minimum."""
 
 
-@pytest.mark.parametrize(
+@each(
     ("steps", "verdict"),
     [
         ([FALL], "fresh"),
@@ -87,7 +88,7 @@ def test_a_steady_clock_that_came_early_counts_no_more_before_it_has_proved_itse
     ]
 
 
-@pytest.mark.parametrize(
+@each(
     ("after", "delay", "verdict"),
     [
         (250 * NS_PER_S, 0, "fresh"),
@@ -176,7 +177,7 @@ EIGHT: dict[str, tuple[list[float], bool]] = {
 }
 
 
-@pytest.mark.parametrize("case", EIGHT)
+@each("case", EIGHT)
 def test_a_proof_through_jitter_compares_the_minima_of_four_pairs_of_halves(case: str) -> None:
     delays, proved = EIGHT[case]
     half = 125 * MS
@@ -301,7 +302,7 @@ def test_a_sender_that_pauses_for_over_2_s_may_have_set_its_clock(
     assert sender.steadily(late, 30)[-1] == verdict
 
 
-@pytest.mark.parametrize(
+@each(
     ("before", "then", "verdict"),
     [(7, 8, "set"), (7, 51, "stale"), (7, 9, "stale"), (7, None, "set"), (None, 8, "set")],
 )
@@ -411,7 +412,7 @@ def test_the_numbers_of_1024_senders_without_stamps_are_remembered(
     assert numbered(freshness, 2, 5) == verdict
 
 
-# what a proof must not believe
+# messages that must not prove a clock
 
 
 def test_bursts_of_a_backlog_never_count_although_one_ends_a_half() -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import Source
 from acsard.core.motion.freshness import FORGIVE_NS, Freshness, Verdict
 from acsard.core.values import NS_PER_S, REST, Command
+from tests.each import each
 from tests.unit.core.motion.commanders import GO, HIGH, HOUR_NS, LOW, MS, SLOW, Bench
 
 
@@ -504,7 +505,7 @@ def test_a_command_behind_a_newer_one_is_stale_and_refreshes_nothing() -> None:
     assert clock.sends(0.0) == "fresh"
 
 
-@pytest.mark.parametrize(
+@each(
     ("stamp", "number", "fresh"),
     [(0, 8, True), (0, 7, False), (0, 6, False), (1, 1, True), (-1, 9, False)],
 )

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.motion.gyro_trial import Trial, Verdict
+from tests.each import each
 
 DT = 0.01
 
@@ -22,8 +23,8 @@ def turned(trial: Trial, rate: float, share: float, seconds: float, late_s: floa
     return trial.verdict
 
 
-@pytest.mark.parametrize("rate", [0.3, -2.0])
-@pytest.mark.parametrize(
+@each("rate", [0.3, -2.0])
+@each(
     ("share", "verdict"),
     [
         (1.0, "good"), (0.5, "good"), (-1.0, "reversed"), (-0.6, "reversed"),

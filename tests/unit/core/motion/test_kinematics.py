@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import DriveConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import REST, STILL, Twist, WheelSpeeds
+from tests.each import each
 from tests.vectors.drive import CALIBRATED, TWIST_OF_WHEELS, WHEELS_OF_TWIST
 
 Pair = tuple[float, float]
@@ -28,7 +29,7 @@ robots = st.builds(
 twists = st.builds(Twist, st.floats(-10.0, 10.0), st.floats(-50.0, 50.0))
 
 
-@pytest.mark.parametrize(("robot", "twist", "left", "right"), WHEELS_OF_TWIST)
+@each(("robot", "twist", "left", "right"), WHEELS_OF_TWIST)
 def test_a_twist_gives_the_wheel_speeds_worked_by_hand(
     robot: DriveConfig, twist: Pair, left: float, right: float
 ) -> None:
@@ -36,7 +37,7 @@ def test_a_twist_gives_the_wheel_speeds_worked_by_hand(
     assert speeds.as_tuple() == pytest.approx((right, left, left, right))
 
 
-@pytest.mark.parametrize(("robot", "twist", "left", "right"), WHEELS_OF_TWIST)
+@each(("robot", "twist", "left", "right"), WHEELS_OF_TWIST)
 def test_those_wheel_speeds_give_the_twist_back(
     robot: DriveConfig, twist: Pair, left: float, right: float
 ) -> None:
@@ -44,7 +45,7 @@ def test_those_wheel_speeds_give_the_twist_back(
     assert (back.linear, back.angular) == pytest.approx(twist)
 
 
-@pytest.mark.parametrize(("robot", "wheels", "twist"), TWIST_OF_WHEELS)
+@each(("robot", "wheels", "twist"), TWIST_OF_WHEELS)
 def test_four_wheel_speeds_give_the_twist_worked_by_hand(
     robot: DriveConfig, wheels: tuple[float, float, float, float], twist: Pair
 ) -> None:

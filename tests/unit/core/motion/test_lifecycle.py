@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
+from tests.each import each
 
 WALL_NS = 1_800_000_000 * NS_PER_S
 AT = "2027-01-15 08:00"
@@ -79,7 +80,7 @@ FAULT = Latch(8, WALL_NS, "", "a wheel is dead", kept=True)
 OFF = Latch(9, WALL_NS, "joe", "switched off by joe", kept=True)
 
 
-@pytest.mark.parametrize(
+@each(
     ("latches", "begins", "why"),
     [
         (
@@ -241,8 +242,8 @@ def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
         life.clear(None, ns(1.5), Instant(ns(1.5), WALL_NS + ns(3600.0)))
 
 
-@pytest.mark.parametrize("wall_s", [-3e8, 0.0, 1.5, 3e8])
-@pytest.mark.parametrize("kept", [True, False])
+@each("wall_s", [-3e8, 0.0, 1.5, 3e8])
+@each("kept", [True, False])
 def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     kept: bool, wall_s: float
 ) -> None:
@@ -814,7 +815,7 @@ def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_da
             assert edge.refused or not (edge.after.inactive or edge.after.dormant)
 
 
-@pytest.mark.parametrize(
+@each(
     ("wall_ns", "text"),
     [
         (0, "1970-01-01 00:00:00 UTC"),

@@ -16,6 +16,7 @@ from acsard.core.config.settings import DriveConfig, LimitsConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import Limiter
 from acsard.core.values import REST, Twist
+from tests.each import each
 
 DT = 0.01
 EPS = 1e-9
@@ -81,7 +82,7 @@ def test_a_new_limiter_is_at_rest() -> None:
     assert limiter().twist == REST
 
 
-@pytest.mark.parametrize(
+@each(
     ("wish", "end"),
     [
         # The limits are 1 m/s and 4 rad/s.
@@ -117,7 +118,7 @@ def test_the_speed_limits_keep_the_curvature(wish: Twist) -> None:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("limits", "wish", "end"),
     [
         (LimitsConfig(angular_speed=0.0), (0.5, 0.001), (0.5, 0.0)),
@@ -254,8 +255,8 @@ def test_jerk_lets_the_slope_grow_step_by_step() -> None:
     assert [t.linear for t in path] == pytest.approx([0.0005, 0.0015, 0.003])
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(
+@each("sign", [1.0, -1.0])
+@each(
     ("goal", "path"),
     [
         # Steps are 0.05 m/s2 and 10 ms; the slopes are 1, 2, 2, 1 and 1, 2, 3, 2, 1 steps.

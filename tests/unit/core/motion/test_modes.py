@@ -9,6 +9,7 @@ import pytest
 
 from acsard.core.motion.modes import REFUSALS, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import Verb
+from tests.each import each
 
 FACTS = ("shutting_down", "fault", "stopped", "inactive", "linked", "commanded")
 
@@ -50,14 +51,14 @@ def test_only_a_linked_commanded_robot_without_any_latch_drives() -> None:
     assert drives == [dict.fromkeys(FACTS[:4], False) | dict.fromkeys(FACTS[4:], True)]
 
 
-@pytest.mark.parametrize(("mode", "verb"), sorted(REFUSALS))
+@each(("mode", "verb"), sorted(REFUSALS))
 def test_a_refused_request_says_why(mode: Mode, verb: Verb) -> None:
     with pytest.raises(RefusedError) as caught:
         require_allowed(mode, verb)
     assert str(caught.value) == REFUSALS[mode, verb]
 
 
-@pytest.mark.parametrize(("mode", "verb"), sorted(REFUSALS))
+@each(("mode", "verb"), sorted(REFUSALS))
 def test_a_refusal_names_clear_only_where_clear_helps(mode: Mode, verb: Verb) -> None:
     assert ("call srv/clear first" in REFUSALS[mode, verb]) == (mode is not Mode.SHUTDOWN)
 

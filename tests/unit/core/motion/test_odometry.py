@@ -21,6 +21,7 @@ from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.path import arc
 from acsard.core.motion.uncertainty import MAX_VARIANCE, NOWHERE
 from acsard.core.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
+from tests.each import each
 from tests.vectors.drive import (
     PATHS,
     SEED_STEP,
@@ -124,7 +125,7 @@ def test_an_arc_in_two_parts_is_the_same_arc(distance: float, turn: float, share
     assert same_pose(second, (whole.x, whole.y, whole.yaw))
 
 
-@pytest.mark.parametrize("turn", [0.0, 5e-324, 1e-300, 1e-20, 1e-12, 1e-9, -1e-9])
+@each("turn", [0.0, 5e-324, 1e-300, 1e-20, 1e-12, 1e-9, -1e-9])
 def test_an_arc_of_hardly_any_turn_is_a_straight_line(turn: float) -> None:
     assert same_pose(arc(Pose(), 1.0, turn), (1.0, 0.0, turn))
 
@@ -142,7 +143,7 @@ def test_there_and_back_the_same_way_ends_where_it_began(
     assert robot.fold(feedback(0.0, 0.0, 0.0)).positions == pytest.approx((0.0,) * 4, abs=1e-9)
 
 
-@pytest.mark.parametrize("turns", [0, 1, 10, 1000, -1, -10, -1000])
+@each("turns", [0, 1, 10, 1000, -1, -10, -1000])
 def test_yaw_is_wrapped_however_many_turns_one_step_makes(turns: int) -> None:
     # Turning in place at 3 rad/s gives a yaw rate of 1 rad/s.
     wheel = 3.0 * (1.0 + turns * math.tau)

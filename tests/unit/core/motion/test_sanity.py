@@ -13,6 +13,7 @@ from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import STILL, WHEELS, Event, Instant, WheelSpeeds
+from tests.each import each
 
 DT = 0.01
 AT = Instant(0, 0)
@@ -187,8 +188,8 @@ def test_while_an_encoder_is_unknown_any_change_may_be_a_count_but_no_speed_too_
 # contradictions
 
 
-@pytest.mark.parametrize("wheel", range(4))
-@pytest.mark.parametrize(
+@each("wheel", range(4))
+@each(
     ("sent", "seen", "word"),
     [
         (10.0, 0.0, "does not turn"),
@@ -209,8 +210,8 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
     assert word in fault
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(
+@each("sign", [1.0, -1.0])
+@each(
     ("sent", "seen", "word"),
     [
         # A tenth of 10 rad/s does not count as turning.

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.motion.suspect_wheel import WORDS, Known, Stuck, Suspect, WheelFault, was_faulty
+from tests.each import each
 
 DT = 0.01
 FINE = math.tau / 3200
@@ -37,8 +38,8 @@ def lies(
     return suspect.sign is not None and suspect.is_faulty(FINE), suspect.sign
 
 
-@pytest.mark.parametrize("known", [told(10.0), told(12.0, slow=8.0), felt(10.0)])
-@pytest.mark.parametrize(("own", "lie"), [(0.0, "dead"), (0.4, "dead"), (-10.0, "reversed")])
+@each("known", [told(10.0), told(12.0, slow=8.0), felt(10.0)])
+@each(("own", "lie"), [(0.0, "dead"), (0.4, "dead"), (-10.0, "reversed")])
 def test_a_sign_that_command_or_gyro_deny_is_a_lie(
     own: float, lie: WheelFault, known: Known
 ) -> None:
@@ -90,7 +91,7 @@ def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
     assert lies(3.0, 0.0, NOTHING, lines=35, same=True) == (True, "stuck")
 
 
-@pytest.mark.parametrize(
+@each(
     ("lie", "own", "other", "lied"),
     [
         ("dead", 0.0, 5.0, True), ("dead", 5.0, 5.0, False),

@@ -14,6 +14,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.sanity import Sanity
 from acsard.core.motion.wheel_faults import WheelFaults
 from acsard.core.values import STILL, WHEELS, WheelSpeeds
+from tests.each import each
 from tests.unit.core.motion.liars import (
     AT,
     LIES,
@@ -80,8 +81,8 @@ def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
 # faulty wheels
 
 
-@pytest.mark.parametrize("wheel", range(4))
-@pytest.mark.parametrize("says", [0.0, -10.0])
+@each("wheel", range(4))
+@each("says", [0.0, -10.0])
 def test_a_wheel_that_lies_is_left_out_within_fifty_milliseconds_and_named(
     wheel: int, says: float
 ) -> None:

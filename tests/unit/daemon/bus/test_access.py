@@ -97,7 +97,7 @@ def written(key: str) -> str:
 # the roles
 
 
-def test_each_role_has_all_that_the_one_before_has_and_more() -> None:
+def test_each_role_has_all_permissions_of_the_role_below_it_and_more() -> None:
     for less, more in (("viewer", "operator"), ("operator", "maintainer"), ("maintainer", "local")):
         given_less = {rule["id"] for rule in DEFAULT.rules_of(less)}
         given_more = {rule["id"] for rule in DEFAULT.rules_of(more)}
@@ -111,12 +111,12 @@ def test_every_service_has_a_role_and_every_role_has_a_service() -> None:
     assert set(SERVICE_ROLES.values()) == set(ROLES)
 
 
-def test_what_no_rule_allows_is_denied() -> None:
+def test_a_message_that_no_rule_allows_is_denied() -> None:
     assert DEFAULT.value["enabled"] is True
     assert DEFAULT.value["default_permission"] == "deny"
 
 
-def test_a_certificate_counts_only_where_it_was_shown_and_plain_tcp_only_without_one() -> None:
+def test_a_certificate_counts_only_over_tls_and_a_tcp_link_needs_none() -> None:
     assert DEFAULT.subjects["local"] == {"id": "local", "link_protocols": ["tcp"]}
     for role in ROLES:
         subject = DEFAULT.subjects[role]
@@ -137,7 +137,7 @@ TOLD = [key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")]
 
 
 @each("told", TOLD)
-def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) -> None:
+def test_every_role_may_subscribe_to_and_query_the_published_keys(told: str) -> None:
     key = DEFAULT.key(told)
     assert DEFAULT.who("declare_subscriber", key) == FROM["viewer"]
     assert DEFAULT.who("query", key) == FROM["viewer"]
@@ -147,20 +147,20 @@ def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) 
 
 
 @each("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
-def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: str) -> None:
+def test_wildcards_are_for_clients_on_the_robot_unless_access_wildcards_is_set(below: str) -> None:
     assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == {"local"}
     assert TRUSTING.who("declare_subscriber", TRUSTING.key(below)) == FROM["viewer"]
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_what_comes_by_tls_names_exact_keys_only(role: Role) -> None:
+def test_a_client_over_tls_may_use_exact_keys_only(role: Role) -> None:
     heard = [rule for rule in GATEWAY.rules_of(role) if "ingress" in rule["flows"]]
     named = [key for rule in heard for key in rule["key_exprs"]]
     assert named
     assert not [key for key in named if "*" in key]
 
 
-def test_by_tls_each_certificate_commands_on_its_own_keys_and_no_other() -> None:
+def test_over_tls_each_certificate_commands_only_on_its_own_keys() -> None:
     people = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
     gateway = Access(gateway_access, access=people)
     for kind in ("cmd", "wheel_cmd"):
@@ -171,7 +171,7 @@ def test_by_tls_each_certificate_commands_on_its_own_keys_and_no_other() -> None
             assert not gateway.lets(who, "put", gateway.key(f"{kind}/app"))
 
 
-def test_a_router_hands_on_the_commands_of_any_certificate_and_has_none_without() -> None:
+def test_a_router_forwards_the_commands_of_any_certificate_and_no_command_without_one() -> None:
     for role in ("operator", "maintainer"):
         assert DEFAULT.lets(role, "put", DEFAULT.key("cmd/app/anna"))
         assert not DEFAULT.lets(role, "put", DEFAULT.key("cmd/ghost/anna"))
@@ -201,7 +201,7 @@ LEAST: dict[str, Role] = {
 
 
 @each("topic", [t for t in TOPICS if t.direction != "out"])
-def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic: Any) -> None:
+def test_every_other_key_is_for_its_least_role_and_the_roles_above(topic: Any) -> None:
     access = SENSING if topic.gyro else DEFAULT
     key = access.key(written(topic.key))
     message = "put" if topic.direction == "in" else "query"
@@ -213,14 +213,14 @@ def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic:
 
 
 @pytest.mark.parametrize("access", [DEFAULT, TRUSTING], ids=["exact", "wildcards"])
-def test_a_role_may_ask_for_its_own_name_and_those_below_and_no_other(access: Access) -> None:
+def test_a_role_may_query_only_the_whoami_keys_of_its_own_and_lower_roles(access: Access) -> None:
     for role in ROLES:
         who = access.who("query", access.key(whoami_key(role)))
         assert who == FROM[role]
     assert access.who("query", access.key("whoami/*")) <= FROM["maintainer"]
 
 
-def test_the_least_role_of_a_key_is_the_one_that_the_rules_have() -> None:
+def test_the_rules_have_the_least_role_of_each_key() -> None:
     for topic in TOPICS:
         if topic.direction != "out" and topic.key in LEAST and topic.key != WHOAMI:
             assert least_role(written(topic.key)) == LEAST[topic.key]
@@ -228,20 +228,19 @@ def test_the_least_role_of_a_key_is_the_one_that_the_rules_have() -> None:
             assert least_role(topic.key) == "viewer"
 
 
-def test_a_gyro_that_nobody_wants_is_granted_to_nobody() -> None:
+def test_an_unused_gyro_key_is_granted_to_no_role() -> None:
     for key in (DEFAULT.key("imu"), "imu/data"):
         assert not any(DEFAULT.lets(role, "put", key) for role in ROLES)
 
 
-def test_beside_the_simulated_gyro_only_who_is_at_the_machine_is_heard_and_all_may_follow_it(
-) -> None:  # fmt: skip
+def test_only_a_local_client_may_put_on_the_simulated_gyro() -> None:
     simulated = Access(odometry=GYRO)
     # received so that the daemon can refuse and report it
     assert simulated.who("put", simulated.key("imu")) == {"local"}
     assert simulated.who("declare_subscriber", simulated.key("imu")) == FROM["viewer"]
 
 
-def test_everybody_admitted_sees_that_the_robot_is_alive() -> None:
+def test_every_role_sees_that_the_robot_is_alive() -> None:
     for message in ("declare_liveliness_subscriber", "liveliness_query"):
         assert DEFAULT.who(message, DEFAULT.key("alive")) == FROM["viewer"]
         assert DEFAULT.who(message, "acsard/*/alive") == {"local"}
@@ -250,13 +249,13 @@ def test_everybody_admitted_sees_that_the_robot_is_alive() -> None:
         assert DEFAULT.lets(who, "liveliness_token", DEFAULT.key("alive"), "egress")
 
 
-def test_a_router_may_tell_of_another_with_our_id_or_our_ros_names() -> None:
+def test_a_router_may_forward_tokens_of_another_daemon_with_this_id_or_these_ros_names() -> None:
     for token in (DEFAULT.key("alive"), *claims(RosConfig())):
         assert DEFAULT.who("liveliness_token", token) == FROM["maintainer"]
         assert DEFAULT.lets("maintainer", "declare_liveliness_subscriber", token, "egress")
 
 
-def test_who_comes_late_gets_the_static_transforms_that_are_kept() -> None:
+def test_a_late_subscriber_gets_the_kept_static_transforms() -> None:
     ros = endpoints(RosConfig(), ZID)
     for key in (DEFAULT.key("tf_static"), *(e.key for e in ros if e.latched)):
         for message in ("query", "declare_subscriber"):
@@ -311,7 +310,7 @@ def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> 
                 assert met in ([], [str(held)])
 
 
-def test_not_even_a_maintainer_asks_beyond_the_robots_own_keys() -> None:
+def test_not_even_a_maintainer_may_query_beyond_the_robots_own_keys() -> None:
     for key in ("acsard/*/config", "acsard/**", "**", "acsard/*", "0/**", "acsard/other/srv/stop"):
         assert DEFAULT.who("query", key) == TRUSTING.who("query", key) == set()
 
@@ -331,7 +330,7 @@ IDS = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)
 
 @pytest.mark.slow
 @given(IDS, IDS)
-def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> None:
+def test_a_robot_grants_nothing_to_the_clients_of_another_robot(one: str, other: str) -> None:
     access = Access(robot=RobotConfig(id=one), ros=RosConfig(bridge=False, rmw=False))
     for topic in TOPICS:
         message = "put" if topic.direction == "in" else "query"
@@ -345,7 +344,7 @@ def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> Non
 
 
 @given(st.lists(IDS, min_size=1, max_size=5, unique=True))
-def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
+def test_only_configured_sources_may_send_commands(names: list[str]) -> None:
     sources = tuple(Source(name, priority=1, timeout=0.25) for name in names)
     access = Access(gateway_access, commands=CommandsConfig(sources=sources), ros=RosConfig())
     for kind in ("cmd", "wheel_cmd"):
@@ -360,7 +359,7 @@ def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
             assert access.lets("operator", "put", endpoint.key) == listed
 
 
-def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() -> None:
+def test_without_sources_no_certificate_commands_but_every_client_may_stop() -> None:
     for rules in (access_control, gateway_access):
         access = Access(rules, commands=CommandsConfig(sources=()))
         assert not access.lets("maintainer", "put", access.key("cmd/app/maintainer"))
@@ -370,7 +369,9 @@ def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() ->
 
 @each("namespace", ["", "robot1"])
 @each("transport", ["bridge", "rmw"])
-def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, namespace: str) -> None:
+def test_every_ros_name_is_for_its_least_role_and_the_roles_above(
+    transport: str, namespace: str
+) -> None:
     other = "rmw" if transport == "bridge" else "bridge"
     ros = RosConfig(**{other: False}, namespace=namespace)  # type: ignore[arg-type]
     access = Access(ros=ros, mcu=REAL, odometry=GYRO)
@@ -393,7 +394,7 @@ def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, name
 
 
 @pytest.mark.parametrize("gone", ["bridge", "rmw"])
-def test_a_ros_tree_that_is_off_leaves_no_keys_behind(gone: str) -> None:
+def test_a_ros_transport_that_is_off_has_no_keys(gone: str) -> None:
     access = Access(ros=RosConfig(**{gone: False}))  # type: ignore[arg-type]
     keys = {e.key for e in endpoints(RosConfig(), ZID) if e.transport == gone}
     named = {key for rule in access.rules.values() for key in rule["key_exprs"]}
@@ -444,7 +445,7 @@ def test_zenoh_accepts_the_rules(
         assert len(set(rule["key_exprs"])) == len(rule["key_exprs"])
 
 
-def test_at_the_gateway_each_role_may_what_it_may_and_the_daemon_all() -> None:
+def test_the_gateway_grants_each_role_its_permissions_and_the_daemon_everything() -> None:
     gateway = GATEWAY
     for role in ROLES:
         there, here = (

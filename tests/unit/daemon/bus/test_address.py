@@ -37,7 +37,7 @@ def _named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return file
 
 
-def test_without_the_variable_it_is_the_robot_here_whatever_lies_around(
+def test_without_the_variable_the_address_is_the_default_and_no_file_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
@@ -48,7 +48,7 @@ def test_without_the_variable_it_is_the_robot_here_whatever_lies_around(
 
 
 @pytest.mark.usefixtures("named")
-def test_what_is_not_given_is_the_file_s() -> None:
+def test_values_without_an_argument_come_from_the_file() -> None:
     tls = "tls/robot:7449"
     assert address_by_environment(None, None, None) == (NOBODY, "r7", "")
     assert address_by_environment(tls, None, None) == (tls, "r7", "/etc/acsard/tls")
@@ -59,7 +59,7 @@ def test_what_is_not_given_is_the_file_s() -> None:
 
 
 @pytest.mark.usefixtures("named")
-def test_the_certificate_of_the_environment_goes_before_the_file_s(
+def test_the_certificate_directory_of_the_environment_wins_over_the_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("ACSARD_TLS", "/run/credentials")
@@ -67,7 +67,7 @@ def test_the_certificate_of_the_environment_goes_before_the_file_s(
 
 
 @pytest.mark.usefixtures("named")
-def test_the_client_goes_where_the_file_says() -> None:
+def test_the_client_connects_to_the_endpoint_of_the_file() -> None:
     with pytest.raises(UnreachableError, match=NOBODY), connect():
         pass
 

@@ -33,17 +33,17 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rooms, "WHOAMI_MORE_S", 0.02)
 
 
-def test_the_highest_role_that_answers_is_ours_in_any_order() -> None:
+def test_the_highest_role_that_answers_is_the_clients_in_any_order() -> None:
     for count in range(1, len(ROLES) + 1):
         for answering in permutations(ROLES[:count]):
             assert of(*answering).role == ROLES[count - 1]
 
 
-def test_no_answer_and_a_strangers_are_no_role() -> None:
+def test_neither_silence_nor_an_unknown_answer_gives_a_role() -> None:
     assert of().role == of("admin").role == ""
 
 
-def test_what_a_role_lacks_is_told_with_the_role_it_takes_and_else_nothing() -> None:
+def test_a_missing_permission_is_reported_with_the_role_that_it_needs() -> None:
     viewer = Identity("viewer", "anna", "joe/1/aa")
     assert viewer.lacks("srv/clear") == (
         "your certificate anna is viewer: it may follow and stop, not drive; "
@@ -54,7 +54,7 @@ def test_what_a_role_lacks_is_told_with_the_role_it_takes_and_else_nothing() -> 
     assert Identity("", "", "x").lacks("config") == ""
 
 
-def test_a_silence_is_first_a_question_about_the_id_and_no_claim_about_a_list() -> None:
+def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() -> None:
     nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
     for told in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
         assert told.startswith("no daemon answers as 'robot1' at tls/a.local:7449")
@@ -68,7 +68,7 @@ def test_a_silence_is_first_a_question_about_the_id_and_no_claim_about_a_list() 
     assert Identity("viewer", "anna", "x").silence == stranger.silence == ""
 
 
-def test_who_is_asked_and_where_is_told_with_the_role() -> None:
+def test_the_message_names_the_robot_and_the_endpoint_that_were_queried() -> None:
     def nobody(name: str, take: Any) -> None:
         pass
 

@@ -49,7 +49,7 @@ def keys_of(inbox: Inbox) -> list[str]:
     return [arrival.key for arrival in inbox.take(8).arrivals]
 
 
-def test_a_step_gets_the_stops_first_and_the_rest_in_the_order_of_arrival() -> None:
+def test_a_step_gets_the_stops_first_and_other_samples_in_the_order_of_arrival() -> None:
     inbox, _ = an_inbox()
     arrived(inbox, "cmd/nav", IMU, "cmd/app", "stop", "cmd/nav")
     assert keys_of(inbox) == ["stop", "cmd/nav", IMU, "cmd/app", "cmd/nav"]
@@ -65,7 +65,7 @@ def test_commands_and_stops_wake_the_loop_and_a_gyro_sample_does_not() -> None:
     assert loop.woken == ["command", "stop", "command"]
 
 
-def test_the_loop_finds_what_it_was_woken_for() -> None:
+def test_the_loop_finds_the_sample_that_woke_it() -> None:
     found: list[list[str]] = []
     inbox, loop = an_inbox()
     loop.command = lambda: found.append(keys_of(inbox))  # type: ignore[method-assign]
@@ -74,7 +74,7 @@ def test_the_loop_finds_what_it_was_woken_for() -> None:
     assert found == [["cmd/app"], ["stop"]]
 
 
-def test_a_flood_on_one_key_pushes_out_only_its_own_and_is_counted() -> None:
+def test_a_flood_on_a_key_displaces_only_samples_of_that_key_and_is_counted() -> None:
     inbox, _ = an_inbox()
     arrived(inbox, "cmd/nav", "stop", *["cmd/app"] * (ARRIVALS + 5))
     taken = inbox.take(8)
@@ -84,7 +84,7 @@ def test_a_flood_on_one_key_pushes_out_only_its_own_and_is_counted() -> None:
     assert inbox.take(8).overrun == 0
 
 
-def test_a_loop_that_takes_when_it_is_woken_finds_the_loss_counted() -> None:
+def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
     inbox, loop = an_inbox()
     arrived(inbox, *["cmd/app"] * ARRIVALS)
     found: list[int] = []
@@ -130,7 +130,7 @@ def ended(replies: Replies) -> None:
             thread.join(5.0)
 
 
-def test_each_query_hears_what_was_sent_by_its_ticket_and_then_its_end() -> None:
+def test_each_query_gets_the_replies_to_its_ticket_and_then_its_end() -> None:
     replies, one, other = Replies("acsard/r7/"), Asked(), Asked()
     first, second = issued(replies, one), issued(replies, other, "acsard/stop")
     replies.send(Reply(first, "odom", b"1", ""))
@@ -143,7 +143,7 @@ def test_each_query_hears_what_was_sent_by_its_ticket_and_then_its_end() -> None
     assert other.told == ["acsard/stop=2", "dropped"]  # a ROS client sent its query on another key
 
 
-def test_a_client_that_has_gone_and_a_ticket_that_is_none_hold_nobody() -> None:
+def test_a_client_that_left_and_an_unknown_ticket_block_no_other_reply() -> None:
     replies, gone, here = Replies(""), Asked(gone=True), Asked()
     first, second = issued(replies, gone), issued(replies, here)
     for ticket in (first, 999, second):
@@ -154,7 +154,7 @@ def test_a_client_that_has_gone_and_a_ticket_that_is_none_hold_nobody() -> None:
     assert (gone.told, here.told) == (["dropped"], ["odom=1", "dropped"])
 
 
-def test_there_is_an_end_to_the_tickets_until_some_are_retired() -> None:
+def test_the_number_of_tickets_is_limited_until_some_are_retired() -> None:
     replies, queries = Replies(""), [Asked() for _ in range(2 * TICKETS)]
     tickets = [replies.issue(query, "") for query in queries]  # type: ignore[arg-type]
     held = [ticket for ticket in tickets if ticket is not None]

@@ -57,7 +57,7 @@ def publish(outlets: Outlets, number: float) -> None:
     outlets.flush()
 
 
-def test_all_is_sent_in_its_order_while_the_bus_takes_it() -> None:
+def test_messages_are_sent_in_order_while_the_bus_accepts_them() -> None:
     publisher = Publisher()
     publisher.free.set()
     outlets = started(publisher)
@@ -68,7 +68,7 @@ def test_all_is_sent_in_its_order_while_the_bus_takes_it() -> None:
     assert outlets.losses(clock.mono_ns()) == (0, False)
 
 
-def test_while_the_bus_is_locked_the_newest_wait_and_the_others_are_counted() -> None:
+def test_while_the_bus_blocks_the_newest_messages_wait_and_the_others_are_counted() -> None:
     publisher = Publisher()
     outlets = started(publisher)
     publish(outlets, 0)
@@ -81,7 +81,7 @@ def test_while_the_bus_is_locked_the_newest_wait_and_the_others_are_counted() ->
     assert publisher.sent == [0, *range(101 - HELD, 101)]
 
 
-def test_a_locked_bus_is_told_once_and_after_it_was_free_again() -> None:
+def test_a_blocked_bus_is_reported_once_for_each_time_that_it_blocks() -> None:
     publisher = Publisher()
     outlets = started(publisher)
     publish(outlets, 0)
@@ -94,7 +94,7 @@ def test_a_locked_bus_is_told_once_and_after_it_was_free_again() -> None:
     assert outlets.losses(now_ns + 3 * STUCK_NS) == (0, False)
 
 
-def test_what_the_thread_dies_of_ends_the_loop() -> None:
+def test_an_error_of_the_thread_ends_the_control_loop() -> None:
     publisher = Publisher(ValueError("a bug"))
     publisher.free.set()
     outlets = started(publisher)

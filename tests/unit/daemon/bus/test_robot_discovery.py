@@ -23,7 +23,7 @@ def test_an_id_names_one_robot_several_or_all(text: str, ids: tuple[str, ...]) -
 
 
 @each("text", ["a,", ",", "a,*", "a,b/c", "a,$*"])
-def test_what_names_nobody_is_refused_with_the_way_to_write_it(text: str) -> None:
+def test_a_list_of_invalid_ids_is_refused_with_the_correct_form(text: str) -> None:
     with pytest.raises(UsageError, match="comma"):
         named(text)
 
@@ -39,15 +39,15 @@ def test_what_names_nobody_is_refused_with_the_way_to_write_it(text: str) -> Non
         ("other/robot1/state", ""),
     ],
 )
-def test_a_key_is_of_one_robot_and_a_wildcard_of_none(key: str, robot: str) -> None:
+def test_a_key_belongs_to_one_robot_and_a_wildcard_to_none(key: str, robot: str) -> None:
     assert robot_of(key) == robot
 
 
-def test_where_wildcards_do_not_pass_names_are_asked_for() -> None:
-    assert "exact keys" in nobody("tls/router.local:7447")
-    assert "exact keys" not in nobody("tcp/127.0.0.1:7448")
+def test_over_tls_the_message_asks_for_the_names_of_the_robots() -> None:
+    assert "name the robots" in nobody("tls/router.local:7447")
+    assert "name the robots" not in nobody("tcp/127.0.0.1:7448")
 
 
-def test_where_certificates_decide_who_sees_nobody_is_told_how_to_find_out() -> None:
-    assert "`acsard whoami --id robot1` says so" in nobody("tls/router.local:7447")
+def test_over_tls_the_message_names_the_command_that_shows_the_role() -> None:
+    assert "`acsard whoami --id robot1` shows" in nobody("tls/router.local:7447")
     assert "whoami" not in nobody("tcp/127.0.0.1:7448")

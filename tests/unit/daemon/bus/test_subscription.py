@@ -38,15 +38,15 @@ def numbers(subscription: Subscription) -> list[int]:
     return [sample.number for sample in found]
 
 
-def test_what_a_stranger_put_on_a_wildcard_is_not_of_the_key() -> None:
+def test_a_sample_that_was_put_on_a_wildcard_does_not_count_for_the_key() -> None:
     assert numbers(Subscription(Queue(KEY, WILDCARD, WILDCARD, KEY), KEY)) == [0, 3]
 
 
-def test_without_a_key_it_is_all_there_is() -> None:
+def test_a_subscription_without_a_key_yields_all_samples() -> None:
     assert numbers(Subscription(Queue(KEY, WILDCARD, KEY))) == [0, 1, 2]
 
 
-def test_a_flood_of_strangers_does_not_hold_the_caller() -> None:
+def test_a_flood_on_other_keys_does_not_hold_the_caller() -> None:
     queue = Queue(*[WILDCARD] * (QUEUED + 1), KEY)
     subscription = Subscription(queue, KEY)
     assert subscription.try_recv() is None
@@ -54,7 +54,7 @@ def test_a_flood_of_strangers_does_not_hold_the_caller() -> None:
     assert subscription.try_recv() is not None
 
 
-def test_it_is_undeclared_after_a_silence_and_when_its_reader_leaves() -> None:
+def test_a_subscription_is_undeclared_after_a_silence_and_when_its_reader_leaves() -> None:
     silent, left = Queue(), Queue(KEY, KEY)
     assert numbers(Subscription(silent)) == []
     reader: Any = Subscription(left).until_silence(None)
@@ -75,11 +75,11 @@ class Closed(Queue):
         raise zenoh.ZError("already undeclared")
 
 
-def test_it_ends_when_its_session_is_closed() -> None:
+def test_a_subscription_ends_when_its_session_is_closed() -> None:
     assert numbers(Subscription(Closed(KEY, KEY))) == [0, 1]
 
 
-def test_a_closed_one_is_undeclared_without_a_word() -> None:
+def test_a_closed_subscription_is_undeclared_without_an_error() -> None:
     Subscription(Closed()).undeclare()
 
 
@@ -107,7 +107,7 @@ def sample(number: int) -> Any:
     return SimpleNamespace(key_expr=KEY, number=number)
 
 
-def test_a_reader_sleeps_until_something_comes_and_ends_when_the_session_is_closed() -> None:
+def test_a_reader_sleeps_until_a_sample_arrives_and_ends_when_the_session_is_closed() -> None:
     handler, subscription = declared()
     asleep: Any = subscription.until_silence(None)
 
@@ -134,7 +134,7 @@ def test_a_reader_sleeps_until_something_comes_and_ends_when_the_session_is_clos
     assert looks <= 1 + 2 * 4  # a poll every millisecond would look 200 times
 
 
-def test_an_asyncio_reader_is_woken_by_what_comes_and_by_the_end() -> None:
+def test_a_sample_or_the_end_wakes_an_asyncio_reader() -> None:
     handler, subscription = declared()
 
     async def read() -> list[int]:
@@ -147,7 +147,7 @@ def test_an_asyncio_reader_is_woken_by_what_comes_and_by_the_end() -> None:
     assert asyncio.run(read()) == [0, 1, 2]
 
 
-def test_of_a_flood_the_newest_are_kept() -> None:
+def test_the_newest_samples_of_a_flood_are_kept() -> None:
     handler, subscription = declared()
     for number in range(QUEUED + 5):
         handler.callback(sample(number))

@@ -25,7 +25,7 @@ def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
     return where
 
 
-def test_the_name_in_a_certificate_is_told_and_of_none_that_can_be_used_no_name(
+def test_the_common_name_is_read_and_is_empty_for_an_unusable_certificate(
     tmp_path: Path,
 ) -> None:
     assert common_name(str(made(tmp_path))) == "robot"
@@ -35,7 +35,7 @@ def test_the_name_in_a_certificate_is_told_and_of_none_that_can_be_used_no_name(
     assert common_name(str(tmp_path)) == common_name(str(tmp_path / "nobody")) == ""
 
 
-def test_what_lan_init_makes_can_be_used(tmp_path: Path) -> None:
+def test_the_files_of_tls_init_can_be_used(tmp_path: Path) -> None:
     require_usable(str(made(tmp_path)))
 
 
@@ -64,7 +64,7 @@ BROKEN: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
+def test_unusable_files_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
     BROKEN[how](made(tmp_path))
     with pytest.raises(CertificateError) as caught:
         require_usable(str(tmp_path))
@@ -73,14 +73,14 @@ def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: 
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
-def test_a_key_that_is_not_ours_to_read_is_no_permission(tmp_path: Path) -> None:
+def test_a_key_that_this_user_may_not_read_is_a_missing_permission(tmp_path: Path) -> None:
     (made(tmp_path) / "key.pem").chmod(0)
     with pytest.raises(NotPermittedError):
         require_usable(str(tmp_path))
 
 
 @pytest.mark.parametrize(("days", "authority"), [(10, 100), (3000, 2)])
-def test_it_ends_when_the_first_of_certificate_and_authority_does(
+def test_the_end_is_the_earlier_one_of_certificate_and_authority(
     tmp_path: Path, days: int, authority: int
 ) -> None:
     ends = ends_ns(str(made(tmp_path, days, authority)))
@@ -92,7 +92,7 @@ def test_it_ends_when_the_first_of_certificate_and_authority_does(
     assert round((ends - later) / DAY_NS) == expected - 1
 
 
-def test_files_that_are_none_end_at_no_time(tmp_path: Path) -> None:
+def test_missing_files_have_no_end(tmp_path: Path) -> None:
     assert ends_ns(str(tmp_path)) is None
 
 
@@ -104,7 +104,7 @@ def test_files_that_are_none_end_at_no_time(tmp_path: Path) -> None:
         (errno.ECONNREFUSED, "no program listens on port 7449 of robot.local", "not there"),
     ],
 )
-def test_a_host_that_is_not_there_is_not_one_on_which_nobody_listens(
+def test_an_absent_host_is_distinguished_from_a_port_without_a_program(
     number: int, told: str, untold: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def connection(*_: Any) -> None:
@@ -128,7 +128,7 @@ def test_the_options_of_an_endpoint_are_not_part_of_its_port(
 
     monkeypatch.setattr(socket, "create_connection", connection)
     assert trouble(f"tls/robot.local:7449{options}", "") == (
-        "robot.local does not answer on port 7449: is it switched on, "
+        "robot.local does not answer on port 7449: is robot.local switched on, "
         "and does a firewall drop connections?"
     )
     assert asked == [("robot.local", 7449)]

@@ -37,7 +37,7 @@ def written(where: Path, text: str) -> Path:
     return file
 
 
-def test_it_takes_the_fleets_file_as_it_is() -> None:
+def test_the_router_accepts_the_file_of_the_project_unchanged() -> None:
     router = Router(ROUTER_FILE)
     assert (router.where, router.most) == ("tls/0.0.0.0:7447", 256)
     assert router.ready()
@@ -57,7 +57,7 @@ def test_it_takes_the_fleets_file_as_it_is() -> None:
         ("", "router.json5"),
     ],
 )
-def test_what_is_none_is_refused_with_the_file_and_the_mend(
+def test_a_file_that_is_not_for_a_router_is_refused_with_its_name_and_the_fix(
     tmp_path: Path, text: str, says: str
 ) -> None:
     with pytest.raises(RouterFileError) as error:
@@ -77,7 +77,7 @@ def test_what_is_none_is_refused_with_the_file_and_the_mend(
         ('{ mode: "a\\"b" }', 'unknown variant `a"b`'),
     ],
 )
-def test_what_cannot_be_read_is_told_whole_with_its_line_and_column(
+def test_a_mistake_in_the_file_is_reported_with_line_and_column(
     tmp_path: Path, text: str, says: str
 ) -> None:
     with pytest.raises(RouterFileError) as error:
@@ -87,7 +87,7 @@ def test_what_cannot_be_read_is_told_whole_with_its_line_and_column(
     assert "Location" not in str(error.value)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(RouterFileError, match=r"nowhere\.json5"):
         Router(tmp_path / "nowhere.json5")
 
@@ -98,7 +98,7 @@ def on(where: Path, endpoint: str) -> Router:
     return Router(written(where, text))
 
 
-def test_an_address_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
+def test_an_address_in_use_may_be_free_later(tmp_path: Path) -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as other,
         pytest.raises(InUseError, match="end the program that uses the address"),
@@ -110,7 +110,7 @@ def test_an_address_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
     ("endpoint", "says"),
     [("tls/127.0.0.1:0", "TLS private key"), ("pigeon/127.0.0.1:0", "pigeon protocol")],
 )
-def test_what_no_address_would_mend_is_the_file_s_fault(
+def test_an_error_that_other_addresses_would_not_fix_is_an_error_of_the_file(
     tmp_path: Path, endpoint: str, says: str
 ) -> None:
     with pytest.raises(RouterFileError, match=rf"router\.json5 cannot be used: .*{says}"):
@@ -133,13 +133,13 @@ def made(robots: Sequence[str], people: Mapping[Role, Sequence[str]] | None = No
     return read(router_file(TEMPLATE, robots, people or {}))
 
 
-def test_for_one_robot_it_is_the_file_as_it_stands() -> None:
+def test_for_the_robot_of_the_template_the_file_is_the_template() -> None:
     assert made(["robot1"]) == read(TEMPLATE)
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize("message", ["query", "put"])
-def test_each_role_may_use_the_keys_that_the_gateway_of_a_robot_lets_it(
+@each("role", ROLES)
+@each("message", ["query", "put"])
+def test_each_role_may_use_the_same_keys_as_at_the_gateway_of_a_robot(
     role: Role, message: str
 ) -> None:
     gateway = gateway_access(
@@ -166,7 +166,7 @@ def granted(access: Any, subjects: set[str], message: str) -> set[str]:
     return {key for rule in sent for key in rule["key_exprs"]}
 
 
-def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
+def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None:
     one, ten = made(["robot1"]), made(TEN)
     for robots in (["robot1"], TEN):
         assert f"// It is for {', '.join(robots)}. For yours:\n" in router_file(
@@ -198,7 +198,7 @@ def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
         )
 
 
-def test_people_are_in_the_list_of_their_role_beside_its_own_certificate() -> None:
+def test_further_certificates_are_in_the_list_of_their_role() -> None:
     who: dict[Role, list[str]] = {
         "operator": ["laptop-anna", "robot1-ben"],
         "viewer": ["wall"],
@@ -218,7 +218,7 @@ DRIVE = ("operator", "laptop-anna", "robot1-ben", "maintainer", "chief")
 
 
 @pytest.mark.parametrize("robots", [["a-1"], ["operator-1", "robot1", "x"]])
-def test_each_certificate_that_commands_has_keys_of_its_own_on_each_robot(
+def test_each_commanding_certificate_has_keys_of_its_own_on_each_robot(
     robots: list[str],
 ) -> None:
     people: dict[Role, list[str]] = {
@@ -252,12 +252,14 @@ def test_each_certificate_that_commands_has_keys_of_its_own_on_each_robot(
         (["operator"], {}),
     ],
 )
-def test_a_name_has_one_place(robots: list[str], people: Mapping[Role, Sequence[str]]) -> None:
+def test_a_name_may_occur_only_once(
+    robots: list[str], people: Mapping[Role, Sequence[str]]
+) -> None:
     with pytest.raises(UsageError, match="named twice"):
         router_file(TEMPLATE, robots, people)
 
 
-def test_no_robot_is_called_as_something_else_in_the_file_is() -> None:
+def test_a_robot_may_have_a_name_that_the_template_uses_otherwise() -> None:
     robots = ["viewers", "hear", "learn", "a", "see-a", "own-a", "robot-a"]
     access = made(robots)
     for kind in ("rules", "subjects"):

@@ -23,14 +23,14 @@ def look(at_ns: int, *holders: str, linked: bool = True) -> Observation:
     return Observation(at_ns, holders, linked)
 
 
-def test_a_gateway_with_room_has_nothing_to_tell() -> None:
+def test_a_gateway_with_free_connections_reports_nothing() -> None:
     health = SessionHealth(MOST, 0)
     assert health.full_event(look(S, "ann", "ben", "ben")) is None
     assert health.restart_event(look(S), S // 4) is None
     assert health.full == 0
 
 
-def test_a_gateway_without_room_tells_who_has_it_once_a_minute_and_counts_every_look() -> None:
+def test_a_full_gateway_names_its_clients_once_a_minute_and_counts_every_observation() -> None:
     health, told = SessionHealth(MOST, 0), []
     for number in range(2 * 60 * 4 + 1):
         event = health.full_event(look(number * S // 4, "ben", "ann", "ben", ""))
@@ -43,7 +43,7 @@ def test_a_gateway_without_room_tells_who_has_it_once_a_minute_and_counts_every_
     assert health.full == 2 * 60 * 4 + 1
 
 
-def test_only_those_who_have_most_are_named() -> None:
+def test_only_the_clients_with_the_most_connections_are_named() -> None:
     holders = [name for name in "abcdefgh" for _ in range(ord(name))]
     assert connection_counts(holders) == "104 by h, 103 by g, 102 by f, 101 by e, 100 by d"
 
@@ -51,7 +51,7 @@ def test_only_those_who_have_most_are_named() -> None:
 MOMENT = S // 4
 
 
-def test_a_look_that_takes_too_long_ends_it() -> None:
+def test_an_observation_that_takes_too_long_restarts_the_gateway() -> None:
     health, stuck = SessionHealth(MOST, 0), look(S)
     assert [health.restart_event(stuck, MOMENT) for _ in range(STUCK_NS // MOMENT + 1)][-1] is None
     over = health.restart_event(stuck, MOMENT)
@@ -59,14 +59,14 @@ def test_a_look_that_takes_too_long_ends_it() -> None:
     assert (over.name, over.level) == ("gateway_stuck", "error")
 
 
-def test_a_machine_that_stands_still_as_a_whole_is_nobody_s_fault() -> None:
+def test_a_stall_of_the_whole_machine_does_not_restart_the_gateway() -> None:
     health = SessionHealth(MOST, 0)
     assert health.restart_event(look(S), MOMENT) is None
     assert health.restart_event(look(S), 60 * S) is None
     assert health.restart_event(look(61 * S), MOMENT) is None
 
 
-def test_a_daemon_that_is_connected_and_answers_nothing_is_none() -> None:
+def test_a_connected_daemon_that_answers_no_query_restarts_the_gateway() -> None:
     health = SessionHealth(MOST, 0)
     for number in range(MAX_UNANSWERED):
         assert health.restart_event(Observation(S, linked=True, unanswered=number), 0) is None
@@ -76,7 +76,7 @@ def test_a_daemon_that_is_connected_and_answers_nothing_is_none() -> None:
     assert "4 queries unanswered" in over.text
 
 
-def test_without_the_daemon_it_closes() -> None:
+def test_a_lost_daemon_restarts_the_gateway() -> None:
     health = SessionHealth(MOST, 0)
     assert health.restart_event(look(S), MOMENT) is None
     assert health.restart_event(look(S + ALONE_NS, linked=False), MOMENT) is None, (
@@ -87,13 +87,13 @@ def test_without_the_daemon_it_closes() -> None:
     assert over.name == "gateway_lost_daemon"
 
 
-def test_while_others_come_in_too_the_daemon_has_more_time() -> None:
+def test_after_the_start_the_daemon_has_more_time_to_connect() -> None:
     health = SessionHealth(MOST, S)
     assert health.restart_event(look(S + FIRST_NS, linked=False), MOMENT) is None
     assert health.restart_event(look(S + FIRST_NS + 1, linked=False), MOMENT) is not None
 
 
-def test_a_daemon_that_is_back_in_time_keeps_it_open() -> None:
+def test_a_daemon_that_reconnects_in_time_causes_no_restart() -> None:
     health = SessionHealth(MOST, 0)
     for half_seconds in range(20):
         now = look(half_seconds * S // 2, linked=half_seconds % 2 == 0)

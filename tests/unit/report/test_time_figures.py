@@ -1,4 +1,4 @@
-"""The plotting library accepts the plots, and their numbers are those of the path."""
+"""Plotly accepts the pictures, and their numbers are those of the report's data."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import plotly.graph_objects as library
 import pytest
 
 from acsard.core.config.parsing import parse
-from acsard.report.drawing import Figure
-from acsard.report.figures import Pictures
+from acsard.report.plot_elements import Figure
+from acsard.report.time_figures import TimeFigures
 from tests.scenarios.taped import Tape, happenings
 from tests.scenarios.world import START, World
-from tests.unit.report.driven import course_of, drive_of_two, followed, two_drivers
+from tests.unit.report.driven import drive_of_two, report_from, report_of, two_drivers
 from tests.unit.report.seen import column, trace
 
 OFFSET_S = 3600.0
@@ -23,8 +23,8 @@ OFFSET_S = 3600.0
 
 @pytest.fixture(scope="module")
 def figures() -> dict[str, Figure]:
-    course, _ = drive_of_two()
-    return {figure.name: figure for figure in Pictures(course, OFFSET_S).all()}
+    report, _ = drive_of_two()
+    return {figure.name: figure for figure in TimeFigures(report, OFFSET_S).all()}
 
 
 def known(values: Iterable[float]) -> list[float | None]:
@@ -37,16 +37,16 @@ def all_that_happens(world: World) -> None:
     happenings(world, random.Random(1))
 
 
-def test_no_two_signs_of_a_picture_look_alike() -> None:
-    course, _ = course_of(all_that_happens)
-    for figure in Pictures(course, OFFSET_S).all():
+def test_no_two_symbols_of_a_picture_look_alike() -> None:
+    report, _ = report_of(all_that_happens)
+    for figure in TimeFigures(report, OFFSET_S).all():
         signs = [(key.sign, key.colour) for key in figure.keys]
         assert len(signs) == len(set(signs)) > 0, figure.keys
-    keys = {key.meaning for figure in Pictures(course, OFFSET_S).all() for key in figure.keys}
+    keys = {key.meaning for figure in TimeFigures(report, OFFSET_S).all() for key in figure.keys}
     assert keys >= {"stop", "link down", "driving, teleop drives"}
 
 
-def test_a_curve_that_another_may_hide_is_seen_beneath_it(figures: dict[str, Figure]) -> None:
+def test_a_curve_under_another_curve_stays_visible(figures: dict[str, Figure]) -> None:
     for name, beneath in (("speeds", "limited"), ("wheels", "commanded"), ("link", "sent")):
         widths = {one["name"]: one["line"]["width"] for one in figures[name].data}
         below = [one["name"] for one in figures[name].data].index(beneath)
@@ -55,15 +55,15 @@ def test_a_curve_that_another_may_hide_is_seen_beneath_it(figures: dict[str, Fig
 
 
 @pytest.mark.slow
-def test_the_library_knows_every_word_of_them(figures: dict[str, Figure]) -> None:
+def test_plotly_knows_every_attribute_of_the_pictures(figures: dict[str, Figure]) -> None:
     for figure in figures.values():
         made = library.Figure(data=figure.data, layout=figure.layout)
         assert len(made.data) == len(figure.data)
 
 
-def test_a_speed_is_at_the_time_of_the_clock_on_the_wall(figures: dict[str, Figure]) -> None:
-    course, _ = drive_of_two()
-    points, drawn = course.linear["measured"].points(), trace(figures["speeds"], "measured")
+def test_speeds_are_drawn_at_local_times(figures: dict[str, Figure]) -> None:
+    report, _ = drive_of_two()
+    points, drawn = report.linear["measured"].points(), trace(figures["speeds"], "measured")
     assert known(column(drawn["y"])) == known(point.value for point in points)
     zero_ms = 1000 * (START.wall_ns / 1e9 + OFFSET_S)
     times = [(ms - zero_ms) / 1000 for ms in column(drawn["x"])]
@@ -71,24 +71,24 @@ def test_a_speed_is_at_the_time_of_the_clock_on_the_wall(figures: dict[str, Figu
 
 
 def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None:
-    course, _ = drive_of_two()
-    for n, curve in enumerate(course.turned):
+    report, _ = drive_of_two()
+    for n, curve in enumerate(report.measured_wheels):
         drawn = trace(figures["wheels"], "measured", f"y{n + 1}" if n else "y")
         assert known(column(drawn["y"])) == known(point.value for point in curve.points())
 
 
-def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
-    waits = trace(figures["who"], "waits")
+def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:
+    waits = trace(figures["sources"], "waits")
     words = [text.replace("<br>", " ") for text in waits["hovertext"]]
     assert "<b>waits</b> teleop has priority: wait until it is silent" in words
     assert max(column(waits["x"])) > 1500  # in ms
-    rows = [note["text"] for note in figures["who"].layout["annotations"]]
+    rows = [note["text"] for note in figures["sources"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
-    assert "Silent all the time: app, ros2_control." in figures["who"].caption
+    assert "Silent all the time: app, ros2_control." in figures["sources"].caption
 
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
-    """Return the colour and pattern of each commander that drove."""
+    """Return the colour and pattern of each source that drove."""
     drives = [one for one in figure.data if one["name"].endswith(" drives")]
     looks = {one["name"].split()[0]: one["marker"] for one in drives}
     return {
@@ -97,8 +97,8 @@ def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
     }
 
 
-def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str, Figure]) -> None:
-    who = figures["who"]
+def test_two_driving_sources_have_two_colours_in_the_legend(figures: dict[str, Figure]) -> None:
+    who = figures["sources"]
     looks = drivers(who)
     assert set(looks) == {"teleop", "nav"}
     assert len(set(looks.values())) == 2
@@ -107,25 +107,25 @@ def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str,
 
 
 @pytest.mark.slow
-def test_ten_who_drove_are_told_apart() -> None:
+def test_ten_driving_sources_have_different_styles() -> None:
     rows = [f'[[commands.sources]]\nname = "app{n}"\npriority = {n}\n' for n in range(10)]
     config, tape = parse("".join(rows).encode()), Tape()
     world = World(config, recorder=tape)
     for n in range(10):
         world.drive(0.3, seconds=0.1, source=f"app{n}")
         world.run(0.3)
-    figure = Pictures(followed(tape.steps(), config), OFFSET_S).who()
+    figure = TimeFigures(report_from(tape.steps(), config), OFFSET_S).sources()
     library.Figure(data=figure.data, layout=figure.layout)
     looks = drivers(figure)
     assert len(looks) == len(set(looks.values())) == 10
     assert [pattern != "" for _, pattern in looks.values()] == [False] * 8 + [True] * 2
 
 
-def test_a_robot_that_was_never_heard_is_drawn_all_the_same() -> None:
+def test_a_robot_without_feedback_is_drawn() -> None:
     def mute(world: Any) -> None:
         world.port.unplug()
         world.run(1.0)
 
-    course, _ = course_of(mute)
-    for figure in Pictures(course, 0.0).all():
+    report, _ = report_of(mute)
+    for figure in TimeFigures(report, 0.0).all():
         library.Figure(data=figure.data, layout=figure.layout)

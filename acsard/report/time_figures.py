@@ -1,6 +1,6 @@
-"""The pictures of a course over time; `Pictures.all` returns every picture of a report.
+"""Draws the data of a report over time.
 
-Times are local times in ms since 1970, because the library knows no time zones.
+Times in the pictures are local times in ms since 1970, because plotly knows no time zones.
 """
 
 from __future__ import annotations
@@ -11,195 +11,207 @@ from typing import Any, NamedTuple
 from acsard.core.thinning import Point, Span
 from acsard.core.values import WHEELS
 from acsard.report.command_sources import OTHERS
-from acsard.report.course import Course, Mark
-from acsard.report.drawing import (
+from acsard.report.path_figure import path_figure
+from acsard.report.plot_elements import (
     COLOURS,
+    COMMANDED,
     LIMITED,
     MEASURED,
     UNKNOWN,
-    WISHED,
     Figure,
     Key,
     Trace,
-    commander,
     label,
     layout,
     note,
     numbers,
-    path,
     scatter,
     sentence,
+    source_style,
 )
+from acsard.report.report_data import Mark, ReportData
 
-ROW_PX, ROOM_PX = 54, 68
+ROW_PX, AXIS_PX = 54, 68
 """Height of a row of bands, and additional height for the time axis."""
 
 
 class Line(NamedTuple):
-    """A curve of a picture; `shape` is plotly's interpolation between two values."""
+    """A curve of a picture."""
 
     name: str
     colour: str
     points: Sequence[Point]
     shape: str = "linear"
+    """Plotly's interpolation between two points."""
     width: float = 1.6
     """Line width, px."""
 
 
 GAP_PX = 30
-"""Height of the gap above each of several pictures, for its title."""
+"""Height of the gap above each part of a picture, for the title of the part."""
 
 BENEATH = 3.4
-"""Width of a curve that another one nearly covers, so that its colour shows on both sides."""
+"""Width of a curve that another curve nearly covers, px. Its colour shows on both sides."""
 
 
 class Part(NamedTuple):
-    """One of several pictures above a common time axis."""
+    """One of several diagrams in a picture, which share the time axis."""
 
     title: str
     lines: list[Line]
 
 
 Row = tuple[str, list[Span]]
-"""The name of a row and its bands."""
+"""The name of a row, and the spans of time that are drawn as its bands."""
 
 DRIVES = "drives"
 
 
-class Look(NamedTuple):
-    """Appearance of the bands of one kind. Each driving source has its own."""
+class BandStyle(NamedTuple):
+    """Appearance of the bands of one kind. Each driving source has a style of its own."""
 
     kind: str
-    who: str
-    """Name of the driving source; "" applies to all rows."""
+    source: str
+    """Name of the driving source; "" if the style applies to all rows."""
     colour: str
     pattern: str = ""
 
     @property
-    def told(self) -> str:
-        return f"{self.who} {self.kind}".strip()
+    def meaning(self) -> str:
+        """Text in the legend."""
+        return f"{self.source} {self.kind}".strip()
 
     def of(self, row: Row) -> list[Span]:
-        """Return the bands of a row with this appearance."""
+        """Return the spans of a row that are drawn with this style."""
         name, spans = row
-        return [one for one in spans if one.kind == self.kind] if self.who in ("", name) else []
+        applies = self.source in ("", name)
+        return [span for span in spans if span.kind == self.kind] if applies else []
 
 
-def _looks(rows: list[Row]) -> Iterator[Look]:
-    drivers = [name for name, spans in rows if any(one.kind == DRIVES for one in spans)]
+def _styles(rows: list[Row]) -> Iterator[BandStyle]:
+    drivers = [name for name, spans in rows if any(span.kind == DRIVES for span in spans)]
     for kind in dict.fromkeys(span.kind for _, spans in rows for span in spans):
         if kind == DRIVES:
             for number, name in enumerate(drivers):
-                yield Look(kind, name, *commander(number))
+                yield BandStyle(kind, name, *source_style(number))
         else:
-            yield Look(kind, "", COLOURS.get(kind, UNKNOWN))
+            yield BandStyle(kind, "", COLOURS.get(kind, UNKNOWN))
 
 
-def _keys(looks: list[Look]) -> list[Key]:
+def _keys(styles: list[BandStyle]) -> list[Key]:
     """Return one legend entry for each colour and pattern, with all its meanings."""
     meanings: dict[tuple[str, str], list[str]] = {}
-    for one in looks:
-        meanings.setdefault((one.colour, one.pattern), []).append(one.told)
+    for style in styles:
+        meanings.setdefault((style.colour, style.pattern), []).append(style.meaning)
     return [
-        Key("▨" if pattern else "■", colour, ", ".join(told))
-        for (colour, pattern), told in meanings.items()
+        Key("▨" if pattern else "■", colour, ", ".join(texts))
+        for (colour, pattern), texts in meanings.items()
     ]
 
 
-class Pictures:
-    """Draws a course; `offset_s` is the local time's offset from UTC."""
+class TimeFigures:
+    """Draws all pictures of a report."""
 
-    def __init__(self, course: Course, offset_s: float) -> None:
-        self._course = course
-        self._zero_ms = 1000 * ((course.began or 0.0) + offset_s)
+    def __init__(self, data: ReportData, offset_s: float) -> None:
+        """Draw `data`; `offset_s` is the offset of the local time from UTC, s."""
+        self._data = data
+        self._zero_ms = 1000 * ((data.began or 0.0) + offset_s)
 
     def all(self) -> list[Figure]:
         """Return all pictures in the order of the page."""
         return [
-            path(self._course), self.speeds(), self.who(), self.events(), self.wheels(),
-            self.link(), self.loop(),
+            path_figure(self._data), self.speeds(), self.sources(), self.events(), self.wheels(),
+            self.serial(), self.loop(),
         ]  # fmt: skip
 
     def speeds(self) -> Figure:
-        course = self._course
+        """Draw the commanded, limited and measured speeds."""
+        data = self._data
         parts = [
             Part(
                 title,
                 [
-                    Line("commanded", WISHED, curves["wished"].points(), "hv"),
+                    Line("commanded", COMMANDED, curves["commanded"].points(), "hv"),
                     Line("limited", LIMITED, curves["limited"].points(), "hv", BENEATH),
                     Line("measured", MEASURED, curves["measured"].points()),
                 ],
             )
             for title, curves in (
-                ("forward, m/s", course.linear),
-                ("turning, rad/s", course.angular),
+                ("forward, m/s", data.linear),
+                ("turning, rad/s", data.angular),
             )
         ]
         caption = (
-            "Commanded is the speed of the source that drives; limited is the speed sent to the "
-            "wheels; measured is the speed that they reported. Left turns and forward driving are "
-            "above zero."
+            "Commanded is the speed of the source that drives. Limited is the speed sent to the "
+            "wheels. Measured is the speed that the wheels reported. Left turns and forward "
+            "driving are above zero."
         )
         return self._stack("speeds", "Speed", caption, parts, 210)
 
     def wheels(self) -> Figure:
-        pairs = zip(WHEELS, self._course.asked, self._course.turned, strict=True)
+        """Draw the commanded and measured speed of each wheel."""
+        curves = zip(WHEELS, self._data.commanded_wheels, self._data.measured_wheels, strict=True)
         parts = [
             Part(
                 f"{name.replace('_', ' ')}, rad/s",
                 [
-                    Line("commanded", LIMITED, asked.points(), "hv", BENEATH),
-                    Line("measured", MEASURED, turned.points()),
+                    Line("commanded", LIMITED, commanded.points(), "hv", BENEATH),
+                    Line("measured", MEASURED, measured.points()),
                 ],
             )
-            for name, asked, turned in pairs
+            for name, commanded, measured in curves
         ]
-        caption = "Above zero drives the robot forward."
+        caption = "A speed above zero drives the robot forward."
         return self._stack("wheels", "The four wheels", caption, parts, 150)
 
-    def link(self) -> Figure:
-        link = self._course.link
-        bad = [Line("dropped", COLOURS["error"], link.dropped.points(), "hvh")]
-        if not self._course.config.mcu.reply_period:
-            bad.append(Line("no answer", WISHED, link.unanswered.points(), "hvh"))
+    def serial(self) -> Figure:
+        """Draw the number of sent, answered and lost lines per second."""
+        counts = self._data.serial
+        bad = [Line("dropped", COLOURS["error"], counts.dropped.points(), "hvh")]
+        if not self._data.config.mcu.reply_period:
+            bad.append(Line("no answer", COMMANDED, counts.unanswered.points(), "hvh"))
         parts = [
             Part(
                 "lines per second",
                 [
-                    Line("sent", LIMITED, link.sent.points(), "hvh", BENEATH),
-                    Line("answered", MEASURED, link.good.points(), "hvh"),
+                    Line("sent", LIMITED, counts.sent.points(), "hvh", BENEATH),
+                    Line("answered", MEASURED, counts.good.points(), "hvh"),
                 ],
             ),
             Part("lost per second", bad),
         ]
         caption = (
-            "Dropped lines arrived, but were unreadable or implausible. Lines without an answer "
-            "were lost on the way there or back."
+            "Dropped lines arrived, but were unreadable or implausible. If a line has no answer, "
+            "the line or its answer was lost."
         )
         return self._stack("link", "The serial line", caption, parts, 170)
 
     def loop(self) -> Figure:
-        late = Line("late", LIMITED, self._course.lateness.points(), "hv")
+        """Draw how late the control loop ran each period."""
+        late = Line("late", LIMITED, self._data.lateness.points(), "hv")
         caption = (
-            "Delay from the time at which a period is due to its step, relative to the least delay."
+            "Delay of each period's step after the time at which the period was due. The smallest "
+            "delay counts as zero."
         )
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 
-    def who(self) -> Figure:
-        course, silent = self._course, list[str]()
+    def sources(self) -> Figure:
+        """Draw mode, link and sources as bands."""
+        data, silent = self._data, list[str]()
         rows: list[Row] = [
-            ("mode", course.modes.spans()),
-            ("link", course.links.spans()),
+            ("mode", data.modes.spans()),
+            ("link", data.links.spans()),
         ]
-        for name, band in course.sources.bands.items():
+        for name, band in data.sources.bands.items():
             if band.spans():
                 rows.append((name, band.spans()))
             elif name != OTHERS:
                 silent.append(name)
-        looks = list(_looks(rows))
-        data = [self._bars(look, [(at, s) for at, row in enumerate(rows) for s in look.of(row)])
-                for look in looks]  # fmt: skip
+        styles = list(_styles(rows))
+        traces = [
+            self._bars(style, [(at, span) for at, row in enumerate(rows) for span in style.of(row)])
+            for style in styles
+        ]
         axes = self._timed() | {
             "barmode": "overlay",
             "uniformtext": {"mode": "hide", "minsize": 11},
@@ -207,25 +219,26 @@ class Pictures:
             "annotations": [note(name, 0, at - 0.44) for at, (name, _) in enumerate(rows)],
         }
         caption = (
-            "Point at a band to read the reason. A source waits while a source before it sends."
+            "Point at a band to read the reason. A source waits while a source with a higher "
+            "priority sends."
         )
         if silent:
             caption += f" Silent all the time: {', '.join(silent)}."
-        height = ROW_PX * len(rows) + ROOM_PX
-        return Figure(
-            "who", "Active source, and why others wait", caption, _keys(looks), height, data, axes
-        )
+        height = ROW_PX * len(rows) + AXIS_PX
+        title = "Active source, and why others wait"
+        return Figure("sources", title, caption, _keys(styles), height, traces, axes)
 
-    def _bars(self, look: Look, spans: list[tuple[int, Span]]) -> Trace:
-        kind, colour = look.kind, look.colour
+    def _bars(self, style: BandStyle, spans: list[tuple[int, Span]]) -> Trace:
+        """Draw the spans of one style; the first part of each pair is the number of the row."""
+        kind, colour = style.kind, style.colour
         # The border line keeps even a very short band visible.
         marker: dict[str, Any] = {"color": colour, "line": {"color": colour, "width": 1}}
-        if look.pattern:
-            marker["pattern"] = {"shape": look.pattern}
+        if style.pattern:
+            marker["pattern"] = {"shape": style.pattern}
         return {
             "type": "bar",
             "orientation": "h",
-            "name": label(look.told),
+            "name": label(style.meaning),
             "base": numbers(self._ms(span.begin) for _, span in spans),
             "x": numbers(1000 * (span.end - span.begin) for _, span in spans),
             "y": numbers(at for at, _ in spans),
@@ -240,8 +253,9 @@ class Pictures:
         }
 
     def events(self) -> Figure:
-        levels, kept = ("info", "warning", "error"), self._course.marks
-        data = [
+        """Draw all events as marks."""
+        levels, kept = ("info", "warning", "error"), self._data.marks
+        traces = [
             self._marks(level, at, [mark for mark in kept.all() if mark.level == level])
             for at, level in enumerate(levels)
         ]
@@ -251,7 +265,7 @@ class Pictures:
         }
         caption = "Point at a mark to read it; the full list is at the end."
         keys = [Key("◆", COLOURS[level], level) for level in reversed(levels)]
-        return Figure("events", "Events", caption, keys, 230, data, axes)
+        return Figure("events", "Events", caption, keys, 230, traces, axes)
 
     def _marks(self, level: str, at: int, marks: list[Mark]) -> Trace:
         return scatter(
@@ -270,7 +284,7 @@ class Pictures:
         return self._zero_ms + 1000 * t
 
     def _timed(self) -> dict[str, Any]:
-        seconds = max(self._course.seconds, 0.1)
+        seconds = max(self._data.seconds, 0.1)
         axis = {
             "type": "date",
             "range": [self._ms(-0.01 * seconds), self._ms(1.01 * seconds)],
@@ -280,21 +294,24 @@ class Pictures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw pictures above each other, with one time axis and one legend."""
-        data, notes = list[Trace](), list[dict[str, Any]]()
+        """Draw several parts above each other, with one time axis and one legend.
+
+        `px` is the height of each part.
+        """
+        traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}
-        # Each cell of the grid is a picture. The x axis belongs to all of them.
+        # Each cell of the grid is a part. All parts share the x axis.
         names = ["", *map(str, range(2, len(parts) + 1))]
         axes["grid"] = {"subplots": [[f"xy{n}"] for n in names], "ygap": GAP_PX / px}
         for n, part in zip(names, parts, strict=True):
             axes[f"yaxis{n}"] = {"rangemode": "tozero"}
             notes.append(note(part.title, 0, 1) | {"yref": f"y{n} domain", "yanchor": "bottom"})
-            data += [self._line(line, f"y{n}") for line in part.lines]
+            traces += [self._line(line, f"y{n}") for line in part.lines]
         axes["annotations"] = notes
         lines = dict.fromkeys((line.name, line.colour) for part in parts for line in part.lines)
         keys = [Key("━", colour, meaning) for meaning, colour in lines]
-        return Figure(name, title, caption, keys, px * len(parts) + 70, data, axes)
+        return Figure(name, title, caption, keys, px * len(parts) + 70, traces, axes)
 
     def _line(self, line: Line, axis: str) -> Trace:
         return scatter(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.daemon.bus.bus import unreached
+from acsard.daemon.bus.router_links import unreached
 from tests.each import each
 
 A, B = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:7450"

@@ -5,52 +5,52 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, Source
-from acsard.report.account import Origin, Setting, differences, reasons, rows, summary
+from acsard.report.report_text import Origin, Setting, differences, reasons, rows, summary
 from tests.scenarios.world import World
-from tests.unit.report.driven import course_of, drive_of_two
+from tests.unit.report.driven import drive_of_two, report_of
 
 
-def test_the_summary_says_how_far_how_fast_and_who_stopped_it() -> None:
-    course, _ = drive_of_two()
-    text = summary(course)
-    assert text.startswith(f"The robot drove {course.metres:.2f} m in ")
-    assert f"at most {course.fastest.linear:.2f} m/s and {course.fastest.angular:.2f} rad/s" in text
+def test_the_summary_has_distance_speed_and_the_client_that_stopped_the_robot() -> None:
+    report, _ = drive_of_two()
+    text = summary(report)
+    assert text.startswith(f"The robot drove {report.metres:.2f} m in ")
+    assert f"at most {report.fastest.linear:.2f} m/s and {report.fastest.angular:.2f} rad/s" in text
     assert text.endswith("There were no faults, 1 stop (by unnamed (native)).")
 
 
-def test_a_robot_that_stood_did_not_drive() -> None:
-    course, _ = course_of(lambda world: world.run(0.5))
-    assert summary(course).startswith("The robot did not drive in these 0.5 s.")
+def test_the_summary_of_a_standing_robot_says_that_it_did_not_drive() -> None:
+    report, _ = report_of(lambda world: world.run(0.5))
+    assert summary(report).startswith("The robot did not drive in these 0.5 s.")
 
 
-def test_a_fault_is_told_with_its_time_and_its_words() -> None:
+def test_a_fault_is_listed_with_its_time_and_its_text() -> None:
     def stuck(world: World) -> None:
         world.drive(0.5, seconds=0.5)
         with world.mcu.dead_motor(0):
             world.hold(0.5, 0.4, seconds=1.5)
 
-    course, _ = course_of(stuck)
-    assert "There was 1 fault" in summary(course)
+    report, _ = report_of(stuck)
+    assert "There was 1 fault" in summary(report)
     origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
-    table = dict(rows(course, origin, lambda s, day: f"<{s:.0f}{' day' if day else ''}>"))
+    table = dict(rows(report, origin, lambda s, day: f"<{s:.0f}{' day' if day else ''}>"))
     assert table["Faults"].startswith("1: <1800000")
     assert "front_right wheel" in table["Faults"]
     assert table["When"] == "<1800000000 day> to <1800000002 day>"
     assert table["Recorded by"] == "acsard 0.1.0, Python 3.11.0"
 
 
-def test_a_computer_that_did_not_run_is_no_loss_of_the_link() -> None:
+def test_a_host_stall_does_not_count_as_a_loss_of_the_link() -> None:
     def late(world: World) -> None:
         world.drive(0.5, seconds=0.5)
         with world.mcu.mute():
             world.stall(0.2)
             world.run(0.02)
 
-    course, _ = course_of(late)
-    assert summary(course).endswith("no stops, 1 stall of the robot's computer.")
+    report, _ = report_of(late)
+    assert summary(report).endswith("no stops, 1 stall of the robot's computer.")
 
 
-def test_only_what_is_not_the_default_is_told_of_a_configuration() -> None:
+def test_only_settings_that_differ_from_the_default_are_listed() -> None:
     config = Config()
     assert differences(config) == []
     sources = (*config.commands.sources, Source("joe", 7))
@@ -67,16 +67,16 @@ def test_only_what_is_not_the_default_is_told_of_a_configuration() -> None:
 
 
 def test_the_longest_reason_comes_first() -> None:
-    course, _ = drive_of_two()
-    first, *rest = reasons(course)
+    report, _ = drive_of_two()
+    first, *rest = reasons(report)
     assert first[:2] == ("nav", "waits")
     assert all(first[3] >= other[3] for other in rest)
 
 
-def test_sentences_that_differ_by_a_number_are_one_reason_as_the_longest_says_it() -> None:
-    course, _ = course_of(lambda world: world.run(0.1))
-    band = course.sources.bands["app"]
+def test_reasons_that_differ_in_a_number_count_as_one_with_the_longest_text() -> None:
+    report, _ = report_of(lambda world: world.run(0.1))
+    band = report.sources.bands["app"]
     for n, t in enumerate((1.0, 1.5, 3.5)):
         band.add(t, "waits", f"lines come 0.1{n} s apart")
     band.end(4.0)
-    assert reasons(course) == [("app", "waits", "lines come 0.11 s apart", 3.0)]
+    assert reasons(report) == [("app", "waits", "lines come 0.11 s apart", 3.0)]

@@ -1,0 +1,121 @@
+"""Watches the links of the daemon's session to the endpoints of `bus.connect` and to routers."""
+
+from __future__ import annotations
+
+import socket
+from threading import Event, Thread
+
+import zenoh
+
+from acsard.core.config.settings import BusConfig
+from acsard.core.values import RoutersStatus
+from acsard.daemon.bus.inbox import Inbox
+
+POLL_S = 0.5
+"""Time between two polls, s. One poll takes Zenoh 0.1 ms."""
+
+STOP_S = 0.05
+"""Time to wait for the thread at the end, s."""
+
+
+class RouterLinks:
+    """Reports whether the endpoints of `bus.connect` are connected.
+
+    Zenoh reconnects by itself and does not report it, so nobody would notice that a router is gone.
+    A thread of its own polls Zenoh, because the call may block.
+    """
+
+    def __init__(self, bus: BusConfig, inbox: Inbox) -> None:
+        """Prepare the thread, which writes the ids of connected routers to `inbox.routers`."""
+        self._bus, self._inbox = bus, inbox
+        self._status: RoutersStatus | None = None
+        self._changed = False
+        """True if the status has changed. It is set after the status, so that the control loop
+        misses no change.
+        """
+        self._over = Event()
+        self._thread = Thread(target=self._run, name="links", daemon=True)
+        self._session: zenoh.Session
+
+    def changed(self) -> RoutersStatus | None:
+        """Return the status if it has changed since the last call, else None. Never wait."""
+        if not self._changed:
+            return None
+        self._changed = False
+        return self._status
+
+    def start(self, session: zenoh.Session) -> None:
+        """Start polling.
+
+        Poll even if `bus.connect` is empty, because a router may have connected to the daemon.
+        """
+        self._session = session
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop polling. Do not wait for a name lookup that is under way."""
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join(STOP_S)
+
+    def _run(self) -> None:
+        # The first poll reports no change, because Zenoh has had no time to connect yet.
+        reports = False
+        while True:
+            status = self._poll()
+            if reports and status != self._status:
+                self._status, self._changed = status, True
+            reports = bool(self._bus.connect)
+            if self._over.wait(POLL_S):
+                return
+
+    def _poll(self) -> RoutersStatus:
+        endpoints = self._bus.connect
+        try:
+            info = self._session.info
+            zids = {str(link.dst): str(link.zid) for link in info.links()}
+            kinds = {str(transport.zid): transport.whatami for transport in info.transports()}
+        except zenoh.ZError:
+            # The session is closing.
+            return self._status or RoutersStatus()
+        routers = (zid for zid, kind in kinds.items() if kind == zenoh.WhatAmI.ROUTER)
+        self._inbox.routers = frozenset(routers)
+        missing = unreached(self._bus.mode, endpoints, set(zids))
+        connected = tuple(endpoint for endpoint in endpoints if endpoint not in missing)
+        peer_ends = {end for end, zid in zids.items() if kinds.get(zid) == zenoh.WhatAmI.PEER}
+        peers = tuple(endpoint for endpoint in connected if _leads_there(endpoint, peer_ends))
+        return RoutersStatus(connected, missing, peers)
+
+
+def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
+    """Return the endpoints that no link leads to.
+
+    `mode` is `bus.mode`, and `ends` has the address of the far end of each link. In mode "client"
+    there is only one link, and if it exists, no endpoint is unreached. A program that connected to
+    the daemon (the TLS gateway, a bridge, a ROS node) has an ephemeral port at its end and matches
+    no endpoint. This function resolves host names, which may block.
+    """
+    if mode == "client":
+        return () if ends else endpoints
+    return tuple(endpoint for endpoint in endpoints if not _leads_there(endpoint, ends))
+
+
+def _leads_there(endpoint: str, ends: set[str]) -> bool:
+    """Return whether one of the far ends belongs to the endpoint.
+
+    The far ends are addresses. The endpoint may have a host name.
+    """
+    bare = endpoint.partition("?")[0].partition("#")[0]
+    protocol, _, address = bare.partition("/")
+    host, _, port = address.rpartition(":")
+    if bare in ends:
+        return True
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+    except (OSError, ValueError):
+        # The name does not resolve any more, but a link may still be connected.
+        return bool(port) and any(
+            end.startswith(f"{protocol}/") and end.endswith(f":{port}") for end in ends
+        )
+    ips = (str(entry[4][0]) for entry in found)
+    return any(f"{protocol}/{f'[{ip}]' if ':' in ip else ip}:{port}" in ends for ip in ips)

@@ -1,0 +1,131 @@
+"""Makes the elements of the pictures, in the format of the library plotly.
+
+The pictures are plain lists and dicts. Columns of numbers are doubles in base64, which plotly
+reads, because JSON cannot represent NaN. `page.py` sets the colours of paper, grid and text. The
+colours in this module suit a light and a dark background.
+"""
+
+from __future__ import annotations
+
+import binascii
+import html
+import struct
+import textwrap
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from acsard.core.formatting import printable
+from acsard.report.report_data import Mark
+
+COMMANDED, LIMITED, MEASURED = "#e08600", "#2f7ed8", "#159a6b"
+
+END = "#8668b8"
+
+COLOURS = {
+    "driving": "#159a6b", "ready": "#8fb8de", "waiting": "#e0b400", "stopped": "#e08600",
+    "fault": "#d43d3d", "inactive": "#9a9a9a", "shutdown": END,
+    "up": "#8fb8de", "booting": "#e0b400", "stale": "#e08600", "down": "#d43d3d",
+    "drives": "#159a6b", "sends": "#8fb8de", "waits": "#e0b400", "refused": "#d43d3d",
+    "info": "#2f7ed8", "warning": "#e08600", "error": "#d43d3d",
+}  # fmt: skip
+
+UNKNOWN = "#9a9a9a"
+
+SOURCE_COLOURS = (
+    "#159a6b", "#2f6fd8", "#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f",
+)  # fmt: skip
+"""Colours of the driving sources. Neighbours in this list are easy to distinguish."""
+
+PATTERNS = ("", "/", "x", ".", "-")
+"""Fill patterns of the bands. When all colours are used, they repeat with the next pattern."""
+
+
+def source_style(number: int) -> tuple[str, str]:
+    """Return the colour and the pattern of the n-th driving source."""
+    beyond, place = divmod(number, len(SOURCE_COLOURS))
+    return SOURCE_COLOURS[place], PATTERNS[beyond % len(PATTERNS)]
+
+
+WRAP = 42
+"""Length of a line of hover text that fits on a phone, characters."""
+
+Trace = dict[str, Any]
+"""Plotly's description of one curve, or of one set of marks or bars."""
+
+
+class Key(NamedTuple):
+    """An entry of a legend: symbol, colour and meaning."""
+
+    sign: str
+    colour: str
+    meaning: str
+
+
+class Figure(NamedTuple):
+    """A picture of the report."""
+
+    name: str
+    """Id of the picture in the page."""
+    title: str
+    caption: str
+    keys: list[Key]
+    """The legend."""
+    height: int
+    """Height, px."""
+    data: list[Trace]
+    layout: dict[str, Any]
+    """Plotly's description of axes, margins and notes."""
+    timed: bool = True
+    """True if the x axis is the time. If the user zooms one such picture, the page zooms all."""
+
+
+def label(text: str) -> str:
+    """Return any text escaped for plotly, in short lines."""
+    lines = textwrap.wrap(printable(text), WRAP) or [""]
+    return "<br>".join(html.escape(line) for line in lines)
+
+
+def numbers(values: Iterable[float]) -> dict[str, str]:
+    """Return a column of numbers as plotly's base64 of doubles."""
+    data = struct.pack(f"<{len(values := list(values))}d", *values)
+    return {"dtype": "f8", "bdata": binascii.b2a_base64(data, newline=False).decode()}
+
+
+def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
+    """Return a curve, or marks, through the points with the coordinates `x` and `y`.
+
+    `look` has plotly's attributes of the curve or of the marks.
+    """
+    return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
+
+
+def sentence(mark: Mark) -> str:
+    """Return the text that the page shows when the user points at an event."""
+    head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
+    by = [label(f"by {mark.by}")] if mark.by else []
+    return "<br>".join([head, label(mark.text), *by])
+
+
+def layout() -> dict[str, Any]:
+    """Return the part of the layout that all pictures share."""
+    return {
+        "autosize": True,
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": "system-ui, sans-serif", "size": 13},
+        "hovermode": "closest",
+        "hoverlabel": {"align": "left", "font": {"size": 13}},
+        "showlegend": False,
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#888", "activecolor": "#2f7ed8"},
+    }
+
+
+def note(text: str, x: float, y: float) -> dict[str, Any]:
+    """Return a heading inside a picture, where it needs no margin.
+
+    `x` is a fraction of the picture's width, and `y` a value of its y axis.
+    """
+    return {
+        "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
+        "yanchor": "middle", "showarrow": False, "font": {"size": 13},
+    }  # fmt: skip

@@ -1,0 +1,259 @@
+"""Collects the data of a report from a recording, step by step.
+
+The mode, the reasons, the path, the events and the driving source come from the recording. The
+commanded, limited and measured speeds come from a robot that replays the recorded inputs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+
+from msgspec import Struct
+
+from acsard.core.config.settings import Config
+from acsard.core.link.link_state import WATCHDOG_S
+from acsard.core.robot import Robot
+from acsard.core.thinning import Band, Curve, Place, Track
+from acsard.core.values import NS_PER_S, Outputs, Twist
+from acsard.recording.recorded_steps import MICRO, Step
+from acsard.recording.timeline import TimelineEntry, TimelineWriter
+from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
+from acsard.report.loop_lateness import Lateness
+from acsard.report.serial_counts import SerialCounts
+
+MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
+"""Modes of the robot. If short spans must be merged, the first of these modes wins."""
+
+LINKS = ("down", "stale", "booting", "up")
+"""States of the link. If short spans must be merged, the first of these states wins."""
+
+FIRST, LAST = 30, 30
+"""Number of events of each name that are kept: the first ones, and the last ones."""
+
+
+class Mark(Struct, frozen=True):
+    """An event, with the place of the robot."""
+
+    t: float
+    """Time since the first collected step, s."""
+    name: str
+    text: str
+    level: str
+    by: str
+    """The client that caused the event, or the source that commanded a drive; "" if unknown."""
+    count: int
+    """Number of equal events that this one stands for."""
+    place: Place | None
+    """Place according to odometry; None before the first pose."""
+
+
+class Marks:
+    """The events of a recording. Only the first and the last events of each name are kept."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, list[Mark]] = {}
+        self._last: dict[str, deque[Mark]] = {}
+        self.counts: Counter[str] = Counter()
+        """Number of events of each name. A repeated event counts as often as it occurred."""
+        self.left_out = 0
+        """Number of events that were dropped."""
+
+    def add(self, mark: Mark) -> None:
+        """Add an event. If there are too many of its name, drop one from their middle."""
+        self.counts[mark.name] += mark.count
+        first = self._first.setdefault(mark.name, [])
+        if len(first) < FIRST:
+            first.append(mark)
+            return
+        last = self._last.setdefault(mark.name, deque(maxlen=LAST))
+        self.left_out += len(last) == LAST
+        last.append(mark)
+
+    def all(self) -> list[Mark]:
+        """Return the kept events in the order of their times."""
+        rows = [mark for kept in (self._first, self._last) for row in kept.values() for mark in row]
+        return sorted(rows, key=lambda mark: mark.t)
+
+
+class Driven(Struct):
+    """For how long, and how far, one source drove the robot."""
+
+    seconds: float = 0.0
+    metres: float = 0.0
+
+
+class ReportData:
+    """The data of a report, from the steps in a window of time."""
+
+    def __init__(
+        self, config: Config, begin: float | None = None, end: float | None = None
+    ) -> None:
+        """Collect the steps between the wall-clock times `begin` and `end`, s since 1970.
+
+        None means no limit. `config` is the configuration at the beginning of the recording.
+        """
+        self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
+        self.config = config
+        """Configuration at the beginning."""
+        self.path = Track()
+        self.linear = {name: Curve() for name in ("commanded", "limited", "measured")}
+        self.angular = {name: Curve() for name in ("commanded", "limited", "measured")}
+        self.commanded_wheels, self.measured_wheels = (
+            [Curve() for _ in range(4)],
+            [Curve() for _ in range(4)],
+        )
+        """Commanded and measured speed of each wheel, rad/s, in the order of `WHEELS`."""
+        self.modes, self.links = Band(MODES), Band(LINKS)
+        self.sources = CommandSources(config.commands.sources)
+        self.serial = SerialCounts()
+        self.lateness = Lateness(config.rate_hz)
+        self.marks = Marks()
+        self.began: float | None = None
+        """Wall-clock time of the first collected step, s since 1970. All times `t` begin there."""
+        self.seconds = self.metres = 0.0
+        """Duration of the collected steps, and distance that the robot drove in them."""
+        self.driven: dict[str, Driven] = {}
+        """For each source, how the source drove the robot."""
+        self.fastest = Twist()
+        """Highest measured speed of each axis, without sign."""
+        self.steps = self.missing = 0
+        """Number of collected steps, and of steps that are missing between them."""
+        self._timeline = TimelineWriter()
+        self._mono_ns = self._wall_ns = 0
+        """Monotonic and wall-clock time of the first step of the recording, ns."""
+        self._wall = -math.inf
+        """Wall-clock time of the last step, s since 1970, computed from the monotonic clock."""
+        self._number: int | None = None
+        """Number of the last step."""
+        self._place: Place | None = None
+        self._jumps = True
+        """True if the next pose does not continue the path, because a request set the pose."""
+        self._sampled = self._sent = -math.inf
+        """Time of the last sample of the status, and of the last line that was sent."""
+        self._status: tuple[str, ...] = ()
+
+    @property
+    def over(self) -> bool:
+        """True if the last step was after the end of the window."""
+        return self._wall > self._window[1]
+
+    def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
+        """Take a recorded step, its replayed outputs, and the replayed robot after the step."""
+        now = step.inputs.now
+        if self._number is None:
+            self._mono_ns, self._wall_ns = now.mono_ns, now.wall_ns
+        self._wall = wall = (self._wall_ns + now.mono_ns - self._mono_ns) / NS_PER_S
+        inside = self._window[0] <= wall <= self._window[1]
+        known = self._number is None or step.number == self._number + 1
+        if inside and self.began is None:
+            self.began = wall
+        t = max(self.seconds, wall - (self.began or wall))
+        self._drive(step, t, inside)
+        refused = self.sources.take_commands(step, t, robot)
+        entries = list(self._timeline.step(step))
+        if inside:
+            if not known:
+                self.missing += step.number - (self._number or 0) - 1
+            self.steps += 1
+            self._speeds(step, outputs, t)
+            self._serial(step, outputs, robot, t, known)
+            self._sample(step, t, robot, refused)
+            for entry in entries:
+                self.marks.add(self._mark(entry, t))
+            self.seconds = t
+        self._number = step.number
+
+    def end(self) -> None:
+        """Finish the data after the last step."""
+        t = self.seconds
+        for band in (self.modes, self.links, *self.sources.bands.values()):
+            band.end(t)
+        self.serial.end()
+
+    def _mark(self, entry: TimelineEntry, t: float) -> Mark:
+        text, by = entry.text[:MAX_TEXT], entry.by[:MAX_TEXT]
+        return Mark(t, entry.name, text, entry.level, by, entry.count, self._place)
+
+    # Distance and speeds.
+
+    def _drive(self, step: Step, t: float, inside: bool) -> None:
+        """Add the poses of a step to the path, and to the distance if `inside` is true."""
+        mode, _, _, source = step.recorded.status
+        driven = self._driven(source) if mode == "driving" and inside else None
+        if driven is not None and t > self.seconds:
+            driven.seconds += t - self.seconds
+        for x, y, yaw in step.recorded.poses:
+            place = Place(t, x / MICRO, y / MICRO, yaw / MICRO, self._jumps)
+            if self._place is not None and not self._jumps and inside:
+                metres = math.hypot(place.x - self._place.x, place.y - self._place.y)
+                self.metres += metres
+                if driven is not None:
+                    driven.metres += metres
+            self._place, self._jumps = place, False
+            if inside:
+                self.path.add(place)
+        # A request takes effect after the poses of its step.
+        if any(request.verb in ("set_pose", "reset_odometry") for request in step.inputs.requests):
+            self._jumps = True
+
+    def _driven(self, source: str) -> Driven:
+        return self.driven.setdefault(self.sources.name(source), Driven())
+
+    def _speeds(self, step: Step, outputs: Outputs, t: float) -> None:
+        commanded = self.sources.commanded(outputs)
+        for curves, axis in ((self.linear, "linear"), (self.angular, "angular")):
+            curves["commanded"].add(t, None if commanded is None else getattr(commanded, axis))
+            self._add_sent(curves["limited"], step, t, getattr(outputs.applied, axis))
+        for wheel, speed in zip(self.commanded_wheels, outputs.speeds.as_tuple(), strict=True):
+            self._add_sent(wheel, step, t, speed)
+        if step.recorded.sent is not None:
+            self._sent = t
+        if step.recorded.status[2] != "up":
+            for curve in (self.linear["measured"], self.angular["measured"], *self.measured_wheels):
+                curve.add(t, None)
+        for estimate in outputs.estimates:
+            twist, most = estimate.twist, self.fastest
+            self.linear["measured"].add(t, twist.linear)
+            self.angular["measured"].add(t, twist.angular)
+            for wheel, speed in zip(self.measured_wheels, estimate.speeds.as_tuple(), strict=True):
+                wheel.add(t, speed)
+            self.fastest = Twist(
+                max(most.linear, abs(twist.linear)), max(most.angular, abs(twist.angular))
+            )
+
+    def _add_sent(self, curve: Curve, step: Step, t: float, speed: float) -> None:
+        """Add a speed to a curve if the step sent a line.
+
+        The curve has a gap if no line was sent until the watchdog of the microcontroller expired.
+        """
+        if step.recorded.sent is not None:
+            curve.add(t, speed)
+        elif t - self._sent > WATCHDOG_S:
+            curve.add(t, None)
+
+    # Serial port, control loop and modes.
+
+    def _serial(self, step: Step, outputs: Outputs, robot: Robot, t: float, known: bool) -> None:
+        inputs, sent = step.inputs, step.recorded.sent is not None
+        session = robot.session
+        rejected = {f"line_{reason}": count for reason, count in session.rejects.items()}
+        impossible = {"line_implausible": robot.counters["line_implausible"]}
+        self.serial.step(t, sent, {"lines": session.good_lines} | rejected | impossible)
+        if inputs.tick:
+            self.lateness.tick(t, inputs.now.mono_ns, inputs.missed, known)
+        elif outputs.due and sent:
+            self.lateness.at_once()
+
+    def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
+        """Add the status to the bands, if it has changed or the last sample is old enough.
+
+        `refused` is true if this step changed which sources are refused.
+        """
+        mode, reason, link, _ = status = step.recorded.status
+        if status == self._status and t - self._sampled < SAMPLE_S and not refused:
+            return
+        self._status, self._sampled = status, t
+        self.modes.add(t, mode[:MAX_TEXT], reason[:MAX_TEXT])
+        self.links.add(t, link[:MAX_TEXT])
+        self.sources.sample(step, t, robot)

@@ -1,0 +1,188 @@
+"""Describes a recording in words, for the summary of a report and the table below it."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from acsard.core.config.live import flat
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.config.validation import show
+from acsard.core.formatting import lasting, listed, many
+from acsard.report.report_data import Mark, ReportData
+
+Clock = Callable[[float, bool], str]
+"""Function that formats a time in s since 1970 as local time.
+
+The text has the date if the second argument is true.
+"""
+
+MAX_REASONS = 8
+"""Largest number of rows in the table of reasons."""
+
+NUMBER = re.compile(r"\d+(\.\d+)?")
+
+FINE_S = 0.05
+"""If a point of a picture stands for more than this time, s, a note says so."""
+
+MAX_NAMES = 5
+"""Largest number of names or texts in a list."""
+
+
+class Origin(Struct, frozen=True):
+    """The robot and the program that made a recording."""
+
+    file: str
+    robot: str
+    version: str
+    """Version of the acsard that made the recording."""
+    python: str
+    notes: tuple[str, ...] = ()
+    """Notes for the user, for example about missing parts of the recording."""
+
+
+class Setting(NamedTuple):
+    """A setting that differs from its default."""
+
+    key: str
+    here: str
+    """Value in the recording."""
+    default: str
+
+
+def differences(config: Config) -> list[Setting]:
+    """Return the settings that differ from their defaults.
+
+    A command source that was added or removed appears with all its keys.
+    """
+    here, default = (dict(flat(effective(each))) for each in (config, Config()))
+    return [
+        Setting(key, _shown(here, key), _shown(default, key))
+        for key in {**default, **here}
+        if key not in here or key not in default or _plain(here[key]) != _plain(default[key])
+    ]
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _shown(table: dict[str, object], key: str) -> str:
+    return show(table[key]) if key in table else "-"
+
+
+def summary(data: ReportData) -> str:
+    """Return a summary of the recording in two sentences."""
+    fast, counts = data.fastest, data.marks.counts
+    driving_s = sum(driven.seconds for driven in data.driven.values())
+    drive = (
+        f"The robot drove {data.metres:.2f} m in {lasting(driving_s)} of {lasting(data.seconds)}, "
+        f"at most {fast.linear:.2f} m/s and {fast.angular:.2f} rad/s."
+        if driving_s
+        else f"The robot did not drive in these {lasting(data.seconds)}."
+    )
+    stops = many(counts["stop"], "stop")
+    by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
+    faults = many(counts["fault"], "fault")
+    lost = counts["link_down"] + counts["link_stale"]
+    link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
+    late = counts["link_late"]
+    link += f", {many(late, 'stall')} of the robot's computer" if late else ""
+    return f"{drive} There {_be(counts['fault'])} {faults}, {stops}{by}{link}."
+
+
+def _be(count: int) -> str:
+    return "was" if count == 1 else "were"
+
+
+def _names(marks: list[Mark]) -> str:
+    names = list(dict.fromkeys(mark.by for mark in marks if mark.by))
+    if not names:
+        return ""
+    return f" (by {listed(names, MAX_NAMES)})"
+
+
+def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
+    """Return why sources did not drive: source, state, reason, and duration in s.
+
+    The longest durations come first, at most `MAX_REASONS`. Reasons that differ only in numbers
+    count as one, with the text of the one that lasted longest.
+    """
+    durations: dict[tuple[str, str, str], dict[str, float]] = {}
+    for name, band in data.sources.bands.items():
+        for span in band.spans():
+            if span.kind != "drives":
+                alike = NUMBER.sub("#", span.words)
+                seconds = durations.setdefault((name, span.kind, alike), defaultdict(float))
+                seconds[span.words] += span.end - span.begin
+    found = [
+        (name, state, max(seconds, key=seconds.__getitem__), math.fsum(seconds.values()))
+        for (name, state, _), seconds in durations.items()
+    ]
+    return sorted(found, key=lambda row: -row[3])[:MAX_REASONS]
+
+
+def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:
+    """Return each distinct text with the time of its first occurrence."""
+    first: dict[str, Mark] = {}
+    for mark in marks:
+        first.setdefault(mark.text, mark)
+    texts = [f"{clock(began + mark.t, False)} {mark.text}" for mark in first.values()]
+    return listed(texts, MAX_NAMES, "; ")
+
+
+def notes(data: ReportData, origin: Origin) -> list[str]:
+    """Return notes about missing steps and about the resolution of the pictures."""
+    found = list(origin.notes)
+    if data.missing:
+        found.append(
+            f"{many(data.missing, 'step is', 'steps are')} missing: after the missing steps, the "
+            "commanded and limited speeds and the reasons of waiting sources may be wrong."
+        )
+    curves = [*data.linear.values(), *data.angular.values()]
+    width = max(curve.width for curve in curves)
+    if width > FINE_S:
+        found.append(
+            f"A point of a picture stands for up to {width:.2g} s and shows the lowest and the "
+            "highest value of that time. --from and --to draw a shorter time in more detail."
+        )
+    return found
+
+
+def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, str]]:
+    """Yield the label and the content of each row of the summary table."""
+    began, config = data.began or 0.0, data.config
+    yield "When", f"{clock(began, True)} to {clock(began + data.seconds, True)}"
+    yield "Duration", f"{lasting(data.seconds)}, {data.steps} steps"
+    yield "Distance", f"{data.metres:.2f} m, forward and backward"
+    fast = data.fastest
+    yield "Top speed", f"{fast.linear:.2f} m/s, {fast.angular:.2f} rad/s (measured)"
+    drivers = [
+        f"{name} {driven.metres:.2f} m in {lasting(driven.seconds)}"
+        for name, driven in data.driven.items()
+    ]
+    yield "Driven by", ", ".join(drivers) or "no source"
+    for name, title in (("fault", "Faults"), ("stop", "Stops")):
+        marks = [mark for mark in data.marks.all() if mark.name == name]
+        count = data.marks.counts[name]
+        yield title, f"{count}: {_first_of_each(marks, began, clock)}" if count else "none"
+    totals = data.serial.totals
+    shares = f"{totals.sent} lines sent, {totals.good} answers, {totals.dropped} dropped"
+    lost = "" if config.mcu.reply_period else f", {totals.unanswered} without an answer"
+    yield "Serial line", shares + lost
+    lateness = data.lateness
+    yield (
+        "Control loop",
+        f"{config.rate_hz:g} Hz, at most {lateness.most_ms:.1f} ms late, "
+        f"{many(lateness.missed, 'period')} missed",
+    )
+    simulated = " on the simulator" if config.mcu.simulated else f" on {config.mcu.port}"
+    yield "Robot", f"{origin.robot}{simulated}"
+    yield "Recorded by", f"acsard {origin.version}, Python {origin.python}"
+    yield "File", origin.file

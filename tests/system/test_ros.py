@@ -1,0 +1,291 @@
+"""ROS 2 drives the robot in the same way over both transports, rmw_zenoh and the bridge.
+
+`test_rmw.py` and `test_ros_bridge.py` test the protocol of each transport.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from acsard.core.motion.lifecycle import LOOK_FIRST_S
+from tests.system.harness import Bus, Daemon, until
+from tests.system.ros_clients import (
+    EMPTY_REQUEST,
+    JOINTS,
+    ODOMETRY,
+    PUBLISHED,
+    QUICK,
+    SERVICES,
+    STAMPED,
+    TF,
+    TRIGGER,
+    TRIGGERS,
+    TWIST,
+    WHEELS,
+    BridgeHalf,
+    Client,
+    RmwClient,
+    behind,
+    changes,
+    decode,
+    encode,
+    joints,
+    make,
+    refused_without_motion,
+    released,
+    settled,
+    stamped,
+    twist,
+    unharmed,
+)
+
+pytestmark = pytest.mark.network
+
+TRANSPORTS: dict[str, type[Client]] = {"rmw": RmwClient, "bridge": BridgeHalf}
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """The usual limits, but quick to drive and to stand."""
+    with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
+        yield daemon
+
+
+@pytest.fixture(params=TRANSPORTS)
+def ros(request: pytest.FixtureRequest, bus: Bus) -> Client:
+    return TRANSPORTS[request.param](bus.session)
+
+
+@pytest.fixture
+def restored(bus: Bus) -> Iterator[None]:
+    """Leave the shared robot at rest and at the origin."""
+    yield
+    for verb in ("clear", "activate"):
+        bus.get(f"srv/{verb}")
+    bus.at_rest()
+    bus.get("srv/reset_odometry")
+
+
+def test_every_topic_arrives(ros: Client) -> None:
+    with ExitStack() as stack:
+        following = {
+            name: stack.enter_context((ros.follow_late if late else ros.follow)(name, kind))
+            for name, (kind, _, late) in PUBLISHED.items()
+        }
+        for name, samples in following.items():
+            decode(PUBLISHED[name][0], samples.first(name).payload)
+
+
+def test_a_late_subscriber_gets_the_static_transforms_at_once(ros: Client) -> None:
+    for _ in range(2):
+        begun = time.monotonic()
+        with ros.follow_late("tf_static", TF) as samples:
+            got = samples.first("tf_static", within=2.0)
+        assert [t.child_frame_id for t in decode(TF, got.payload).transforms] == ["lidar_link"]
+        assert time.monotonic() - begun < 1.0
+
+
+# commands
+
+COMMANDS = {
+    "Twist": ("cmd_vel", TWIST, 0.3, "nav"),
+    "TwistStamped": ("cmd_vel_teleop", STAMPED, 0.3, "teleop"),
+    "JointState": ("joint_commands", JOINTS, 6.0, "ros2_control"),
+}
+
+
+@pytest.mark.usefixtures("restored")
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_of_each_type_drives_the_robot(bus: Bus, ros: Client, name: str) -> None:
+    topic, kind, amount, source = COMMANDS[name]
+    with ros.follow("odom", ODOMETRY) as odometry, ros.follow("joint_states", JOINTS) as wheels:
+        with ros.driving(bus, topic, kind, amount):
+            odometry.first("motion", lambda s: _speed(s.payload) > 0.2)
+            assert bus.state()["source"] == source
+        turning = decode(JOINTS, wheels.seen[-1].payload)
+    assert sorted(turning.name) == sorted(WHEELS)
+    assert all(speed > 3.0 for speed in turning.velocity)
+
+
+def _speed(payload: bytes) -> float:
+    return float(decode(ODOMETRY, payload).twist.twist.linear.x)
+
+
+@pytest.mark.usefixtures("restored")
+def test_a_person_at_teleop_is_followed_before_the_navigation(bus: Bus, ros: Client) -> None:
+    def drives(state: Any, source: str, sign: float) -> bool:
+        return state["source"] == source and sign * (state["linear"] or 0.0) > 0.1
+
+    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
+        states.find(lambda s: drives(s, "nav", 1.0), 3.0, "nav drives")
+        with ros.driving(bus, "cmd_vel_teleop", TWIST, -0.2):
+            states.find(lambda s: drives(s, "teleop", -1.0), 3.0, "teleop drives")
+        released_at = time.monotonic()
+        states.find(lambda s: drives(s, "nav", 1.0), 3.0, "nav again", after=released_at)
+
+
+def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: Client) -> None:
+    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
+        states.find(lambda s: (s["linear"] or 0.0) > 0.1 and s["source"] == "nav", 3.0, "it drives")
+        assert ros.call("acsard/stop").trigger()[0]
+        states.find(lambda s: s["mode"] == "stopped" and not any(s["wheels"]), 3.0, "it stands")
+        success, message = ros.call("acsard/clear").trigger()
+        assert not success
+        assert "look at the robot, then call /acsard/clear again 2 s after that" in message
+        released(ros)
+        lines = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") > lines + 20, 3.0, "20 periods")
+        # This sender never sent a zero, so it does not drive on.
+        assert not any(bus.state()["wheels"])
+    settled(bus)
+
+
+class Bad(NamedTuple):
+    """A command, the counter of its refusal, and a word of the logged reason."""
+
+    payload: bytes
+    reason: str
+    said: str
+    topic: str = "cmd_vel"
+    kind: str = TWIST
+
+
+GO = twist(0.5)
+
+BAD = {
+    "a twist cut short": Bad(GO[:-1], "malformed", "ends after 51"),
+    "a stamped twist cut short": Bad(stamped(0.5)[:-1], "malformed", "ends after 75", kind=STAMPED),
+    "nothing": Bad(b"", "malformed", "header"),
+    "JSON": Bad(b'{"linear":{"x":0.5},"angular":{}}', "malformed", "header"),
+    "5 kB": Bad(GO + bytes(5000), "too_big", "bytes"),
+    "NaN": Bad(twist(float("nan")), "not_finite", "NaN"),
+    "a wheel missing": Bad(
+        joints(6.0, WHEELS[:3]), "wrong_wheels", "rear_right", "joint_commands", JOINTS
+    ),
+    "a wheel of another robot": Bad(
+        joints(6.0, [*WHEELS[:3], "wheel_4"]),
+        "wrong_wheels",
+        "rear_right",
+        "joint_commands",
+        JOINTS,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_command_is_counted_and_reported_and_moves_nothing(
+    bus: Bus, ros: Client, name: str
+) -> None:
+    bad = BAD[name]
+    ros.zeros(bus)
+    send: Callable[[], None] = lambda: ros.put(bad.topic, bad.kind, bad.payload)  # noqa: E731
+    refused_without_motion(bus, send, bad.reason, bad.said)
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind"), [("cmd_vel", TWIST), ("cmd_vel_teleop", TWIST), ("joint_commands", JOINTS)]
+)
+def test_a_delete_is_counted_and_reported_and_moves_nothing(
+    bus: Bus, ros: Client, topic: str, kind: str
+) -> None:
+    ros.zeros(bus)
+    key, attachment = ros.key(topic, kind), ros.attachment()
+    refused_without_motion(
+        bus, lambda: ros.session.delete(key, attachment=attachment), "not_a_put", "DELETE"
+    )
+
+
+WILDCARDS = {
+    RmwClient: ("0/cmd_vel/**", "*/cmd_vel/*/*", "0/**", "**"),
+    BridgeHalf: ("cmd_vel$*", "*", "**"),
+}
+
+
+def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: Client) -> None:
+    for key in WILDCARDS[type(ros)]:
+        ros.zeros(bus)
+        before = bus.state()
+        bus.session.put(key, GO, attachment=ros.attachment())
+        bus.session.delete(key, attachment=ros.attachment())
+        behind(bus, lambda: ros.put("cmd_vel", TWIST, b""), "malformed")
+        after = bus.state()
+        # Either the access rules keep it out, or the daemon's code refuses it.
+        mine = {"command_malformed", "command_wildcard", "command_no_attachment"}
+        assert changes(before, after).keys() <= mine, key
+        assert (after["x"], after["wheels"]) == (before["x"], before["wheels"]), key
+        if after["mode"] == "stopped":  # "**" includes `stop`
+            bus.get("srv/clear")
+
+
+# services
+
+EMPTY = (b"\0\1\0\0", EMPTY_REQUEST, b"\0\1\0\0\0\0\0\0")
+"""The forms of an empty request."""
+
+
+@pytest.mark.parametrize("verb", TRIGGERS)
+def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
+    bus: Bus, ros: Client, verb: str
+) -> None:
+    # A Trigger has no latch number, so `clear` only works 2 s after a stop.
+    for request in EMPTY[:1] if verb == "clear" else EMPTY:
+        if verb == "clear":
+            bus.get("srv/stop")
+            stopped = time.monotonic()
+            until(lambda: time.monotonic() > stopped + LOOK_FIRST_S, 5.0, "two seconds")  # noqa: B023
+        called = ros.call(f"acsard/{verb}", TRIGGER, request)
+        for undo in ("clear", "activate"):
+            bus.get(f"srv/{undo}")
+        success, message = called.trigger()
+        assert success, message
+        assert called.seconds < 1.0
+
+
+def test_a_parameter_is_set_as_by_anybody(bus: Bus, ros: Client) -> None:
+    def ask(value: float) -> Any:
+        none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "string_value": ""}
+        lists = ("byte_array", "bool_array", "integer_array", "double_array", "string_array")
+        none |= {f"{kind}_value": np.array([]) for kind in lists}
+        double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
+        wish = make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
+        request = encode(make("rcl_interfaces/msg/SetRequest", parameters=[wish]))
+        name = "acsard/set_parameters"
+        (reply,) = ros.call(name, SERVICES[name], request).replies
+        return decode("rcl_interfaces/msg/SetReply", reply.payload).results[0]
+
+    before = bus.get("config")["limits"]["linear_speed"]
+    try:
+        assert ask(0.6).successful
+        assert bus.get("config")["limits"]["linear_speed"] == 0.6
+        refused = ask(60.0)
+        assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
+        assert bus.get("config")["limits"]["linear_speed"] == 0.6
+    finally:
+        assert ask(before).successful
+
+
+QUERIES = {
+    RmwClient: ("0/**", "0/acsard/*/std_srvs::srv::dds_::Trigger_/*", "**"),
+    BridgeHalf: ("acsard/*", "**", "acsard/stop/**", "*/stop"),
+}
+
+
+def test_a_query_on_all_keys_stops_nothing(bus: Bus, ros: Client) -> None:
+    before = bus.state()
+    for key in QUERIES[type(ros)]:
+        for _ in bus.session.get(key, payload=EMPTY_REQUEST, attachment=ros.attachment()):
+            pass
+    after = bus.state()
+    assert after["mode"] != "stopped"
+    assert changes(before, after) == {}
+
+
+def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+    unharmed(shared)
+    bus.at_rest()

@@ -1,0 +1,216 @@
+"""A web page of another origin uses the robot's page as an interface."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from acsard.machine.authority import Authority
+from tests.system.browser import NAME, Page, hands, run
+from tests.system.chromium import CHROMIUM, browsing
+from tests.system.harness import (
+    PATIENCE_S,
+    ROOT,
+    Bus,
+    Daemon,
+    finish,
+    free_endpoint,
+    until,
+)
+
+pytestmark = pytest.mark.network
+
+NODE = shutil.which("node")
+
+MANUAL = ROOT / "deploy/web/README.md"
+
+
+def block(language: str) -> str:
+    """Return the only block of this language on the manual's page."""
+    (text,) = re.findall(rf"^```{language}\n(.*?)^```", MANUAL.read_text(), re.S | re.M)
+    return str(text)
+
+
+@pytest.fixture(scope="module")
+def origin() -> str:
+    return f"http://127.0.0.1:{free_endpoint().rpartition(':')[2]}"
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory, origin: str) -> Iterator[Daemon]:
+    where = tmp_path_factory.mktemp("robot")
+    with Daemon(where, config={"web": {"origins": [origin]}}) as robot:
+        yield robot
+
+
+@pytest.fixture(scope="module")
+def server(robot: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    where = tmp_path_factory.mktemp("dashboard")
+    Authority.make(where / "tls", "test", 1, [NAME]).issue(where / "tls", "robot", [NAME], 1)
+    with Page(robot, where) as server:
+        yield server
+
+
+@pytest.fixture
+def bus(robot: Daemon) -> Iterator[Bus]:
+    """A plain client of the robot, which stands and may be driven."""
+    with Bus(robot.endpoint) as bus:
+        bus.linked()
+        bus.ask("srv/clear")
+        bus.at_rest()
+        yield bus
+
+
+def test_a_page_of_another_origin_sends_its_token_and_no_cookie(server: Page, origin: str) -> None:
+    token, told = server.invite("operator", "panel"), {"Origin": origin}
+
+    async def story() -> None:
+        async with server.client() as browser:
+            url = f"{server.away}/token"
+            async with browser.post(url, data={"token": token}, allow_redirects=False) as answer:
+                assert answer.status == 303
+            for headers, status in [({}, 200), (told, 401)]:
+                async with browser.get(f"{server.away}/api/state", headers=headers) as answer:
+                    assert answer.status == status
+            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+                await browser.ws_connect(f"{server.away}/ws", headers=told)
+            assert caught.value.status == 401
+            shown = {**told, "Authorization": f"Bearer {token}"}
+            async with browser.get(f"{server.away}/api/state", headers=shown) as answer:
+                assert answer.status == 200
+            mine = f"acsard.token.{token}"
+            opening = browser.ws_connect(
+                f"{server.away}/ws", headers=told, protocols=("acsard", mine)
+            )
+            async with opening as opened:
+                assert opened.protocol == "acsard"
+                assert json.loads((await opened.receive()).data)["hello"]["role"] == "operator"
+            for names in [["acsard", "acsard.token.wrong"], [mine]]:
+                with pytest.raises(aiohttp.WSServerHandshakeError):
+                    await browser.ws_connect(f"{server.away}/ws", headers=told, protocols=names)
+
+    run(story)
+    assert token not in server.stdout + server.stderr
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node")
+def test_the_proxy_of_the_manual_makes_requests_look_like_the_page_s_own(server: Page) -> None:
+    dumped = block("js") + "\nconst none = JSON.stringify;\n"
+    dumped = dumped.replace("export default", "const config =") + "console.log(none(config));"
+    done = finish([str(NODE), "--input-type=module", "-e", dumped], ROOT)
+    assert done.code == 0, done
+    proxies: dict[str, Any] = json.loads(done.out)["server"]["proxy"]
+    assert set(proxies) == {"/api", "/ws"}
+    assert proxies["/ws"]["ws"] is True
+
+    async def story() -> None:
+        async with aiohttp.ClientSession() as session:
+            for told in proxies.values():
+                assert told["changeOrigin"] is True
+                written = json.dumps(told).replace("http://127.0.0.1:8080", server.here)
+                headers = {"Sec-Fetch-Site": "same-origin", **json.loads(written)["headers"]}
+                place = f"{server.here}/api/srv/stop"
+                async with session.post(place, headers=headers) as answer:
+                    assert answer.status == 200
+                async with session.ws_connect(f"{server.here}/ws", headers=headers) as opened:
+                    assert "hello" in (await opened.receive()).data
+
+    run(story)
+
+
+def test_a_finger_takes_over_from_a_program_that_names_no_source(server: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(server) as program, hands(server) as finger:
+            program.source = ""
+            await program.say(subscribe="state", rate=50)
+            await program.until_driving(0.2)
+            assert bus.state()["source"] == "app"
+            driving = asyncio.create_task(program.hold(0.2, PATIENCE_S))
+            await finger.say(subscribe="state", rate=50)
+            await finger.until_driving(-0.2)
+            assert bus.state()["source"] == "teleop"
+            # The program goes on when the finger has been lifted.
+            await finger.drive(0.0)
+            await finger.state(lambda state: state["source"] == "app" and state["linear"] > 0.1)
+            driving.cancel()
+
+    run(story)
+    bus.at_rest()
+
+
+def test_a_program_that_names_an_unknown_source_is_refused(server: Page) -> None:
+    async def story() -> None:
+        async with hands(server) as program:
+            program.source = "nobody"
+            await program.drive(0.1)
+            refused = await program.find(lambda said: said.get("refused") == "cmd")
+            assert "nobody is not one of the robot's sources: teleop, app" in refused["reason"]
+
+    run(story)
+
+
+class _Silent(SimpleHTTPRequestHandler):
+    def log_request(self, code: int | str = "-", size: int | str = "-") -> None:
+        """Log nothing."""
+
+
+@contextmanager
+def served(where: Path, origin: str) -> Iterator[None]:
+    """Serve the files of a directory at that origin."""
+    port = int(origin.rpartition(":")[2])
+    server = ThreadingHTTPServer(("127.0.0.1", port), partial(_Silent, directory=str(where)))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
+    server: Page, bus: Bus, origin: str, tmp_path: Path
+) -> None:
+    text = block("html")
+    assert "http://127.0.0.1:8080" in text
+    (tmp_path / "index.html").write_text(text.replace("http://127.0.0.1:8080", server.here))
+
+    async def takes_over(look: Callable[[str], None]) -> None:
+        async with hands(server) as finger:
+            await finger.say(subscribe="state", rate=50)
+            await finger.until_driving(-0.2)
+            holding = asyncio.create_task(finger.hold(-0.2, PATIENCE_S))
+            await asyncio.to_thread(look, "driving by teleop")
+            holding.cancel()
+            await finger.drive(0.0)
+
+    with served(tmp_path, origin), browsing() as browser:
+
+        def shows(words: str) -> None:
+            until(lambda: words in browser.text("state"), PATIENCE_S, f"it shows {words!r}")
+
+        browser.open(origin)
+        shows("ready by nobody")
+        browser.js("document.getElementById('forward').onpointerdown()")
+        shows("driving by app")
+        until(lambda: bus.state()["linear"] > 0.1, PATIENCE_S, "it drives")
+        run(lambda: takes_over(shows))
+        shows("driving by app")
+        browser.js("document.getElementById('stop').click()")
+        shows("stopped by")
+        assert bus.state()["mode"] == "stopped"

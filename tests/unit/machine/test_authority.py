@@ -1,0 +1,79 @@
+"""An authority signs for the robot's names and private addresses, as OpenSSL reads it."""
+
+from __future__ import annotations
+
+import ssl
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from acsard.machine.authority import Authority
+from tests.each import each
+
+OWN = ["robot1", "robot.example", "203.0.113.9", "2001:db8:1:2::9"]
+
+PERMITTED = [
+    *OWN, "robot9.local", "localhost", "arm.robot.example", "192.168.1.7", "10.9.8.7", "172.16.0.1",
+    "100.64.0.1", "127.0.0.1", "169.254.1.1", "fd00::1", "fe80::1", "::1", "2001:db8:1:2::1",
+]  # fmt: skip
+
+BARRED = [
+    "bank.example", "example", "robot2", "robot1.example", "notrobot.example", "203.0.113.10",
+    "8.8.8.8", "2001:db8:1:3::1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> tuple[Authority, Path]:
+    where = tmp_path_factory.mktemp("authority")
+    return Authority.make(where, "test", 1, OWN), where
+
+
+def connects(where: Path, server: Path, name: str, client: Path) -> bool:
+    """Connect by TLS in memory; each side checks the other one."""
+    there, here = ssl.MemoryBIO(), ssl.MemoryBIO()
+    serving = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    serving.verify_mode = ssl.CERT_REQUIRED
+    asking = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    for context, own in ((serving, server), (asking, client)):
+        context.load_verify_locations(where / "ca.pem")
+        context.load_cert_chain(own / "certificate.pem", own / "key.pem")
+    one = asking.wrap_bio(there, here, server_hostname=name)
+    other = serving.wrap_bio(here, there, server_side=True)
+    try:
+        for side in (one, other, one, other):
+            with suppress(ssl.SSLWantReadError):
+                side.do_handshake()
+    except ssl.SSLCertVerificationError:
+        return False
+    return True
+
+
+@each("name", [*PERMITTED, *BARRED])
+def test_a_certificate_is_valid_for_a_permitted_name_only(
+    authority: tuple[Authority, Path], name: str, tmp_path: Path
+) -> None:
+    ours, where = authority
+    ours.issue(tmp_path / name, "robot", [name], 1)
+    ours.issue(tmp_path / "client", "operator", [], 1)
+    assert ours.permits(name) == (name in PERMITTED)
+    assert connects(where, tmp_path / name, name, tmp_path / "client") == (name in PERMITTED)
+
+
+def test_the_constraints_are_critical(authority: tuple[Authority, Path]) -> None:
+    certificate = x509.load_pem_x509_certificate((authority[1] / "ca.pem").read_bytes())
+    found = certificate.extensions.get_extension_for_class(x509.NameConstraints)
+    assert found.critical
+    assert authority[0].limited
+
+
+@each("name", ["anna", "anna.meyer", "laptop-anna.example.com"])
+def test_a_person_s_certificate_is_valid_even_if_its_name_looks_like_a_host(
+    authority: tuple[Authority, Path], name: str, tmp_path: Path
+) -> None:
+    ours, where = authority
+    ours.issue(tmp_path / "robot", "robot", ["robot1"], 1)
+    ours.issue(tmp_path / "person", name, [f"{name}.local"], 1)
+    assert connects(where, tmp_path / "robot", "robot1", tmp_path / "person")
