@@ -84,6 +84,6 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the number of accepted and of dropped lines. An implausible line could be read, too."""
+    """Return the number of accepted and dropped lines. An implausible line could be read, too."""
     bad = sum(count for name, count in counters.items() if name.startswith("line_"))
     return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
