@@ -15,7 +15,7 @@ from statistics import fmean
 from msgspec import Struct
 
 from acsard.core.config.wire_time import FIELD
-from acsard.core.link.check import Reading
+from acsard.core.link.checksum import Reading
 from acsard.core.link.codec import Motors
 
 # Bounds within which a measured time agrees with the contract's `WATCHDOG_S`.

@@ -1,6 +1,6 @@
 """Checks every outgoing line a second time, with code of its own.
 
-The guard shares no code with `limits.py`, `codec.py` or `check.py`. It reads the finished bytes as
+The guard shares no code with `limits.py`, `codec.py` or `checksum.py`. It reads the finished bytes as
 the MCU will, and passes a line only if all of these hold:
 
 - The line is whole, within the hard limit, and its check is right. Only `link_check = "require"`

@@ -15,11 +15,17 @@ from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
-from acsard.core.incoming.bus_interface import NOTHING, Bus, BusInput, GatewayReports, RouterChanges
-from acsard.core.incoming.commands import Receiver, asker, parts, sender
-from acsard.core.incoming.imu import ImuSamples
+from acsard.core.incoming.bus_interface import (
+    NOTHING,
+    Bus,
+    BusInput,
+    GatewayFollower,
+    RouterFollower,
+)
+from acsard.core.incoming.commands import Receiver, caller_name, parts, sender
+from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Queries, Query, refused
-from acsard.core.link.line_gate import Port
+from acsard.core.link.serial_output import Port
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import Info, Message
@@ -102,8 +108,8 @@ class ControlLoop:
             recorder.begins(self.robot, self._guard)
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
-        self._gateway, self._imu = GatewayReports(), ImuSamples(config.mcu.simulated)
-        self._routers = RouterChanges()
+        self._gateway, self._imu = GatewayFollower(), GyroFollower(config.mcu.simulated)
+        self._routers = RouterFollower()
         self._turn_rates: list[GyroSample] = []
         """Samples of a gyro since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
@@ -238,17 +244,17 @@ class ControlLoop:
         self._note(got)
         for arrival in got.arrivals:
             if arrival.key == GATEWAY:
-                ends_ns = self._gateway.take(arrival, self.robot.counters)
+                ends_ns = self._gateway.receive(arrival, self.robot.counters)
                 self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
                 continue
             if arrival.key == IMU:
-                heard = self._imu.take(arrival, self.robot.counters, self._others)
+                heard = self._imu.receive(arrival, self.robot.counters, self._others)
                 if heard is not None:
                     self._turn_rates.append(heard)
                 continue
             if arrival.key == "stop":
                 if arrival.put:
-                    by = asker(arrival.via, arrival.attachment, arrival.sender)
+                    by = caller_name(arrival.via, arrival.attachment, arrival.sender)
                     requests.append(Request("stop", asked_ns=arrival.arrived_ns, by=by))
                 else:
                     refusals.append(Refusal("not_a_put", "stop: a DELETE is not a stop"))
@@ -278,7 +284,7 @@ class ControlLoop:
         if got.dropped:
             self.robot.counters["bus_dropped"] += got.dropped
         if got.routers is not None:
-            self._routers.take(got.routers, self.robot.counters, self._others)
+            self._routers.receive(got.routers, self.robot.counters, self._others)
         if got.stuck:
             self.robot.counters["bus_stuck"] += 1
             self._others.append(BUS_STUCK)
@@ -366,5 +372,5 @@ def _stops(got: BusInput) -> list[str]:
     """Return the names of those that stop the robot with this input."""
     puts = [one for one in got.arrivals if one.key == "stop" and one.put]
     calls = [query for query in got.queries if query.topic == "srv/stop"]
-    names = [asker(put.via, put.attachment, put.sender) for put in puts]
-    return names + [asker(call.via, call.attachment) for call in calls]
+    names = [caller_name(put.via, put.attachment, put.sender) for put in puts]
+    return names + [caller_name(call.via, call.attachment) for call in calls]

@@ -10,7 +10,7 @@ from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import COMMAND_ROLE, has, least_role
-from acsard.core.ros.channels import CMD_VEL_IN, SOURCE, Channel, said
+from acsard.core.ros.channels import CMD_VEL_IN, SOURCE, Channel, published_channels
 from acsard.core.ros.transports import left_out
 from acsard.host.errors import ReplyError
 
@@ -39,7 +39,7 @@ class Facts(Struct, frozen=True):
     def rows(self) -> list[tuple[Channel, str]]:
         """Return each channel with its source; a commander channel appears once for each source."""
         found = []
-        for row in said(left_out(self.config)):
+        for row in published_channels(left_out(self.config)):
             names = self.sources if row is CMD_VEL_IN else ("",)
             found += [(row, name) for name in names]
         return found

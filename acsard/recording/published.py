@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from acsard.core.messages.report import Look, Report
 from acsard.core.messages.schema import DiagnosticArray, RobotState, TFMessage, Time
 from acsard.core.robot import Robot
-from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, said
+from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, published_channels
 from acsard.core.ros.shapes import asked, log
 from acsard.core.ros.transports import left_out
 from acsard.core.values import Command, Instant, Outputs
@@ -55,7 +55,7 @@ class Publisher:
         """True before the first step, and after a setting has changed."""
 
     def _wanted_keys(self) -> frozenset[str]:
-        names = {channel.native for channel in said(left_out(self._config))}
+        names = {channel.native for channel in published_channels(left_out(self._config))}
         return frozenset(names & BY_KEY.keys())
 
     def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:

@@ -39,7 +39,7 @@ ROOT = Path(__file__).parents[2]
 CORE = (
     "acsard/core/motion",
     "acsard/core/guard.py",
-    "acsard/core/link/check.py",
+    "acsard/core/link/checksum.py",
     "acsard/core/link/encoders.py",
     "acsard/core/link/codec.py",
     "acsard/core/link/negotiation.py",

@@ -17,7 +17,7 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import OWN
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.link.codec import Codec
-from acsard.core.link.line_gate import Gate, Offered
+from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.core.messages.signature import Signature
@@ -60,17 +60,17 @@ class VirtualPort:
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
         self._opening = (baud_rate, stop, period_ns)
-        self._gate = Gate(*self._opening)
+        self._output = SerialOutput(*self._opening)
         self._received: list[Received] = []
 
     @property
     def sent_ns(self) -> int:
-        return self._gate.sent_ns
+        return self._output.sent_ns
 
     def plug(self, mcu: FakeMcu) -> None:
         self.mcu, self.is_open = mcu, True
         self.opened += 1
-        self._gate = Gate(*self._opening)
+        self._output = SerialOutput(*self._opening)
 
     def unplug(self) -> None:
         self.mcu, self.is_open = None, False
@@ -89,13 +89,13 @@ class VirtualPort:
             return "down"
         pause, self.pause = self.pause, None
         now_ns = now.mono_ns if pause is None else pause()
-        data = self._gate.prepare(line, now.mono_ns, now_ns, int(self.blocked))
+        data = self._output.prepare(line, now.mono_ns, now_ns, int(self.blocked))
         if data is None:
             return "superseded"
         part, self.takes = data[: self.takes], None
         self.mcu.receive(now_ns, part)
         self.sent.append((now_ns, part.removeprefix(b"\r\n")))
-        return self._gate.took(line, data, len(part), now_ns)
+        return self._output.took(line, data, len(part), now_ns)
 
 
 class MemoryBus:

@@ -147,8 +147,8 @@ FAULTS = (
         "arbiter priority",
         "the source of the lowest priority wins",
         ARBITER,
-        "key=lambda one: (-one[0].priority, one[1].came_ns)",
-        "key=lambda one: (one[0].priority, one[1].came_ns)",
+        "key=lambda source: -source.priority",
+        "key=lambda source: source.priority",
     ),
     fault(
         "arbiter arming",
@@ -410,7 +410,7 @@ FAULTS = (
     fault(
         "gate late",
         "a line that was made before a stall leaves after it",
-        "core/link/line_gate.py",
+        "core/link/serial_output.py",
         "if now_ns - made_ns > self._period_ns and",
         "if False and",
     ),

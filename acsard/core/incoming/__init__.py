@@ -1,2 +1,1 @@
-"""Pure package for input from the bus: decodes samples into commands, and queries into replies or
-requests."""
+"""Decodes input from the bus: samples become commands, and queries become replies or requests."""

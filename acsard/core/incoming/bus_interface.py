@@ -1,7 +1,7 @@
-"""The bus as the control loop sees it; `daemon/bus/bus.py` implements it with Zenoh.
+"""The interface between the control loop and the bus. `daemon/bus/bus.py` implements it with Zenoh.
 
-It also follows the connections of the bus: the reports of the TLS gateway and the endpoints of
-`bus.connect` become counters and events.
+The module also turns two kinds of input into counters and events: reports of the TLS gateway, and
+changes of the connections to the endpoints in `bus.connect`.
 """
 
 from __future__ import annotations
@@ -25,28 +25,27 @@ class BusInput(Struct, frozen=True):
     arrivals: tuple[Arrival, ...] = ()
     queries: tuple[Query, ...] = ()
     overrun: int = 0
-    """Number of samples that were dropped because they came faster than the control loop took
-    them."""
+    """Number of samples that were dropped because the control loop did not take them in time."""
     dropped: int = 0
     """Number of published messages that were dropped because the bus did not take them in time."""
     stuck: bool = False
-    """True once when the bus starts to block."""
+    """True in the first input after the bus has begun to block."""
     routers: RoutersStatus | None = None
-    """The connections of `bus.connect` if they have changed, else None."""
+    """The connections to the endpoints in `bus.connect` if they have changed, else None."""
 
 
 NOTHING = BusInput()
-"""The input of nearly every step."""
+"""The input of a step in which nothing has arrived, as in nearly every step."""
 
 
 class Waker(Protocol):
-    """The receiver of wake-ups from the bus, called on any thread."""
+    """Wakes the control loop. The bus calls these methods on any thread."""
 
     def command(self) -> None:
-        """Report a sample that may be a command."""
+        """Wake the control loop because a sample has arrived that may be a command."""
 
     def stop(self) -> None:
-        """Report a stop."""
+        """Wake the control loop because a stop has arrived."""
 
 
 class Bus(Protocol):
@@ -57,7 +56,10 @@ class Bus(Protocol):
         """Published topics that have a listener."""
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` + 1 queries."""
+        """Return the input since the last call, with at most `queries` + 1 queries.
+
+        The other queries wait for the next call.
+        """
 
     def publish(self, key: str, message: Message) -> None:
         """Queue a message for its listeners. `flush` sends it."""
@@ -77,29 +79,30 @@ GATEWAY_KEY = "gateway"
 _decoder = Decoder(GatewayState)
 
 
-class GatewayReports:
-    """Follower of the TLS gateway's reports, also across restarts of the gateway."""
+class GatewayFollower:
+    """Counts the events in the reports of the TLS gateway, also across restarts of the gateway."""
 
     def __init__(self) -> None:
         self._last = GatewayState(0, 0, 0)
 
-    def take(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Count the news in a report.
+    def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
+        """Count the events that are new in a report.
 
-        Return the wall time at which the certificate ends, if it is known.
+        Returns:
+            The end of the TLS certificate by the wall clock, ns; None if it is unknown.
         """
         try:
-            told = _decoder.decode(arrival.encoding, arrival.payload)
+            report = _decoder.decode(arrival.encoding, arrival.payload)
         except DecodeError:
-            return None  # only local programs may write on this key, so a bad report is ignored
+            return None  # only local programs may put on this key, so a bad report is harmless
         last = self._last
-        if told.opened != last.opened:
+        if report.opened != last.opened:
             counters["gateway_opened"] += 1
-            last = GatewayState(told.opened, 0, 0)
-        if told.full > last.full:
-            counters["gateway_full"] += told.full - last.full
-        self._last = told
-        return told.certificate_ends or None
+            last = GatewayState(report.opened, 0, 0)
+        if report.full > last.full:
+            counters["gateway_full"] += report.full - last.full
+        self._last = report
+        return report.certificate_ends or None
 
 
 PEER = (
@@ -109,25 +112,25 @@ PEER = (
 )
 
 
-class RouterChanges:
-    """Follower of the endpoints that this daemon should be connected to."""
+class RouterFollower:
+    """Reports changes of the connections to the endpoints in `bus.connect`."""
 
     def __init__(self) -> None:
         self.status = RoutersStatus()
 
-    def take(
+    def receive(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
-        """Take the present status. Log and count each connection that was lost or made."""
+        """Take the present status, and add counters and events for the connections that changed."""
         before, self.status = self.status, status
-        gone = [one for one in status.missing if one not in before.missing]
-        come = [one for one in status.connected if one not in before.connected]
-        if gone:
-            counters["router_missing"] = counters.get("router_missing", 0) + len(gone)
-            events.append(Event("router_missing", _words("not connected to", gone), "warning"))
-        if come:
-            events.append(Event("router_found", _words("connected to", come)))
-        peers = [one for one in status.peers if one not in before.peers]
+        lost = [endpoint for endpoint in status.missing if endpoint not in before.missing]
+        made = [endpoint for endpoint in status.connected if endpoint not in before.connected]
+        if lost:
+            counters["router_missing"] = counters.get("router_missing", 0) + len(lost)
+            events.append(Event("router_missing", _words("not connected to", lost), "warning"))
+        if made:
+            events.append(Event("router_found", _words("connected to", made)))
+        peers = [endpoint for endpoint in status.peers if endpoint not in before.peers]
         if peers:
             events.append(Event("not_a_router", f"{', '.join(peers)} {PEER}", "warning"))
 

@@ -1,8 +1,14 @@
-"""Decodes a sample from the bus into a `Command` or a `Request`, or refuses it with a reason.
+"""Decodes samples and service queries from the bus into a `Command` or a `Request`.
 
-A command is refused as a whole, never in part, and a refused command does not refresh the motion.
-Reasons are a payload that cannot be decoded or is too big, NaN or infinity in any field that the
-daemon reads, a wildcard key, a DELETE, and a sender id that belongs to another certificate.
+A sample is refused as a whole for each of these reasons:
+
+- The payload cannot be decoded or is too big.
+- A field that the daemon reads has NaN or infinity.
+- The key has a wildcard.
+- The sample is a DELETE.
+- The sender id belongs to another certificate.
+
+A refused command does not keep the robot moving: it does not refresh the timeout of its source.
 """
 
 from __future__ import annotations
@@ -35,32 +41,34 @@ from acsard.core.values import NS_PER_S, REST, Command, Pose, Request, Verb, Whe
 from acsard.core.values import Twist as BodyTwist
 
 BOUND_NS = 60 * NS_PER_S
-"""A sender that is silent for longer may come back under another certificate, for example when a
-program with a fixed id moves from the robot to a laptop."""
+"""Silence after which a sender may use another certificate, ns.
+
+A program with a fixed id may move from the robot to a laptop.
+"""
 
 MAX_BOUND = 1024
-"""Senders remembered at once. The one that was seen longest ago is forgotten first."""
+"""Largest number of senders that are remembered. The one with the oldest command is forgotten."""
 
 
 class Bindings:
-    """The certificates of the senders that were seen lately.
+    """Binds each sender id to the certificate with which the daemon first saw it.
 
-    It binds each sender id to the certificate under which the daemon first saw it. The certificate
-    is part of a sender's name (`core/messages/signature.py`), so a command under another
-    certificate counts as another sender's in any case. But one id under two certificates is a
-    mistake or a stolen secret. The daemon therefore refuses the second one for as long as the first
-    one speaks.
+    One id with two certificates is a mistake or a stolen secret. The daemon refuses the second
+    certificate while the sender with the first one keeps commanding.
 
-    Only native keys name a certificate. A sender that commands on a key of ROS is bound to nothing,
-    and its name is never that of a native sender.
+    Only native keys name a certificate. A sender that commands on a ROS key is not bound, and its
+    public name never equals that of a native sender.
     """
 
     def __init__(self) -> None:
         self._seen: dict[str, tuple[str, int]] = {}
-        """Certificate, "" for the robot's own machine, and time of the last command, by sender."""
+        """Certificate and time of the last command (ns) of each sender.
+
+        The certificate is "" for a program on the robot's own machine.
+        """
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Return the certificate that the sender is bound to, or None if it is this one."""
+        """Return the certificate that the sender is bound to, or None if it may use this one."""
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
             return bound
@@ -72,39 +80,41 @@ class Bindings:
 
 
 MAX_COMMAND_BYTES = 4096
-"""Limit of a payload. A TwistStamped takes less than 300 bytes as JSON."""
+"""Largest payload in bytes. A TwistStamped has less than 300 bytes as JSON."""
 
 REPLACED_NS = NS_PER_S // 2
-"""Zenoh replaces a timestamp that is further ahead of the daemon's clock than this."""
+"""Lead of a timestamp before the daemon's clock above which Zenoh replaces it, ns."""
 
 Via = Literal["native"] | Transport
-"""The tree of keys on which a sample or query came."""
+"""The tree of keys on which a sample or query arrived: acsard's own, or that of a transport."""
 
 
 class Arrival(Struct, frozen=True):
-    """A sample as the bus shell took it from Zenoh, with the key below `acsard/<id>/`.
-
-    A sample on a ROS key has the native key that it stands for.
-    """
+    """A sample as Zenoh delivered it."""
 
     key: str
+    """The key below `acsard/<id>/`. A sample on a ROS key has the native key that it stands for."""
     put: bool
+    """True for a PUT, false for a DELETE."""
     payload: bytes
     encoding: str
     arrived_ns: int
+    """Monotonic time of arrival, ns."""
     stamp_ns: int | None
-    """Zenoh's timestamp if the sender or a router set it, wall clock in ns."""
+    """Zenoh's timestamp by the wall clock, ns, if the sender or a router set it."""
     sender: str
-    """The id of the Zenoh session that stamped the sample, "" if none did or if a router did."""
+    """The id of the sender's Zenoh session; "" if that session did not stamp the sample."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
-    """Zenoh's timestamp if the daemon's own session set it, because the sample had none or one too
-    far ahead of the daemon's clock."""
+    """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it.
+
+    It does so if the sample had no timestamp, or one too far ahead of the daemon's clock.
+    """
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
-    """A Twist or a TwistStamped, distinguished by the fields that are set."""
+    """A Twist or a TwistStamped. The fields that are set show which one it is."""
 
     linear: Vector3 | UnsetType = UNSET
     angular: Vector3 | UnsetType = UNSET
@@ -113,12 +123,14 @@ class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
-"""Size of a Twist in CDR and the least size of a TwistStamped. Often only the size distinguishes
-the two."""
+"""Size of a Twist in CDR and the least size of a TwistStamped, bytes.
+
+If the Encoding names no type, only the size distinguishes the two.
+"""
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
-"""Type names that an Encoding may carry for the two messages."""
+"""Type names that an Encoding may have for a Twist and for a TwistStamped."""
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
@@ -139,7 +151,7 @@ MAY_BE_PLAIN: tuple[Verb, ...] = ("clear", "activate")
 
 
 class Receiver:
-    """The decoder of commands, by the key on which they came."""
+    """Decodes commands and requests."""
 
     def __init__(self, joints: JointsConfig, kinematics: Kinematics) -> None:
         self._joints = joints.as_tuple()
@@ -147,7 +159,7 @@ class Receiver:
         self._bindings = Bindings()
 
     def command(self, arrival: Arrival) -> Command:
-        """Decode a sample on `cmd/…` or `wheel_cmd/…` into a command; raise `DecodeError`."""
+        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`. Raises `DecodeError`."""
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
@@ -155,19 +167,19 @@ class Receiver:
             raise DecodeError("not_a_put", "a DELETE is not a command")
         if len(arrival.payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
-        said = voice(arrival)
-        stamp_ns, clock = said.stamp_ns, said.sender
+        identity = identify(arrival)
+        stamp_ns, clock = identity.stamp_ns, identity.sender
         if kind == "cmd":
             twist, header, cancelled = self._twist(arrival)
         else:
             twist, header, cancelled = self._wheel_speeds(arrival)
-        if header is not None and header.stamp.to_ns() > 0 and not said.steady:
-            # The header's stamp comes from another clock than the envelope's, so it gets a name of
-            # its own.
+        if header is not None and header.stamp.to_ns() > 0 and not identity.steady:
+            # The stamp of the header may come from another clock than that of the attachment, so
+            # its clock gets its own name.
             stamp_ns = header.stamp.to_ns()
             clock = f"{clock}, header on {arrival.via}/{arrival.key}"
-        if said.signed:
-            bound = self._bindings.other(said.signed, certificate, arrival.arrived_ns)
+        if identity.signed:
+            bound = self._bindings.other(identity.signed, certificate, arrival.arrived_ns)
             if bound is not None:
                 where = f"certificate {bound}" if bound else "the robot's own machine"
                 raise DecodeError(
@@ -182,13 +194,13 @@ class Receiver:
             arrival.arrived_ns,
             stamp_ns,
             clock,
-            said.sender,
+            identity.sender,
             cancelled,
-            said.sequence,
-            shared=said.shared,
+            identity.sequence,
+            shared=identity.shared,
             ros=arrival.via != "native",
             stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > REPLACED_NS),
-            steady=said.steady,
+            steady=identity.steady,
         )
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
@@ -218,10 +230,10 @@ class Receiver:
                 "wrong_wheels", f"needs one velocity for each of {', '.join(self._joints)}"
             )
         places = [got.name.index(joint) for joint in self._joints]
-        # Values of other joints, for example of an arm, are not for this daemon.
+        # Other joints, for example those of an arm, are not the daemon's.
         velocity, position, effort = (
-            [told[place] for place in places] if len(told) == count else told
-            for told in (got.velocity, got.position, got.effort)
+            [values[place] for place in places] if len(values) == count else values
+            for values in (got.velocity, got.position, got.effort)
         )
         if not all(map(math.isfinite, (*velocity, *position, *effort))):
             raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
@@ -234,9 +246,14 @@ class Receiver:
     def request(
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
-        """Decode a service query into a request that is answered by `ticket`.
+        """Return the request in a service query. Raises `DecodeError` if it is not valid.
 
-        Raise `DecodeError` if it is not a valid request.
+        Args:
+            verb: the service.
+            ticket: the number with which the reply names the query.
+            encoding: the Zenoh Encoding of the payload.
+            payload: the payload of the query.
+            asked_ns: the monotonic time of the query, ns.
         """
         if verb not in EXAMPLES or (verb in MAY_BE_PLAIN and not payload):
             return Request(verb, ticket, asked_ns=asked_ns)
@@ -257,61 +274,64 @@ class Receiver:
         return Request(verb, ticket, Pose(got.x, got.y, got.yaw), asked_ns)
 
 
-class Voice(Struct, frozen=True):
-    """The sender of a sample, its stamp and its number, as far as the envelope has them."""
+class Identity(Struct, frozen=True):
+    """The sender of a sample, with the stamp and the number of the sample if they are known."""
 
     sender: str
-    """The public name: never the id that the sender attached."""
+    """The public name of the sender. The secret id is not kept."""
     stamp_ns: int | None = None
+    """Time of sending by the sender's wall clock, ns."""
     sequence: int | None = None
+    """Number of the sample."""
     shared: bool = False
     """Whether several programs may share this identity."""
     steady: bool = False
-    """Whether the clock of the stamps is steady, so that nobody adjusts it."""
+    """Whether the clock of the stamps is never adjusted."""
     signed: str = ""
-    """The public name without the certificate, "" unless a native command carries an id of its
-    own."""
+    """The public name without the certificate; "" unless a native command has a sender id."""
 
 
 # Each command needs the parts of its key twice, and few keys ever command.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
-    """Split the key of a command into kind, source and certificate, "" for none."""
+    """Return kind, source and certificate of a command's key, with "" for a missing part."""
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
     return kind, source, certificate
 
 
-def voice(arrival: Arrival) -> Voice:
-    """Return the sender of a sample, by the first of these that is there.
+def identify(arrival: Arrival) -> Identity:
+    """Return the identity of a sample's sender. Raises `DecodeError` if it cannot be read.
 
-    On a native key: the attachment (`core/messages/signature.py`), the session that stamped the
-    sample, the key. On a key of rmw_zenoh: the GID. On a key of a bridge: the session that stamped
-    the sample, the key. All programs that have nothing but a key look like one sender, and so do
-    all ROS nodes behind a bridge and all programs that a router stamps. Raises `DecodeError`.
+    The identity is the first of these that the sample has:
 
-    From here on the sender has only its public name. ROS discovery publishes GIDs, so a program
-    that may follow it and put on a key of rmw_zenoh can still claim any GID.
+    - on a native key: the sender id in the attachment, the session that stamped the sample, the key
+    - on a key of rmw_zenoh: the GID
+    - on a key of a bridge: the session that stamped the sample, the key
+
+    Programs of which only the key is known look like one sender. So do all ROS nodes behind a
+    bridge, and all programs whose samples a router stamps. A GID is no proof: ROS discovery
+    publishes it, so a program that may put on a key of rmw_zenoh can claim any GID.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
-        return Voice(_by_gid(rmw.gid), rmw.stamp_ns, rmw.sequence)
+        return Identity(_by_gid(rmw.gid), rmw.stamp_ns, rmw.sequence)
     if arrival.via == "bridge":
         name = f"bridge/{public_name(arrival.sender)}" if arrival.sender else _by_key(arrival)
-        return Voice(name, arrival.stamp_ns, shared=True)
-    told, sender_id, stamp_ns = signature.unpack(arrival.attachment), arrival.sender, None
-    if told is not None:
-        sender_id, stamp_ns = told.sender, told.stamp
-    steady = told is not None and told.steady and told.stamp is not None
+        return Identity(name, arrival.stamp_ns, shared=True)
+    signed, sender_id, stamp_ns = signature.unpack(arrival.attachment), arrival.sender, None
+    if signed is not None:
+        sender_id, stamp_ns = signed.sender, signed.stamp
+    steady = signed is not None and signed.steady and signed.stamp is not None
     if stamp_ns is None:
         stamp_ns = arrival.stamp_ns
     if not sender_id:
-        return Voice(_by_key(arrival), stamp_ns, shared=True)
+        return Identity(_by_key(arrival), stamp_ns, shared=True)
     kind, _, certificate = parts(arrival.key)
-    return Voice(
+    return Identity(
         public_name(sender_id, certificate),
         stamp_ns,
-        None if told is None else told.sequence,
+        None if signed is None else signed.sequence,
         steady=steady,
         signed=public_name(sender_id) if kind in COMMANDS else "",
     )
@@ -327,12 +347,12 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def sender(arrival: Arrival) -> str:
-    """Return the sender's name, also if the attachment of an rmw cannot be read."""
+    """Return the public name of a sample's sender, "" if the attachment of rmw_zenoh has no GID."""
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
-        # A shorter GID could look like the public name of a sender without a name.
+        # A shorter GID could look like the public name of a native sender.
         return _by_gid(gid) if len(gid) == GID_BYTES else ""
-    return voice(arrival).sender
+    return identify(arrival).sender
 
 
 def _twist_payload(arrival: Arrival) -> _TwistPayload:
@@ -340,12 +360,12 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
     if form != "cdr":
         return _twists.decode_as(form, arrival.payload)
     named, size = arrival.encoding.partition(";")[2], len(arrival.payload)
-    # Without a type name the size decides. DDS pads to a multiple of four.
-    plain, told = named in TWISTS, named in TWISTS + STAMPED_TWISTS
-    if plain or (not told and size < TWIST_CDR_BYTES + 4):
+    # If the Encoding names no type, the size decides. DDS pads a payload to a multiple of four.
+    plain, known = named in TWISTS, named in TWISTS + STAMPED_TWISTS
+    if plain or (not known and size < TWIST_CDR_BYTES + 4):
         twist = decode_cdr(Twist, arrival.payload)
         return _TwistPayload(linear=twist.linear, angular=twist.angular)
-    if not told and size < STAMPED_CDR_BYTES:
+    if not known and size < STAMPED_CDR_BYTES:
         raise DecodeError(
             "wrong_shape", f"{size} bytes of CDR are neither a Twist nor a TwistStamped"
         )
@@ -353,14 +373,18 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
     return _TwistPayload(header=stamped.header, twist=stamped.twist)
 
 
-def asker(via: Via, attachment: bytes, stamped_by: str = "") -> str:
-    """Return a name for the log of the program that called a service or sent a stop.
+def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
+    """Return a name for the program that called a service or sent a stop, for the log.
 
-    The name is the public name of the sender id in the attachment (`core/messages/signature.py`),
-    followed by the transport in brackets. The name itself is a claim: Zenoh does not say which
-    connection a query came by. The digits behind it are the same for as long as the program keeps
-    its secret. A call over rmw_zenoh has the client's GID, which ROS discovery publishes; a bridge
-    says nothing. `stamped_by` is the id of the Zenoh session that stamped the sample, "" for none.
+    It is the public name of the sender id in the attachment, with the transport in brackets. The
+    name is only a claim of the program, because Zenoh does not say on which connection a query
+    arrived. The digits of the public name stay the same while the program keeps its secret. A call
+    over rmw_zenoh has the GID of the client. A call through a bridge has no name.
+
+    Args:
+        via: the tree of keys on which the call arrived.
+        attachment: the attachment of the call.
+        stamped_by: the id of the Zenoh session that stamped the sample, or "".
     """
     if via == "rmw":
         return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"

@@ -1,9 +1,10 @@
-"""Decodes a sample on `imu` into the turn rate about base_link's z axis, or refuses it.
+"""Decodes samples on the key `imu` into turn rates about the z axis of base_link, or refuses them.
 
-The sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
-required. Its z axis points up, so a turn to the left is positive. If several gyros send, the daemon
-follows the first one and changes to another when that one is silent. Two gyros have two biases, so
-the first sample after a change is marked.
+A sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
+required. Its z axis points up, so a turn to the left is positive.
+
+If several gyros send, the daemon follows the first one until that gyro is silent. Two gyros have
+different biases, so the first sample of another gyro is marked (`GyroSample.anew`).
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from acsard.core.messages.signature import public_name
 from acsard.core.values import NS_PER_S, Event, GyroSample
 
 MAX_RATE = 50.0
-"""rad/s. No base turns so fast, and no gyro on a base measures it."""
+"""Largest turn rate that is accepted, rad/s. No robot turns as fast."""
 
 FOLLOWED_NS = NS_PER_S // 2
-"""Silence after which the daemon may follow another gyro, ns."""
+"""Silence of a gyro after which the daemon may follow another one, ns."""
 
 OWN = "gyro of the simulator/own"
 """The sender id with which the simulator signs the samples of its gyro."""
 
 MOST_WHO = 64
-"""Characters of a sender's name that an error message shows."""
+"""Largest number of characters of a sender's name in an error message."""
 
-UNTOLD = [0.0] * 9
+UNKNOWN = [0.0] * 9
+"""Covariance of a sample that has none. sensor_msgs/Imu defines zeros as "unknown"."""
 
 
 class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -50,22 +52,22 @@ class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 _readings = Decoder(_Reading)
 
 
-class ImuSamples:
-    """Follower of the gyros on the bus, one at a time."""
+class GyroFollower:
+    """Decodes the samples of one gyro on the bus, and refuses those of all others meanwhile."""
 
     def __init__(self, own: bool = False) -> None:
-        """Start.
+        """Start without a gyro.
 
-        With `own` the robot is the simulated one, whose gyro is the only one that counts.
+        `own` says that the robot is the simulated one. Then only the simulator's gyro is accepted.
         """
         self._own = own
         self._followed = public_name(OWN) if own else ""
         self._heard_ns = -FOLLOWED_NS
 
-    def take(
+    def receive(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
-        """Decode a gyro sample. Count and log a refused one and return None."""
+        """Return the turn rate in a sample, or count and report the refusal and return None."""
         try:
             sample = reading(arrival)
             anew = self._follow(sender(arrival), arrival.arrived_ns)
@@ -76,7 +78,10 @@ class ImuSamples:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Follow this sender; return whether another one was followed before."""
+        """Follow this sender, and return whether another one was followed before.
+
+        Raises `DecodeError` if another gyro is followed and not silent.
+        """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
             raise DecodeError(
@@ -87,7 +92,10 @@ class ImuSamples:
 
 
 def reading(arrival: Arrival) -> GyroSample:
-    """Decode one sample; raise `DecodeError`. Orientation and acceleration are ignored."""
+    """Return the turn rate in a sample. Raises `DecodeError`.
+
+    Orientation and acceleration are ignored.
+    """
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a sample")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
@@ -97,16 +105,16 @@ def reading(arrival: Arrival) -> GyroSample:
         got = decode_cdr(Imu, arrival.payload)
     else:
         got = _readings.decode(arrival.encoding, arrival.payload)
-    rate, variances = got.angular_velocity, got.angular_velocity_covariance or UNTOLD
-    said = (rate.x, rate.y, rate.z, variances[8])
-    if not all(map(math.isfinite, said)):
+    rate, variances = got.angular_velocity, got.angular_velocity_covariance or UNKNOWN
+    numbers = (rate.x, rate.y, rate.z, variances[8])
+    if not all(map(math.isfinite, numbers)):
         raise DecodeError("not_finite", "NaN or infinity in the angular velocity")
     # sensor_msgs/Imu marks an absent measurement by -1 in the first variance.
     if variances[0] == -1.0:
         raise DecodeError("no_rate", "this IMU measures no angular velocity")
     if variances[8] < 0.0:
         raise DecodeError("wrong_shape", f"a variance of {variances[8]:g}")
-    if max(map(abs, said[:3])) > MAX_RATE or variances[8] > MAX_RATE**2:
+    if max(map(abs, numbers[:3])) > MAX_RATE or variances[8] > MAX_RATE**2:
         raise DecodeError(
             "out_of_range", f"over {MAX_RATE:g} rad/s, or a variance above the square of that"
         )

@@ -1,7 +1,7 @@
-"""Answers a query, or turns it into the `Request` to the robot that it stands for.
+"""Answers queries from the bus, or turns a service call into a `Request` to the robot.
 
-A service runs only if the query's key is exactly its own, because a get on `<id>/**` must never
-stop or clear anything. All other keys may also be queried by wildcard.
+A service runs only if the query has exactly the key of the service: a get on `<id>/**` must never
+stop the robot or clear a latch. All other keys may also be queried with a wildcard.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via, asker
+from acsard.core.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via, caller_name
 from acsard.core.messages.cdr import CdrError
 from acsard.core.messages.encodings import (
     FORMATS,
@@ -59,32 +59,35 @@ from acsard.core.values import ROLES, Answer, Outputs, Request
 Current = Callable[[str], Message | None]
 
 MAX_WILDCARD = 512
-"""Characters of the longest key expression with a wildcard that is compared with keys. A longer one
-would take time from the control loop, and no key is as long."""
+"""Largest number of characters of a key expression with a wildcard.
+
+A longer one would take time from the control loop. No key is as long.
+"""
 
 BUSY = "busy: too many queries at once; ask again"
 
 
 class Query(Struct, frozen=True):
-    """A query as the bus shell took it from Zenoh, with keys below `acsard/<id>/`."""
+    """A query as Zenoh delivered it."""
 
     ticket: int
-    """The number by which replies name the query."""
+    """The number with which replies name the query."""
     topic: str
-    """The row of the topic table that the query matched."""
+    """The key of the row in the topic table that the query matches."""
     asked: str
-    """The key expression that the client wrote."""
+    """The key expression of the client, below `acsard/<id>/`."""
     fmt: str
     """The `fmt` parameter, "" if it is absent."""
     payload: bytes
     encoding: str
     arrived_ns: int | None = None
+    """Monotonic time of arrival, ns."""
     via: Via = "native"
     attachment: bytes = b""
 
 
 class Reply(Struct, frozen=True):
-    """A reply to a query; with `ok` False an error reply."""
+    """A reply to a query."""
 
     ticket: int
     """The ticket of the query."""
@@ -92,23 +95,25 @@ class Reply(Struct, frozen=True):
     payload: bytes
     encoding: str
     ok: bool = True
+    """False for an error reply of Zenoh."""
     attachment: bytes = b""
 
 
 class _Waiting(Struct, frozen=True):
-    """The data needed to reply when the robot answers: key, encoding and the attachment to echo."""
+    """A service call that waits for the answer of the robot."""
 
     key: str
     form: Format
+    """Encoding of the reply."""
     asked: Attachment | None
+    """The attachment of a call over rmw_zenoh, which the reply repeats."""
     ros: bool = False
     wish: bytes = b""
-    """The payload of a ROS request that sets parameters, "" for others. The reply must match its
-    form."""
+    """The payload of a ROS request to set parameters, which the reply depends on; else b""."""
 
 
 class Queries:
-    """The answers to queries, from constant values and the present messages."""
+    """Answers queries from constant values and from the present messages."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
@@ -130,10 +135,15 @@ class Queries:
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
-        """Answer a query: return its replies, or the `Request` of a service.
+        """Return the replies to a query, or the `Request` of a service call.
 
         The list is empty if the query is not for this daemon. Raises `DecodeError` for a ROS
-        request that cannot be served; `refused` builds the reply to it.
+        request that cannot be served; `refused` builds the reply to such a request.
+
+        Args:
+            query: the query.
+            current: returns the present message of a published key.
+            outputs: the outputs of the last step, or None before the first step.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -150,7 +160,7 @@ class Queries:
             return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
     def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
-        """Return the reply that carries the robot's answer, or None if no query waits for it."""
+        """Return the reply with the robot's answer, or None if no service call waits for it."""
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
@@ -166,9 +176,9 @@ class Queries:
         return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
-        """Serve a std_srvs/Trigger or a ROS parameter service."""
+        """Serve a query for a std_srvs/Trigger service or a ROS parameter service."""
         asked = unpack(query.attachment) if query.via == "rmw" else None
-        by = asker(query.via, query.attachment)
+        by = caller_name(query.via, query.attachment)
         verb = VERBS.get(query.topic)
         if verb is not None:
             self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, True)
@@ -206,7 +216,7 @@ class Queries:
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
         self._waiting[query.ticket] = _Waiting(query.topic, form, None)
-        return replace(request, by=asker(query.via, query.attachment))
+        return replace(request, by=caller_name(query.via, query.attachment))
 
     def _values(
         self, query: Query, current: Current, outputs: Outputs | None
@@ -217,7 +227,7 @@ class Queries:
             return [(key, "", value) for key, value in keys.items() if self._matches(query, key)]
         if topic == WHOAMI:
             found = [role for role in ROLES if whoami_key(role) == query.asked]
-            by = asker(query.via, query.attachment)
+            by = caller_name(query.via, query.attachment)
             return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in found]
         if topic == "interfaces":
             return [(topic, "Interfaces", interfaces(self._config, outputs))]
@@ -228,10 +238,10 @@ class Queries:
         return [] if value is None else [(topic, type(value).__name__, value)]
 
     def _matches(self, query: Query, key: str) -> bool:
-        """Return whether a query asks for a key.
+        """Return whether the key expression of a query includes a key.
 
-        The expression of the query is below `acsard/<id>/`, or it is whole if its first two chunks
-        are not exactly these.
+        The expression is relative to `acsard/<id>/` if it began with exactly these two chunks.
+        Otherwise it is complete, for example `acsard/*/info`.
         """
         if "*" not in query.asked:
             return query.asked == key
@@ -275,9 +285,10 @@ def _fits(pattern: str, chunk: str) -> bool:
 
 
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
-    """Return the refusal of a query, or None if no reply could find its caller.
+    """Return the reply that refuses a query, or None if the caller could not recognize a reply.
 
-    ROS clients do not receive error replies, so they get a normal response that reports a failure.
+    A ROS client does not receive the error replies of Zenoh, so it gets a response with `success`
+    or `successful` false. `why` is the reason.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
@@ -294,17 +305,20 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
 
 
 def most_bytes(topic: str) -> int:
-    """Return how many bytes of a query's payload are worth keeping."""
+    """Return the size in bytes above which the payload of a query is refused."""
     return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment by which rmw_zenoh matches a reply: the request's sequence and GID."""
+    """Return the attachment of a reply, with which rmw_zenoh finds the request."""
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
 
 def _format(query: Query) -> Format:
-    """Return the reply's encoding: `?fmt=`, else that of a service's payload, else JSON."""
+    """Return the encoding of the reply.
+
+    It is that of `?fmt=`, else that of the payload of a service call, else JSON.
+    """
     for form in FORMATS:
         if query.fmt == form:
             return form
@@ -316,12 +330,12 @@ def _format(query: Query) -> Format:
         try:
             return detect(query.encoding, query.payload)
         except DecodeError:
-            pass  # a service without a payload ignores one that cannot be decoded
+            pass  # a service that needs no payload ignores one that cannot be decoded
     return "json"
 
 
 def topic_table(config: Config) -> Topics:
-    """Return the topic table with this robot's full keys."""
+    """Return the rows of the topic table that this daemon has, with full keys."""
     robot = config.robot.id
     return Topics(
         [

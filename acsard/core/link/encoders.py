@@ -14,7 +14,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.config.wire_time import FIELD
-from acsard.core.link.check import Reading
+from acsard.core.link.checksum import Reading
 from acsard.core.link.codec import Motors
 from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S

@@ -14,7 +14,7 @@ from collections import Counter
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
-from acsard.core.link.check import Reading, unseal
+from acsard.core.link.checksum import Reading, unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader

@@ -1,9 +1,12 @@
 """Encodes msgspec structs as CDR, the encoding of ROS 2, and decodes them.
 
-The codec is derived from the struct type and knows nothing about robots. It writes plain CDR
-(XCDR1), little endian, behind the 4-byte encapsulation header; alignment counts from the byte after
-the header. It reads both byte orders. Each struct type (`cdr_types.py`) is compiled once, and
-neighbouring numbers are packed in one call, so a message costs a few calls and not one per field.
+The codec is derived from the type of the struct. It writes plain CDR (XCDR1), little endian, behind
+the encapsulation header of 4 bytes. Alignment counts from the byte after the header. It reads both
+byte orders.
+
+Each type is compiled once to a list of parts. Neighbouring numbers are one part, which a single
+call packs, so a message needs a few calls instead of one for each field. `cdr_types.py` reads the
+types.
 """
 
 from __future__ import annotations
@@ -37,11 +40,11 @@ _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
 class CdrError(AcsardError):
-    """Bytes that are not a valid message of the expected type."""
+    """The bytes are not a valid message of the expected type."""
 
 
 class Cdr(Generic[T]):
-    """Codec of one struct type. Raises `TypeError` for a type that CDR cannot represent."""
+    """Codec of one struct type. The constructor raises `TypeError` if CDR cannot represent it."""
 
     def __init__(self, cls: type[T]) -> None:
         # A cache key must be hashable, and mypy does not know that of a type variable.
@@ -49,7 +52,7 @@ class Cdr(Generic[T]):
         self._parts, self._build = _compiled(of_type)
 
     def encode(self, message: T) -> bytes:
-        """Encode the message with its header, little endian, without trailing padding."""
+        """Return the message as CDR with its header, little endian, without trailing padding."""
         out = bytearray(HEADER)
         for part in self._parts:
             part.write(out, message)
@@ -59,10 +62,9 @@ class Cdr(Generic[T]):
         return bytes(out)
 
     def decode(self, payload: bytes) -> T:
-        """Decode a message.
+        """Return the message in a payload. Bytes after the message are ignored as padding.
 
-        Raises `CdrError`, and no other exception, if the payload is not valid. Bytes after the
-        message are ignored as padding.
+        Raises `CdrError`, and no other exception, if the payload is not valid.
         """
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
@@ -75,10 +77,7 @@ class Cdr(Generic[T]):
 
 
 class _Source:
-    """Reader of a payload.
-
-    It aligns from the end of the header and never reads beyond the payload.
-    """
+    """Reads the values of a payload in order, and never beyond its end."""
 
     def __init__(self, data: bytes, order: str) -> None:
         self.data, self.order = data, order
@@ -91,7 +90,7 @@ class _Source:
 
     def take_many(self, code: str, count: int) -> list[Any]:
         self.at += -(self.at - len(HEADER)) % SIZES[code]
-        # Do not cache this layout: a stranger may send sequences of every length.
+        # Do not cache this layout: a client may send a sequence of any length, and fill the cache.
         values = self._unpack(struct.Struct(f"{self.order}{count}{code.replace('?', 'B')}"))
         return [_whole(code, value) for value in values] if code == "?" else list(values)
 
@@ -139,7 +138,7 @@ def _layout(order: str, codes: str, start: int) -> struct.Struct:
 
 
 def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
-    """Return the function that packs these numbers, for each start from 0 to 7 (mod 8)."""
+    """Return the functions that pack these numbers, one for each start position modulo 8."""
     return tuple(_layout("<", codes, start).pack for start in range(8))
 
 
@@ -148,10 +147,7 @@ _put_count = _packs("I")
 
 @lru_cache(256)
 def _text_bytes(text: str) -> bytes:
-    """Encode a string with its length.
-
-    Results are cached, because a robot repeats the same few strings.
-    """
+    """Return a string as CDR with its length, cached because a robot repeats a few strings."""
     raw = text.encode() + b"\0"
     return struct.pack("<I", len(raw)) + raw
 
@@ -165,7 +161,7 @@ Get = Callable[[Any], Any]
 
 
 class _Numbers:
-    """Neighbouring numbers of a message, which may belong to different nested structs."""
+    """A part: neighbouring numbers of a message, which may belong to different nested structs."""
 
     def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
         self._codes = "".join(number_code(kind) for _, kind in run)
@@ -187,7 +183,7 @@ class _Numbers:
 
 
 class _Text:
-    """A string of a message."""
+    """A part: a string of a message."""
 
     def __init__(self, get: Get) -> None:
         self._get = get
@@ -200,7 +196,7 @@ class _Text:
 
 
 class _List:
-    """Items of one type: a sequence of at most `most` items, or an array of exactly `most`."""
+    """A part: a sequence of at most `most` items, or if `fixed` an array of `most` items."""
 
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
         self._get, self._most = get, most
@@ -227,7 +223,7 @@ class _List:
             out += self._packs[start](*items)
             return
         if self._code:
-            # An empty sequence has no padding after its length.
+            # An empty sequence ends with its length, without padding for its items.
             if items:
                 out += bytes(-(len(out) - len(HEADER)) % SIZES[self._code])
                 out += struct.pack(f"<{len(items)}{self._code}", *items)
@@ -264,7 +260,7 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return the parts of a struct type in order, and the function that builds an instance."""
+    """Return the parts of a struct type in order, and a function that builds an instance."""
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

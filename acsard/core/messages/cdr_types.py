@@ -1,7 +1,7 @@
-"""The part of a struct type that CDR needs: its leaf fields in order, and how to build an instance.
+"""Reads from a struct type the fields in the order of CDR, and a function that builds an instance.
 
-A `float` is a float64. An `int` declares its width by `Meta(extra={"cdr": code})` with a code of
-the struct module (`B i I q Q`). A list whose `Meta` fixes its length is an array.
+A `float` is a float64. An `int` declares its width with `Meta(extra={"cdr": code})`, where the code
+is one of the struct module (`B i I q Q`). A list whose `Meta` fixes its length is an array.
 """
 
 from __future__ import annotations
@@ -12,14 +12,17 @@ from typing import Any
 from msgspec import inspect
 
 SIZES = {"d": 8, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
-"""Size of a number in bytes by its code; a number is aligned to its own size."""
+"""Size of a number in bytes by its code. A number is aligned to its size."""
 
 Build = Callable[[Iterator[object]], object]
+"""Function that takes the values of a struct's leaves from an iterator and returns the struct."""
+
 Limit = tuple[float, float]
+"""Least and greatest value of a number."""
 
 
 def struct_info(cls: Any) -> inspect.StructType:
-    """Return the type information of a struct type; raise `TypeError` for any other type."""
+    """Return the type information of a struct type. Raises `TypeError` for any other type."""
     info = inspect.type_info(cls)
     if not isinstance(info, inspect.StructType):
         raise TypeError(f"{cls} is not a struct")
@@ -27,7 +30,7 @@ def struct_info(cls: Any) -> inspect.StructType:
 
 
 def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, inspect.Type]]:
-    """Yield the dotted path and the type of every field, with the fields of nested structs."""
+    """Yield the dotted path and the type of each leaf: a field that is not a struct itself."""
     for field in info.fields:
         kind = plain(field.type)
         if isinstance(kind, inspect.StructType):
@@ -37,7 +40,7 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 
 
 def builder(info: inspect.StructType) -> Build:
-    """Return a function that builds a struct from an iterator over the values of its leaves."""
+    """Return a function that builds this struct from the values of its leaves."""
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
     return lambda values: info.cls(*[child(values) for child in children])
@@ -49,7 +52,7 @@ def plain(kind: inspect.Type) -> inspect.Type:
 
 
 def number_code(kind: inspect.Type) -> str:
-    """Return the struct code of a number, or "" for any other type."""
+    """Return the code of a number in the struct module, or "" for any other type."""
     match plain(kind):
         case inspect.FloatType():
             return "d"
@@ -64,7 +67,7 @@ def number_code(kind: inspect.Type) -> str:
 
 
 def limit(kind: inspect.Type) -> Limit | None:
-    """Return the least and the greatest value of an int that has bounds, or None."""
+    """Return the bounds of an int, or None for an int without bounds and for any other type."""
     number = plain(kind)
     if not isinstance(number, inspect.IntType):
         return None

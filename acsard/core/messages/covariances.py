@@ -1,9 +1,9 @@
-"""Converts planar covariances to the 6x6 matrices of ROS messages.
+"""Converts the covariances of planar odometry to the 6x6 matrices of ROS messages.
 
-A matrix is row major with the axes x, y, z, roll, pitch, yaw. Wheels cannot measure z, roll and
-pitch, so these axes get the configured variances, clamped to a range that RViz can draw and a
+A matrix is row major, and its axes are x, y, z, roll, pitch and yaw. Wheels do not measure z, roll
+and pitch. These axes get the configured variances, limited to a range that RViz can draw and a
 filter can invert. With `odometry.covariance = "constant"` both matrices are the configured
-diagonals.
+diagonals without a limit.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from acsard.core.config.settings import Diagonal, OdometryConfig
 from acsard.core.values import PoseCovariance, TwistVariances
 
 SMALLEST, LARGEST = 1e-6, 1e6
-"""Smallest and largest variance of an axis that is not measured."""
+"""Smallest and largest variance of an axis that is not measured, m2 or rad2."""
 
 UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
-"""Covariance of a twist that is not measured at all."""
+"""Covariance of a twist of which no axis is measured."""
 
 
 class Covariances:
-    """Builder of the covariance matrices of nav_msgs/Odometry."""
+    """Builds the covariance matrices of nav_msgs/Odometry."""
 
     def __init__(self, odometry: OdometryConfig) -> None:
         self._constant = odometry.covariance == "constant"
@@ -29,9 +29,10 @@ class Covariances:
         self._unmeasured_rates = _bounded(self._twist)
 
     def of_pose(self, p: PoseCovariance) -> list[float]:
-        """Return the covariance of the pose in the odom frame.
+        """Return the covariance of the pose in the frame odom, m2, m rad and rad2.
 
-        The rotations are about the axes of odom, through the robot's position.
+        Roll, pitch and yaw are rotations about axes through the robot that are parallel to the axes
+        of odom.
         """
         if self._constant:
             return _diagonal(*self._pose)
@@ -48,7 +49,7 @@ class Covariances:
         # fmt: on
 
     def of_twist(self, v: TwistVariances) -> list[float]:
-        """Return the covariance of the twist in the base frame."""
+        """Return the covariance of the twist in the frame of the base, m2/s2 and rad2/s2."""
         if self._constant:
             return _diagonal(*self._twist)
         return _diagonal(v.linear, v.lateral, *self._unmeasured_rates, v.angular)

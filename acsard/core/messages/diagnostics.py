@@ -1,8 +1,13 @@
-"""Converts `Outputs` and `Snapshot` to the rows of `diagnostics`, as rqt_robot_monitor shows them.
+"""Converts `Outputs` and `Snapshot` to the rows of `diagnostics`, which rqt_robot_monitor shows.
 
-A row is in every message of a run or in none. The monitor keeps a row that it has once received,
-and shows it as stale when it stays away. Level OK means that the robot needs no attention. WARN
-means that a person should know about it. ERROR means that it keeps the robot from driving.
+The levels have these meanings:
+
+- OK: the robot needs no attention.
+- WARN: a person should know about it.
+- ERROR: it keeps the robot from driving.
+
+As long as the daemon runs, each message has the same rows. If a row were missing from a message,
+rqt_robot_monitor would show the row as stale.
 """
 
 from __future__ import annotations
@@ -31,19 +36,19 @@ from acsard.core.values import (
 OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
-"""Levels of the modes that wait until a person clears a latch."""
+"""Levels of the modes in which the robot waits for a person to clear a latch."""
 
 REFUSED_S = 2.0
-"""Time for which a refusal is shown, s: two messages at the default rate."""
+"""Time for which a refused command is shown, s. These are two messages at the default rate."""
 
 MISSED_SHARE = 0.01
-"""Share of the last minute's periods above which missed periods are a warning."""
+"""Fraction of the control periods of the last minute that may be missed without a warning."""
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
 
 class Row(Struct, frozen=True):
-    """A diagnostic status, before the robot's name is added."""
+    """A row of `diagnostics` without the name of the robot."""
 
     name: str
     level: int
@@ -54,10 +59,14 @@ class Row(Struct, frozen=True):
 def diagnostics(
     config: Config, outputs: Outputs, snapshot: Snapshot, certificate: tuple[int, str]
 ) -> DiagnosticArray:
-    """Return all rows.
+    """Return the message with all rows.
 
-    `certificate` is the level of the certificate's expiry and its description, which is empty
-    without a certificate.
+    Args:
+        config: the configuration of the daemon.
+        outputs: the outputs of the last step.
+        snapshot: the state of the robot.
+        certificate: the level and the description of the certificate's validity, as `expiry`
+            returns them. The description is "" without a certificate, and then there is no row.
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
@@ -106,8 +115,8 @@ def _control_loop(snapshot: Snapshot) -> Row:
     kept = figures.get("period_lateness", Measured()).last_minute.count
     values = {
         f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
-        for name, one in figures.items()
-        for when, spread in (("", one.since_start), ("_minute", one.last_minute))
+        for name, figure in figures.items()
+        for when, spread in (("", figure.since_start), ("_minute", figure.last_minute))
         for share in ("p50", "p99", "max")
     }
     return Row(
@@ -130,7 +139,7 @@ def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """Return the row about the agreement of the front and rear wheels."""
+    """Return the row that says whether the front and the rear wheels agree."""
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
@@ -194,4 +203,5 @@ def _latch_file(trouble: str | None) -> list[Row]:
 
 
 def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:
+    """Return the counters whose names begin with `kind`, as text."""
     return {name: str(count) for name, count in counters.items() if name.startswith(kind)}

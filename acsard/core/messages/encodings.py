@@ -1,7 +1,8 @@
-"""The encodings msgpack, JSON and CDR, and the detection of an incoming payload's encoding.
+"""Encodes and decodes messages in msgpack, JSON and CDR.
 
-A Zenoh Encoding that names one of them decides. Otherwise the first bytes decide: `{` (after white
-space) is JSON, a msgpack map header is msgpack, and `00 00` or `00 01` is CDR. Decoding raises
+The encoding of an incoming payload is the one that its Zenoh Encoding names. If the Zenoh Encoding
+names none of the three, the first bytes of the payload decide: `{`, also after white space, means
+JSON, the header of a map means msgpack, and `00 00` or `00 01` means CDR. Decoding raises
 `DecodeError` and no other exception.
 """
 
@@ -31,7 +32,7 @@ _text = msgspec.json.Encoder()
 
 
 class DecodeError(AcsardError):
-    """A payload that cannot be used; `reason` is the counter's name."""
+    """A payload that cannot be used. `reason` is the last part of the name of its counter."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -42,12 +43,15 @@ _AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
-    """Return the Zenoh Encoding of a payload that the daemon publishes."""
+    """Return the Zenoh Encoding of a payload that the daemon publishes.
+
+    `type_name` is the name of the message type, or "" for a payload without one.
+    """
     return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
 
 
 def encode(message: object, form: Format) -> bytes:
-    """Encode the message; raise `DecodeError` for CDR of a type that CDR cannot represent."""
+    """Return the encoded message. Raises `DecodeError` if `form` is CDR and the type has no CDR."""
     if form == "cdr":
         return _codec(type(message)).encode(message)
     return _pack.encode(message) if form == "msgpack" else _text.encode(message)
@@ -63,7 +67,10 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """Return the encoding of the payload; raise `DecodeError` if it is unknown."""
+    """Return the encoding of a payload. Raises `DecodeError` if it is unknown.
+
+    `encoding` is the Zenoh Encoding of the payload.
+    """
     form = _FORM_OF.get(encoding.partition(";")[0])
     if form is not None:
         return form
@@ -81,7 +88,7 @@ def detect(encoding: str, payload: bytes) -> Format:
 
 
 class Decoder(Generic[T]):
-    """Decoder of payloads of one type in any of the encodings."""
+    """Decodes payloads of one type in any of the encodings."""
 
     def __init__(self, cls: type[T]) -> None:
         self._cls = cls
@@ -89,11 +96,14 @@ class Decoder(Generic[T]):
         self._text = msgspec.json.Decoder(cls)
 
     def decode(self, encoding: str, payload: bytes) -> T:
-        """Decode a message; raise `DecodeError` if the payload is not a valid one."""
+        """Return the message in a payload. Raises `DecodeError` if the payload is not valid.
+
+        `encoding` is the Zenoh Encoding of the payload.
+        """
         return self.decode_as(detect(encoding, payload), payload)
 
     def decode_as(self, form: Format, payload: bytes) -> T:
-        """Decode a message in a known encoding; raise `DecodeError` if it is not a valid one."""
+        """Return the message in a payload of a known encoding. Raises `DecodeError`."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:
@@ -106,7 +116,7 @@ class Decoder(Generic[T]):
 
 
 def _where(words: str, payload: bytes) -> str:
-    """Replace the byte offset in msgspec's JSON error by the line and the column."""
+    """Return the text of a JSON error with line and column in place of the byte offset."""
     match = _AT_BYTE.fullmatch(words)
     if match is None:
         return words
@@ -118,7 +128,7 @@ def _where(words: str, payload: bytes) -> str:
 
 
 def decode_cdr(cls: type[T], payload: bytes) -> T:
-    """Decode a CDR payload; raise `DecodeError` if it is not valid."""
+    """Return the message in a CDR payload. Raises `DecodeError` if the payload is not valid."""
     try:
         return _codec(cls).decode(payload)
     except CdrError as error:

@@ -1,11 +1,11 @@
-"""Describes the validity of the bus's certificate, for `state`, `diagnostics` and `doctor`."""
+"""Describes the validity of the bus's TLS certificate, for `state`, `diagnostics` and `doctor`."""
 
 from __future__ import annotations
 
 from acsard.core.values import NS_PER_S
 
 EXPIRY_DAYS = 30
-"""Number of days before its end from which on a certificate is a warning."""
+"""Number of days of validity below which a certificate is a warning."""
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -13,7 +13,9 @@ DAY_NS = 86400 * NS_PER_S
 def expiry(ends_ns: int | None, now_ns: int) -> tuple[int, str]:
     """Return the level (0 ok, 1 warning, 2 error) and a description of the certificate's validity.
 
-    Both times are wall-clock ns since 1970. `ends_ns` is None if the end is unknown.
+    Args:
+        ends_ns: the end of the certificate, wall-clock ns since 1970; None if it is unknown.
+        now_ns: the present time, wall-clock ns since 1970.
     """
     if ends_ns is None:
         return (

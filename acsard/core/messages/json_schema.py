@@ -1,9 +1,9 @@
-"""The JSON Schemas of published types, received types and `Config`, for `schema/<Type>`.
+"""Makes the JSON Schemas of the message types and of `Config`, for the key `schema/<Type>`.
 
-A published message has all its fields, and later versions may add more: all fields are required and
-others are allowed. A received message may omit fields with a default, and unknown fields are
-refused. A type that is used in both directions has two schemas: its name for publishing, and the
-name with `In` appended for receiving.
+A message that the daemon publishes has all its fields, and a later version may add more. Its schema
+therefore requires all fields and allows others. A message that the daemon receives may omit fields
+with a default, and unknown fields are refused. A type that is used in both directions has two
+schemas: its own name for publishing, and the name with `In` appended for receiving.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ ENOUGH: dict[type, list[str]] = {
     JointState: ["name", "velocity"],
     Imu: ["angular_velocity"],
 }
-"""Required fields of a received type, if they are not exactly the fields without a default."""
+"""Required fields of the received types that do not require all fields without a default."""
 
 Schema = dict[str, Any]
 
 
 def going_out(cls: type, name: str) -> Schema:
-    """Return the schema of a type as the daemon writes it."""
+    """Return the schema of a type as the daemon publishes it."""
     schema = _described(cls, name)
     for part in (schema, *schema["$defs"].values()):
         if "properties" in part:
@@ -53,13 +53,13 @@ def going_out(cls: type, name: str) -> Schema:
 
 
 def coming_in(cls: type, name: str) -> Schema:
-    """Return the schema of a type as the daemon accepts it."""
+    """Return the schema of a type as the daemon accepts it from clients."""
     schema = _described(cls, name)
     return schema | {"required": ENOUGH[cls]} if cls in ENOUGH else schema
 
 
 def _described(cls: type, name: str) -> Schema:
-    # A pattern is an ECMAScript expression, which has no \Z; its $ matches only at the end.
+    # A pattern is an ECMAScript expression. It has no \Z, but its $ matches only at the end.
     text = msgspec.json.encode(msgspec.json.schema(cls)).replace(rb'\\Z"', b'$"')
     whole: Schema = msgspec.json.decode(text)
     parts, own = whole["$defs"], whole["$ref"].rpartition("/")[2]

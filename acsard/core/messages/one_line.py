@@ -1,6 +1,6 @@
-"""Formats the pose and the motion of the robot in one line for a person; pure.
+"""Formats the pose and the motion of the robot in one line for a person.
 
-Covariances, stamps and frames are left out: programs read them in the JSON.
+Covariances, stamps and frames are left out. Programs read them from the JSON.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from acsard.core.messages.schema import Odometry, Pose, PoseStamped, RobotState,
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
-    """Format a pose with units: x and y in m, yaw in degrees. The arguments are in m and rad."""
+    """Return a pose as text with units. The arguments are in m and rad, the text in degrees."""
     return [
         f"x {signed(x, 3, 8)} m",
         f"y {signed(y, 3, 8)} m",
@@ -23,12 +23,12 @@ def place(x: float, y: float, yaw: float) -> list[str]:
 
 
 def speeds(linear: float | None, angular: float | None) -> list[str]:
-    """Format a twist with units: m/s and rad/s, or "-" for an unknown speed."""
+    """Return a twist as text with units. The arguments are in m/s and rad/s, None if unknown."""
     return [f"forward {signed(linear, 2, 5)} m/s", f"turn {signed(angular, 2, 5)} rad/s"]
 
 
 def short(message: object) -> str:
-    """Format a message in one line; its type must be in `SHORT`."""
+    """Return a message in one line. Its type must be in `SHORT`."""
     return "  ".join(SHORT[type(message)](message))
 
 
@@ -37,9 +37,9 @@ def _odometry(odom: Odometry) -> list[str]:
 
 
 def _state(state: RobotState) -> list[str]:
-    why = state.reason.removeprefix(f"{state.mode}: ")
-    told = printable(f"{state.mode}: {why}")
-    return [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), told]
+    reason = state.reason.removeprefix(f"{state.mode}: ")
+    mode = printable(f"{state.mode}: {reason}")
+    return [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
 
 
 def _pose(pose: Pose) -> list[str]:
@@ -57,4 +57,4 @@ SHORT: dict[type, Callable[[Any], list[str]]] = {
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }
-"""Types with a short form, and the function that makes it."""
+"""Types with a short form, and the functions that make it."""

@@ -1,7 +1,7 @@
-"""The permissions of each role, derived from the table of keys in `topics.py`.
+"""Derives the permissions of each role from the table of keys in `topics.py`.
 
-The access rules of the daemon and of the TLS gateway, the rules of a fleet's router, the
-permissions of the page and the tables of roles on the pages are made from these functions.
+These functions make the access rules of the daemon and of the TLS gateway, the rules of a fleet's
+router, the permissions of the page, and the tables of roles in the documentation.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ def has(role: str, least: Role) -> bool:
 
 
 def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
-    """Return the exact keys of these rows for which `role` is the least role.
+    """Return the keys of these rows that `role` may use in this way and lower roles may not.
 
-    Keys of commands are left out, because their sources and certificates depend on the
-    configuration: `source_keys` makes them, and `COMMAND_ROLE` is their role.
+    Keys of commands are left out, because they contain names of the configuration. `source_keys`
+    makes these keys, and `COMMAND_ROLE` is their least role.
     """
     exact = (pair for row in rows if not row.local for pair in _exact(row, use))
     return [key for key, least in exact if least == role and "<" not in key]
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield each key that a row stands for, with the least role that may use it so."""
+    """Yield each key that a row stands for, with the least role that may use it in this way."""
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":
         yield from ((row.key.replace("<role>", role), role) for role in ROLES)
@@ -56,10 +56,11 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 
 
 def least_role(key: str) -> Role:
-    """Return the least role that may follow, query, call or put on a key below the robot's id.
+    """Return the least role that may use a key, given below the robot's id, in its usual way.
 
-    A key that clients put on has the role for putting. An unknown key has the lowest role: no rule
-    grants it, and this function only chooses the words for a client that received nothing.
+    The usual way is to put on a key for commands, to query or call a key that answers, and to
+    follow any other key. An unknown key gets the lowest role. This grants nothing, because this
+    function only chooses the words for a client that received nothing.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

@@ -1,8 +1,8 @@
-"""The last events for the topic `events`.
+"""Keeps the last events for the topic `events`.
 
-An event that repeats is one row with a count. A machine that misses a period every second would
-otherwise push a fault out of the twenty rows within 20 s. An event that brings news keeps a row of
-its own. The log has a line for each event.
+An event that repeats is one row with a count. If each repetition had its own row, a computer that
+misses a control period every second would push a fault out of the twenty rows within 20 s. An event
+whose `news` is true always gets its own row. The log has a line for each event.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from acsard.core.motion.event_throttle import together
 from acsard.core.values import NS_PER_S, Event, Instant
 
 LAST = 20
-"""Number of rows: more events than usually happen between two looks of a slow reader."""
+"""Number of rows. A reader that polls slowly usually misses no event with this many rows."""
 
 PAUSE_NS = 60 * NS_PER_S
-"""Pause without a repetition after which the next event of the same name gets a new row."""
+"""Time without a repetition after which an event of the same name gets a new row."""
 
 
 class _Row(Struct, frozen=True):
@@ -29,14 +29,14 @@ class _Row(Struct, frozen=True):
 
 
 class RecentEvents:
-    """The last rows, oldest first. A row whose event repeats moves to the end."""
+    """The rows of the last events, oldest first. An event that repeats moves its row to the end."""
 
     def __init__(self) -> None:
         self._rows: deque[_Row] = deque(maxlen=LAST)
         self._total = 0
 
     def add(self, events: Iterable[Event], now: Instant) -> None:
-        """Add events that have just been reported."""
+        """Add events of a step that took place at `now`."""
         for event in events:
             self._total += 1
             same = None if event.news else self._same(event, now)
@@ -49,7 +49,7 @@ class RecentEvents:
         """Return the message with all rows, or None before the first event."""
         if not self._rows:
             return None
-        return Events(_time(self._rows[-1]), self._total, [_happening(row) for row in self._rows])
+        return Events(_time(self._rows[-1]), self._total, [_log_event(row) for row in self._rows])
 
     def _same(self, event: Event, now: Instant) -> _Row | None:
         """Return the row that this event repeats, or None."""
@@ -64,6 +64,6 @@ def _time(row: _Row) -> Time:
     return Time.from_ns(row.at.wall_ns)
 
 
-def _happening(row: _Row) -> LogEvent:
-    one = row.event
-    return LogEvent(_time(row), one.name, one.level, one.text, one.by, one.count)
+def _log_event(row: _Row) -> LogEvent:
+    event = row.event
+    return LogEvent(_time(row), event.name, event.level, event.text, event.by, event.count)

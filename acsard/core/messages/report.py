@@ -1,4 +1,4 @@
-"""Converts `Outputs` to messages: those that are due, and the present value of any published key.
+"""Builds the messages that are due after a step, and the present value of any published key.
 
 Only messages with a subscriber are built. All messages of one feedback line carry its stamp.
 """
@@ -54,7 +54,7 @@ Look = Callable[[], Snapshot]
 
 
 class _Rate:
-    """Rate limit of one topic; 0 Hz means no limit."""
+    """Limits the rate of one topic. 0 Hz means no limit."""
 
     def __init__(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0
@@ -71,17 +71,15 @@ class _Rate:
 
 
 class Report:
-    """Builder of messages.
-
-    It remembers only the last outputs, the last estimate and the last events.
-    """
+    """Builds messages. It keeps only the last outputs, the last estimate and the last events."""
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends_ns: int | None = None
     ) -> None:
         self.certificate_ends_ns = certificate_ends_ns
-        """Wall-clock time at which the certificate ends, ns. The TLS gateway reports it if the
-        daemon may not read the certificate.
+        """End of the TLS certificate by the wall clock, ns since 1970; None if it is unknown.
+
+        The TLS gateway reports it if the daemon may not read the certificate.
         """
         self._names = list(config.joints.as_tuple())
         self._start = start
@@ -99,10 +97,14 @@ class Report:
     def due(
         self, outputs: Outputs, wanted: Collection[str], look: Look
     ) -> Iterator[tuple[str, Message]]:
-        """Yield the (key, message) pairs to publish after this step, for the keys in `wanted`.
+        """Yield the pairs of key and message to publish after this step.
 
-        They come one by one, feedback first, because a `state` takes as long to build as ten
-        others.
+        The messages of feedback come first, because `state` takes as long to build as ten others.
+
+        Args:
+            outputs: the outputs of the step.
+            wanted: the keys that have a subscriber.
+            look: returns the state of the robot; called only if a message needs it.
         """
         self._outputs = outputs
         if outputs.events:
@@ -117,6 +119,7 @@ class Report:
             or (outputs.events and "events" in wanted)
         ):
             return self._due(outputs, wanted, look)
+        # Most steps end here, because nothing is due that a client follows.
         return iter(())
 
     def _due(
@@ -181,9 +184,10 @@ class Report:
         return TFMessage(transforms)
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Build the message with the stamp of its sample.
+        """Return the message with the stamp of its sample.
 
-        If the feedback is not `live`, the twist is zero with the covariance of an unmeasured one.
+        `live` is false if feedback has stopped since. The twist is then zero, and its covariance
+        says that it is not measured.
         """
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
@@ -249,9 +253,9 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
-        """Return the level (0 ok, 1 warning, 2 error) and the words about the certificate.
+        """Return the level (0 ok, 1 warning, 2 error) and a description of the certificate.
 
-        The words are empty without TLS.
+        The description is "" without TLS.
         """
         if not self._config.bus.tls:
             return 0, ""

@@ -1,7 +1,8 @@
-"""The message structs, shaped and named like their ROS 2 counterparts, with the unit of each field.
+"""The types of the messages on the bus, with the unit of each field.
 
-One schema serves several encodings: a field means the same in msgpack, JSON and CDR. Structs refuse
-unknown fields, so a misspelt axis in a command is an error and not a robot that stands still.
+A type has the name and the fields of its ROS 2 counterpart if there is one. A field means the same
+in msgpack, JSON and CDR. Unknown fields are refused: a command with a misspelt axis is an error,
+and not a command to stand still.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from acsard.core.messages.topics import Direction
 from acsard.core.motion.modes import Mode
 from acsard.core.values import NS_PER_S, ROLES, EventName, GyroDoes, Level, Plain
 
-# Annotations for `cdr.py`: the width of an int, and the fixed length of an array.
+# These annotations tell `cdr.py` the width of an int and the fixed length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
 Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
@@ -25,18 +26,16 @@ Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
 LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
-"""Number of a latch, exact as a JavaScript number."""
+"""Number of a latch. JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
-"""Bound of a list: more joints than any robot of ours has, so that a stranger's long list is
-refused quickly.
-"""
+"""Bound of a list, so that a very long list is refused quickly. No robot has as many joints."""
 
 
 def one_of(values: Iterable[object]) -> Meta:
-    """List the possible values in the JSON Schema.
+    """Return the annotation that lists the possible values of a field in its JSON Schema.
 
-    Decoding accepts other values of a later version.
+    Decoding accepts other values, which a later version may have.
     """
     return Meta(extra_json_schema={"enum": list(values)})
 
@@ -46,14 +45,14 @@ class Message(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Time(Message, frozen=True):
-    """Wall-clock time since 1970-01-01 UTC; `sec` is an int32 as in ROS."""
+    """Wall-clock time since 1970-01-01 UTC. `sec` is an int32 as in ROS."""
 
     sec: Seconds = 0
     nanosec: Nanoseconds = 0
 
     @classmethod
     def from_ns(cls, wall_ns: int) -> Time:
-        """Convert ns since 1970 to a `Time`, clamped to int32 seconds (1901 to 2038)."""
+        """Return ns since 1970 as a `Time`, limited to the range of int32 (1901 to 2038)."""
         sec, nanosec = divmod(wall_ns, NS_PER_S)
         return cls(max(-(2**31), min(2**31 - 1, sec)), nanosec)
 
@@ -159,7 +158,7 @@ class TFMessage(Message, frozen=True):
 
 
 class JointState(Message, frozen=True):
-    """Per joint `name`: `position` rad (continuous), `velocity` rad/s, `effort` N m (unused)."""
+    """State of the joints: `position` rad (not wrapped), `velocity` rad/s, `effort` (unused)."""
 
     header: Header = Header()
     name: Annotated[list[str], FEW] = []
@@ -184,14 +183,14 @@ class Imu(Message, frozen=True):
 
 
 class SourceState(Message, frozen=True):
-    """A source of commands: `age` in s since its last accepted command (null: none yet), and the
-    condition that it waits for, in words.
-    """
+    """A source of commands."""
 
     name: str
     priority: int
     age: float | None
+    """Seconds since the last accepted command of the source; null before the first one."""
     waits_for: str
+    """The condition under which the source will drive, in words; empty if it drives."""
 
 
 class Spread(Message, frozen=True):
@@ -204,7 +203,7 @@ class Spread(Message, frozen=True):
 
 
 class Latency(Message, frozen=True):
-    """A duration that the daemon measures of itself, such as from a command to its line."""
+    """A duration that the daemon measures, such as the time from a command to its serial line."""
 
     since_start: Spread
     last_minute: Spread
@@ -232,43 +231,56 @@ class RobotState(Message, frozen=True):
     refused: str
     """The last refused command and the reason; empty if no command was refused."""
     counters: dict[str, int]
+    """Counters since the start of the daemon, by name."""
     certificate_expiry: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS."""
     latencies: dict[str, Latency] = {}
     """Durations of the control loop by the names in `daemon/latencies.py`, up to a second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
-    """Use of the gyro in odometry, a value of `values.GyroDoes`."""
+    """Use of the gyro in odometry."""
     encoder_counts: list[int] = []
-    """Counts per wheel turn, inferred from the speeds, in the order of `wheels`; 0 if unknown."""
+    """Encoder counts per wheel turn, inferred from the speeds, in the order of `wheels`.
+
+    0 means unknown.
+    """
     wheel_fault: str = ""
-    """The wheel that is left out of the pose, or the side that slips, in words; else empty."""
+    """The wheel that the pose leaves out, or the side that slips, in words; else empty."""
     sender: str = ""
-    """Public name of the followed sender of `source`."""
+    """Public name of the sender of `source` that drives the robot; empty while none drives."""
     effective_track: str = ""
-    """Effective track divided by the wheel separation, as learned from the gyro and as
-    configured, and which of them is in use, in words; empty until one is learned.
+    """Effective track divided by the wheel separation, in words.
+
+    The text has the learned and the configured value, and says which one is in use. It is empty
+    until a value is learned from the gyro.
     """
     recording_error: str = ""
-    """Why nothing is recorded at present although recording is on, in words; else empty."""
+    """Reason why nothing is recorded at present although recording is on, in words; else empty."""
     latch: LatchNumber = 0
-    """Number of the fault, else of the stop, else of "inactive"; 0 while none is latched."""
+    """Number of the latch that keeps the robot from driving; 0 without a latch.
+
+    If several latches are set, it is that of the fault, else that of the stop.
+    """
     latch_file_error: str = ""
-    """Why a stop would not survive a restart, in words; empty if it would, and in the simulator."""
+    """Reason why a stop would not survive a restart, in words.
+
+    Empty if a stop survives, and in the simulator.
+    """
     feedback_age: float | None = None
-    """Seconds since the last good line of the microcontroller; null before the first one."""
+    """Seconds since the last valid feedback line; null before the first one."""
 
 
 class GatewayState(Message, frozen=True):
     """Status that the TLS gateway (`acsard gateway`) reports to the daemon."""
 
     opened: Annotated[int, Meta(ge=0, lt=1 << 62)]
-    """Start time of the gateway in ns of the machine's monotonic clock. Another value means that
-    the gateway has restarted.
+    """Start time of the gateway by the machine's monotonic clock, ns.
+
+    If the value changes, the gateway has restarted.
     """
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
-    """Number of checks, four a second, at which all connections were in use."""
+    """Number of checks at which all connections were in use. There are four checks a second."""
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
 
@@ -291,7 +303,7 @@ class DiagnosticStatus(Message, frozen=True):
 
 
 class DiagnosticArray(Message, frozen=True):
-    """The state of every part of the robot at one time."""
+    """The state of each part of the robot at one time."""
 
     header: Header
     status: list[DiagnosticStatus]
@@ -305,31 +317,33 @@ class LogEvent(Message, frozen=True):
     level: Annotated[str, one_of(get_args(Level))]
     text: str
     by: str
-    """Client that asked, sent or commands; empty if no client did."""
+    """Client that caused the event; empty if no client did."""
     count: int
-    """Number of occurrences since the previous event of this name. For an event that goes on
-    without a pause of a minute, it is the number since the event began.
+    """Number of occurrences since the previous event of this name.
+
+    If the event repeats without a pause of a minute, it is the number since the first occurrence.
     """
 
 
 class Events(Message, frozen=True):
     """The last events, oldest first.
 
-    An event that goes on is one row, with the time of its last repetition.
+    An event that repeats is one row, with the time of its last repetition. When it repeats, its row
+    moves to the end.
     """
 
     stamp: Time
     """Time of the last event."""
     total: int
-    """Number of events since the start, with each repetition counted. A repeated event moves to
-    the end. Of the last N rows, where N is the growth of `total`, those that a reader does not
-    have yet are new.
+    """Number of events since the start, with each repetition counted.
+
+    If `total` has grown by N since the last message, new events are among the last N rows.
     """
     events: list[LogEvent]
 
 
 class ServiceReply(Message, frozen=True):
-    """Result of a service call, with a message about the outcome or the remedy."""
+    """Result of a service call. `message` has the outcome, or the mistake and its fix."""
 
     success: bool
     message: str
@@ -344,9 +358,10 @@ class SetPose(Message, frozen=True):
 
 
 class Release(Message, frozen=True):
-    """The latch that `clear` or `activate` releases, by `RobotState.latch`; null names none."""
+    """Payload of `clear` and `activate`."""
 
     latch: LatchNumber | None = None
+    """Number of the latch to release, as in `RobotState.latch`; null names no latch."""
 
 
 class Settings(Message, frozen=True):
@@ -406,7 +421,7 @@ class WhoAmI(Message, frozen=True):
     """The caller of the query as the daemon sees it."""
 
     role: Annotated[str, one_of(ROLES)]
-    """A role that the caller has at least, by the access rules."""
+    """A role that the caller has at least, according to the access rules."""
     sender: str
     """The caller's public name and its transport, as in the log."""
 
@@ -435,4 +450,4 @@ MESSAGES: dict[str, type[Message]] = {
         WhoAmI,
     )
 }
-"""Every type that is a message of its own, by name. The key `schema/<Type>` answers for these."""
+"""The types that are messages of their own, by name. The key `schema/<Type>` answers for them."""

@@ -1,9 +1,8 @@
 """The table of all keys below `acsard/<id>/`: direction, type, rate, meaning, and the least roles.
 
-The bus declares its keys from this table, the command line and the README list it, and the query
-`topics` answers with it. `permissions.py` derives from it which role may use which key, for the
-access rules, the router of a fleet, the page and the tables of the pages. A key that is not in the
-table does not exist.
+A key that is not in the table does not exist. The bus declares its keys from this table, `acsard
+topics` and the README list it, and the query `topics` answers with it. `permissions.py` derives the
+permissions of the roles from it.
 """
 
 from __future__ import annotations
@@ -22,22 +21,27 @@ from acsard.core.values import ROOT, Role, Verb
 _PLACE = re.compile("<[A-Za-z]+>")
 
 Direction = Literal["out", "in", "query", "service"]
-"""Direction of a topic. A query only reads, and may be asked by a wildcard. A service acts, and
-runs only for its exact key.
+"""Direction of a key.
+
+- out: the daemon publishes on it.
+- in: clients put on it.
+- query: the daemon answers queries for it, also those with a wildcard.
+- service: the daemon acts on a query for it, but only on one with this exact key.
 """
 
 
 class Topic(Struct, frozen=True):
-    """One row of the table.
-
-    `key` may hold a placeholder: `<source>`, `<certificate>`, `<Type>`, `<key>` or `<role>`.
-    """
+    """One row of the table."""
 
     key: str
+    """The key below the robot's id, with placeholders such as `<source>`."""
     direction: Direction
     type: str
+    """Type of the message, in words if it is not a type of `MESSAGES`."""
     rate: str
+    """How often the daemon publishes or accepts a message, in words; "" for a query."""
     note: str
+    """Meaning of the message."""
     publish: Role | None = None
     """Least role that may put on the key. None means that no client may."""
     subscribe: Role | None = None
@@ -45,8 +49,9 @@ class Topic(Struct, frozen=True):
     query: Role | Literal["<role>"] | None = None
     """Least role that may query the key. `<role>` means the role that the key ends with."""
     local: bool = False
-    """True for a key that is only for programs on the robot's own machine, whatever their role."""
+    """True for a key that only programs on the robot's own machine may use."""
     latched: bool = False
+    """True for a key whose last message a new subscriber receives at once."""
     simulated: bool = False
     """True for a key that exists only with the built-in simulator."""
     gyro: bool = False
@@ -77,19 +82,19 @@ _SERVICES: dict[Verb, tuple[Role, str]] = {
 }
 """The least role that may call each service, and its effect. Every client may stop the robot."""
 
-
 IMU = "imu"
-"""Key of the gyro's samples. The simulator publishes its own gyro on the same key."""
-
+"""Key of the gyro's samples. The simulator publishes the samples of its gyro on the same key."""
 
 WHOAMI = "whoami/<role>"
-"""One key for each role. Zenoh's access rules let a client query only the keys of its own role
-and of lower ones, so an answer proves the role.
+"""One key for each role.
+
+Zenoh's access rules let a client query only the keys of its own role and of lower roles, so an
+answer proves the role.
 """
 
 
 def whoami_key(role: str) -> str:
-    """Return the key that answers clients with at least this role."""
+    """Return the key that answers only clients with at least this role."""
     return WHOAMI.replace("<role>", role)
 
 
@@ -102,7 +107,7 @@ JSON_TREE = "json/"
 
 
 def json_key(key: str) -> str:
-    """Return the key on which a published topic also appears in JSON."""
+    """Return the key on which the messages of a published key also appear as JSON."""
     return JSON_TREE + key
 
 
@@ -176,10 +181,10 @@ TOPICS: tuple[Topic, ...] = (
 FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
-"""The topics whose messages clients follow: the published ones and the gyro of the simulator."""
+"""The rows of messages that clients follow: the published ones and the gyro of the simulator."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The topics with a payload. Each also answers queries with its last value."""
+"""The rows of messages that the daemon publishes. It also answers queries with the last message."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
@@ -199,7 +204,7 @@ def published(config: Config) -> tuple[Topic, ...]:
 
 
 def full_key(robot_id: str, key: str) -> str:
-    """Return the complete key on the bus."""
+    """Return the key on the bus for a key below a robot's id."""
     return f"{ROOT}/{robot_id}/{key}"
 
 
@@ -208,49 +213,56 @@ COMMANDS = ("cmd", "wheel_cmd")
 
 
 def command_key(kind: str, source: str, certificate: str = "") -> str:
-    """Return the key that a source commands on.
+    """Return the key on which a sender commands as a source.
 
-    `certificate` is the common name of the sender's certificate. Over TLS each certificate has a
-    key of its own, and the access rules let no other certificate put there. Without a certificate
-    the key is that of programs on the robot's own machine.
+    Over TLS each certificate has its own key, and the access rules let no other certificate put on
+    this key.
+
+    Args:
+        kind: "cmd" or "wheel_cmd".
+        source: the name of the source.
+        certificate: the common name of the sender's certificate, or "" for a program on the robot's
+            own machine.
     """
     return f"{kind}/{source}/{certificate}" if certificate else f"{kind}/{source}"
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """Return the keys on which these sources command; `certificate` may be "*" for all of them."""
+    """Return the keys on which senders command as these sources.
+
+    `certificate` is as in `command_key`, or "*" for all certificates.
+    """
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 
 
 def unknown(key: str) -> bool:
-    """Return whether no row of the table matches the key.
+    """Return whether no row of the table matches a key below the robot's id.
 
-    Keys below `json/`, `cmd/` and `wheel_cmd/` count as known, because they depend on the
-    configuration.
+    Every key below `json/`, `cmd/` and `wheel_cmd/` counts as known.
     """
     return row_of(key) is None and not key.startswith((JSON_TREE, "cmd/", "wheel_cmd/"))
 
 
 def key_hint(key: str) -> str:
-    """Return the most similar key of the table, or the advice to list them."""
+    """Return a question with the most similar key of the table, or the advice to list the keys."""
     known = [topic.key for topic in TOPICS if "<" not in topic.key]
     return hint(key, known, "`acsard topics` lists the keys")
 
 
 def by_key(key: str) -> Topic | None:
-    """Return the row whose key is written exactly like this in the table, or None."""
+    """Return the row with exactly this key, or None. Placeholders match only themselves."""
     return next((topic for topic in TOPICS if topic.key == key), None)
 
 
 def row_of(key: str) -> Topic | None:
-    """Return the row that matches a key below the robot's id, as `cmd/app` matches
-    `cmd/<source>`.
+    """Return the row that a key below the robot's id matches, or None.
+
+    A placeholder matches any name: `cmd/app` matches the row `cmd/<source>`.
     """
-    found = (topic for topic in TOPICS if _like(topic.key).fullmatch(key))
-    return next(found, None)
+    return next((topic for topic in TOPICS if _pattern(topic.key).fullmatch(key)), None)
 
 
 @cache
-def _like(row: str) -> re.Pattern[str]:
+def _pattern(row: str) -> re.Pattern[str]:
     return re.compile(_PLACE.sub("[^/]+", re.escape(row)))

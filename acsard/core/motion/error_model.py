@@ -1,23 +1,25 @@
-"""The error model of the odometry: errors of one step, of the parameters and of a report's twist.
+"""The error model of the odometry: the noise of a step, the errors of parameters, and of the twist.
 
-The travel of a side, dl or dr, has an independent error of variance k |dl| or k |dr| (Siegwart,
-Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2.4). With the track L that
-gives
+In a step the sides of the robot roll the distances dl and dr, m. Their errors are independent and
+have the variances k |dl| and k |dr| (Siegwart, Nourbakhsh & Scaramuzza, Introduction to Autonomous
+Mobile Robots, 5.2.4), where k is in m. The step has the distance d = (dl + dr) / 2 and the turn
+dyaw = (dr - dl) / L, where L is the effective track, m. Its errors are therefore
 
-    var(d) = k (|dl| + |dr|) / 4     var(dyaw) = k (|dl| + |dr|) / L2
+    var(d) = k (|dl| + |dr|) / 4
+    var(dyaw) = k (|dl| + |dr|) / L^2
     cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
 
-The settings express more than one k can. If only the sides erred, `distance_variance_per_metre` D
-would be k / 2 and `yaw_variance_per_metre` Y would be 2 k / L2. So k = min(2 D, Y L2 / 2) is the
-noise of the sides, and the rest of D or Y is an error of the base as a whole. The skid adds
-`yaw_variance_per_radian` to every turn.
+The settings allow more than these equations. If the sides were the only cause of errors,
+`distance_variance_per_metre` D would be k / 2, and `yaw_variance_per_metre` Y would be 2 k / L^2.
+The model uses k = min(2 D, Y L^2 / 2) for the sides. The remaining part of D or Y is an error of
+the robot as a whole. In addition, skidding gives each turn the variance `yaw_variance_per_radian`.
 
-The errors of the parameters do not average out (Borenstein & Feng, Measurement and Correction of
-Systematic Odometry Errors in Mobile Robots, 1996), so they are not noise. `columns` gives the
-effect on a step of each parameter that is off by one standard deviation.
+The errors of the parameters do not average out, so they are not noise (Borenstein & Feng,
+Measurement and Correction of Systematic Odometry Errors in Mobile Robots, 1996). `columns` gives
+the effect of each parameter on a step if the parameter is off by one standard deviation.
 
-`ErrorModel` holds both for the settings and the track in use. The pose (`uncertainty.py`) and the
-twist of each report (`TwistUncertainty`) share it.
+`ErrorModel` has both for the settings and the track in use. The covariance of the pose
+(`uncertainty.py`) and that of the twist (`TwistUncertainty`) use it.
 """
 
 from __future__ import annotations
@@ -30,33 +32,39 @@ from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import Twist, TwistVariances
 
 Column = tuple[float, float, float, float]
-"""The effect of a parameter's error on a step: m per m, m per rad, rad per m and rad per rad. The
-first two add to the distance and the last two to the turn, for each m and rad of the step."""
+"""The effect of a parameter's error on a step.
+
+The numbers are the errors of the distance for each m and for each rad of the step (m/m, m/rad), and
+the errors of the turn for each m and for each rad of the step (rad/m, rad/rad).
+"""
 
 SLIPPING = 100.0
-"""Factor on every variance of the wheels while they slip."""
+"""Factor on the variances of the wheels while they slip."""
 
 DECIMAL = 0.01
-"""rad/s. A line reports a wheel's speed in two decimals."""
+"""Resolution of the wheel speeds in a feedback line, which have two decimals, rad/s."""
 
 MOST = 1e9
-"""rad2/s2. A greater variance of the turn rate carries no information."""
+"""Largest variance of the turn rate, rad2/s2. It means "unknown"."""
 
 LEAST = 1e-8
-"""m2/s2 and rad2/s2, for 0.1 mm/s. Filters treat a smaller variance as an error."""
+"""Smallest variance of a twist, m2/s2 and rad2/s2. Filters treat a smaller one as an error."""
 
 PERIOD = 0.01
-"""Period that is assumed before the first one is measured, s."""
+"""Period of the feedback lines that is assumed before one is measured, s."""
 
 SMOOTHED = 0.05
-"""Weight of a new period in the mean. Lines that are read together seem to have no period."""
+"""Weight of a new period in the mean period.
+
+A single period means little, because several lines may be read at the same time.
+"""
 
 
 class Noise:
-    """The variances of one step in base_link."""
+    """The noise of a step."""
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
-        """Compute the model; `track` is the one by which the wheels turn the robot, m."""
+        """Compute the noise for these settings and this effective track, m."""
         wheels = min(
             2 * odometry.distance_variance_per_metre,
             odometry.yaw_variance_per_metre * track * track / 2,
@@ -70,10 +78,12 @@ class Noise:
         self._to_both = wheels / (2 * track)
 
     def of(self, distance: float, turn: float, turned: float) -> tuple[float, float, float]:
-        """Return var(d) m2, var(dyaw) rad2 and cov(d, dyaw) m rad of a step, in m and rad.
+        """Return var(d), var(dyaw) and cov(d, dyaw) of a step, m2, rad2 and m rad.
 
-        `turned` rad is the part of the step that counts as turning: |turn|, or less if a part is
-        encoder noise.
+        Args:
+            distance: the distance of the step, m.
+            turn: the turn of the step, rad.
+            turned: the part of |turn| that is not encoder noise, rad.
         """
         left, right = abs(distance - self._half * turn), abs(distance + self._half * turn)
         path, sides = abs(distance), left + right
@@ -85,7 +95,7 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise and the parameters' effects on a step, for the settings and the track in use."""
+    """The noise of a step and the effects of the parameters, for the settings and track in use."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
         """Start with the configured track."""
@@ -96,14 +106,14 @@ class ErrorModel:
         self.turn_by(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use this noise from now on. The parameters and their uncertainty stay."""
+        """Use the noise of these settings from now on. The parameters' uncertainty stays."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
     def turn_by(self, learned: Track | None) -> None:
-        """Use this effective track from now on; None if none is learned at all."""
+        """Use this effective track from now on. None means that no track is ever learned."""
         self.track = self._kinematics.track * (learned or CONFIGURED).share
-        """Track by which the wheels turn the robot, m."""
+        """Effective track in use, m."""
         self.columns = columns(self._declared, self._kinematics, learned)
         self.noise = Noise(self.settings, self.track)
 
@@ -111,11 +121,17 @@ class ErrorModel:
 def columns(
     odometry: OdometryConfig, kinematics: Kinematics, learned: Track | None = None
 ) -> tuple[Column, ...]:
-    """Return the effect of one standard deviation of each uncertain parameter; omit certain ones.
+    """Return the effect of each uncertain parameter if it is off by one standard deviation.
 
-    The parameters are those of dl = r m_l phi_l, dr = r m_r phi_r and dyaw = (dr - dl) / (m_L b),
-    with the multipliers m. With a `learned` track the last column is its error, independent of the
-    configured track's. It is zero while the configured track is in use.
+    The parameters are the multipliers m_l, m_r and m_L in
+
+        dl = r m_l phi_l,   dr = r m_r phi_r,   dyaw = (dr - dl) / (m_L b)
+
+    and a scale that multiplies all lengths. r is `wheel_radius`, b is `wheel_separation`, and phi_l
+    and phi_r are the wheel angles. A parameter with a standard deviation of 0 has no column.
+
+    If `learned` is given, the last column is the error of the learned track. It is zero while the
+    configured track is in use.
     """
     used = learned or CONFIGURED
     track = kinematics.track * used.share
@@ -131,7 +147,7 @@ def columns(
         share = 0.0 if used.deviation else odometry.wheel_separation_multiplier_std / separation
         rows.append((0.0, 0.0, 0.0, -share))
     if odometry.distance_scale_std:
-        # This scales radii and track alike, so turns do not change.
+        # The scale multiplies radii and track alike, so it does not change turns.
         rows.append((odometry.distance_scale_std, 0.0, 0.0, 0.0))
     if learned is not None:
         rows.append((0.0, 0.0, 0.0, -learned.deviation))
@@ -139,22 +155,26 @@ def columns(
 
 
 class TwistUncertainty:
-    """The variances of each report's twist, by the mean period of the reports.
+    """Computes the variances of the twist that a feedback line reports.
 
-        var(v) = quantum + (s_R v)2 + var(d) / T2
-        var(w) = quantum + (s_R v)2 + (s_L w)2 + var(dyaw) / T2
+    v is the linear speed and w the turn rate of the line. Their variances are
 
-    Every wheel speed is rounded to the quantum q and so has the variance q2 / 12, which the mean of
-    a side's two wheels halves. The s are the parameters' relative standard deviations (`columns`).
-    T is the period over which a report is the mean. var(d) and var(dyaw) are the noise of one
-    period, k |v| / T in all, so integrating the reports gives the noise of the pose.
+        var(v) = a_v q^2 / 12 + var(d) / T^2 + sum of (c_1 v + c_2 w)^2
+        var(w) = a_w q^2 / 12 + var(dyaw) / T^2 + sum of (c_3 v + c_4 w)^2
 
-    If the wheels slip, all of it is multiplied by `SLIPPING`. A robot at rest is known to be at
-    rest: only a motion that the encoders could not have noticed remains.
+    - q is the quantization step of the wheel speeds. Each wheel has the variance q^2 / 12. a_v and
+      a_w follow from the kinematics, with two wheels on each side.
+    - T is the mean period of the feedback lines. A line reports the mean speed over one period.
+    - var(d) and var(dyaw) are the noise of one period. Integrating the twists gives the noise of
+      the pose.
+    - The sums are over the parameters, and c_1 to c_4 are the numbers of a column (`columns`).
+
+    If the wheels slip, the variances are multiplied by `SLIPPING`. If the robot rests, only a
+    motion that the encoders could not show remains uncertain.
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start; `counts` are the encoders' counts per wheel turn, 0 if unknown."""
+        """Start. `counts` are the encoder counts per wheel turn, 0 if unknown."""
         self._model = model
         self._count = math.tau / counts if counts else 0.0
         # The errors of the four wheels are independent, and each side is the mean of two.
@@ -163,16 +183,20 @@ class TwistUncertainty:
         self.bend()
 
     def bend(self) -> None:
-        """Use the model's track from now on."""
+        """Use the present track of the model from now on."""
         self._to_angular = self._model.radius**2 / self._model.track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
-        """Return the variances of a report that came `dt` s after the one before, 0 if unknown.
+        """Return the variances of the twist of a feedback line.
 
-        `step` is the quantization step of a wheel's speed, rad/s, if the lines show it, else 0.
+        Args:
+            twist: the twist.
+            dt: the time since the line before, s; 0 if it is unknown.
+            step: the quantization step of the wheel speeds that the lines show, rad/s; 0 if
+                unknown.
         """
         if dt > 0.0:
-            # A late line, or one behind missing lines, does not mean a longer period.
+            # A late line, or one after lost lines, does not mean a longer period.
             self._period += SMOOTHED * (min(dt, 2 * self._period) - self._period)
         model, period, linear, angular = self._model, self._period, twist.linear, twist.angular
         quantum = max(DECIMAL, self._count / period, step) ** 2
@@ -184,7 +208,7 @@ class TwistUncertainty:
         along += self._to_linear * quantum
         yaw += self._to_angular * quantum
         lateral = model.settings.twist_covariance_diagonal[1]
-        # Calls of `max` would be slow here: three of them cost half as much as the rest.
+        # Do not call `max` here: three calls take half as long as the lines above.
         return TwistVariances(
             along if along > LEAST else LEAST,
             lateral if lateral > LEAST else LEAST,
@@ -192,9 +216,9 @@ class TwistUncertainty:
         )
 
     def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
-        """Return the variances of a robot whose wheels reported no speed for `seconds`.
+        """Return the variances of a robot whose wheels have reported zero speed for `seconds` s.
 
-        `step` is the quantization step as in `of`.
+        `step` is as in `of`.
         """
         quantum = (max(self._count, step * self._period) / seconds) ** 2
         return TwistVariances(
@@ -204,7 +228,7 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return the variances for wheels that slip, which also moves the robot sideways."""
+        """Return the variances while the wheels slip. The robot then also moves sideways."""
         return TwistVariances(
             min(SLIPPING * variances.linear, MOST),
             min(SLIPPING * variances.lateral, MOST),
@@ -212,5 +236,5 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return the variances with that of a gyro's turn rate, `angular` rad2/s2."""
+        """Return the variances if a gyro measures the turn rate, with the variance `angular`."""
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -1,13 +1,14 @@
-"""Fills gaps: how far the wheels rolled since the last believed line, and how uncertain that is.
+"""Fills gaps in the feedback: the angles that the wheels rolled meanwhile, and their uncertainty.
 
-Each second and each count is used exactly once. The angles come from the encoders' own counts, else
-from whole counts that the speeds show, else from speed times time. A time that no line reported is
-filled half with the speed before it and half with the speed after it. But if the silence was so
-long that the daemon commanded rest, the earlier speed counts only until then. The motion of
-impossible lines is left to the next possible one.
+`Rolling` computes the angles since the last feedback line that was believed, by the first of these
+sources that exists: the encoder counts of the line, whole counts that its speeds show, speed times
+time. Each moment and each count is used exactly once. If no line reported a time, the first half of
+this time gets the speed before it, and the second half the speed after it. If the daemon has
+commanded rest because of the silence, the earlier speed counts only until then. The motion during
+implausible lines is computed with the next plausible one.
 
-`Rolling` computes the angles. `Gaps` estimates how far the motion in a gap deviates from a straight
-line between the two known speeds.
+`Gaps` estimates how much the true motion in a gap differs from a constant acceleration between the
+two known speeds.
 """
 
 from __future__ import annotations
@@ -21,41 +22,42 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Impossible lines over which the robot is assumed to have kept its motion: this many seconds of
-them, or this many lines at any distance."""
+"""Implausible lines over which the robot is assumed to have kept its speed.
+
+They are lines of at most `MAX_LOST_S` s, or at most `MAX_LOST` lines of any length.
+"""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 GUESS = Twist(0.125, 0.5)
-"""Assumed s_a over `SPAN` before any measurement, m/s2 and rad/s2: an eighth of the default limits,
-which random driving at these limits hardly reaches."""
+"""Standard deviation of the acceleration that is assumed at first, m/s2 and rad/s2.
+
+It is an eighth of the default limits, which random driving with these limits rarely exceeds.
+"""
 
 SPAN = 0.2
-"""Time over which the deviation is measured, s."""
+"""Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Number of spans for which the assumption counts, and number that is remembered: a minute of
-driving."""
+"""Weight of the assumption, and largest number of spans that count: a minute of driving."""
 
 GROWTH = 5
-"""Power of the time with which the variance grows: 4 from s_a2 t4 / 4, and 1 from the growth of
-s_a2."""
+"""Power of the time with which the variance in a gap grows (`Gaps`)."""
 
 
 class Rolled(Struct, frozen=True, gc=False):
-    """Wheel angles since the last line that was believed, rad in `WHEELS` order."""
+    """Wheel angles since the last line that was believed, rad, in the order of `WHEELS`."""
 
     pieces: tuple[Motors, ...]
-    """The angles in the order in which they occurred, one arc each, without empty ones."""
+    """The angles by speeds, in the order of time. Each piece is an arc, and no piece is empty."""
     turned: Motors
-    """The angles by the encoders' cumulative counts. They precede the `pieces`."""
+    """The angles by encoder counts, from before the `pieces`."""
     seen: Motors
-    """The angles in `seconds` by this line's own speeds or counts, without corrections for
-    rounding."""
+    """The angles in `seconds` by the line's own speeds or counts, with their rounding errors."""
     seconds: float
     """Duration of `seen`, s."""
     bridged: float
-    """Part of `seconds` that no line reported, s."""
+    """Part of `seconds` that no line reported, s. It was filled."""
     unknown: float
     """Further time in which the motion of the robot is unknown, s."""
     known: float
@@ -63,18 +65,18 @@ class Rolled(Struct, frozen=True, gc=False):
 
 
 class Rolling:
-    """The lines that were passed over, until `take` of the next possible one."""
+    """Computes wheel angles from plausible lines, and remembers the implausible lines before."""
 
     def __init__(self, quiet: float = math.inf) -> None:
-        """Start; after `quiet` s of silence the link is stale and the daemon commands rest."""
+        """Start. After `quiet` s without feedback the daemon commands rest."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
-        """Seconds of the lines passed over: those without counts, the gaps before them, those with
-        counts."""
+        """Durations of the implausible lines, s: of those without counts, of the gaps before these,
+        and of those with counts."""
         self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:
-        """Pass over a line. Its counts are kept, and of a line without counts only the time."""
+        """Remember an implausible line: its counts, or its duration if it has no counts."""
         self._skipped += 1
         if line.turned is None:
             self._lost += line.dt
@@ -84,16 +86,17 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
-        """Return the angles by the next line; the last believed line had the speeds `before`."""
+        """Return the angles up to a plausible line.
+
+        `before` has the wheel speeds of the last line that was believed, rad/s.
+        """
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
-            # The short way for nearly every line: the general way below gives the same for this
-            # line alone.
+            # Nearly every line takes this shortcut. The code below gives the same result for it.
             seen = times(speeds, dt)
             pieces = _some(seen if line.counted is None else line.counted)
             return Rolled(pieces, NOWHERE, seen, dt, 0.0, 0.0, dt)
-        # Lost lines without counts are filled in at about this speed, unless they last too long to
-        # guess.
+        # Fill in lost lines without counts with the speed of this line, unless they last too long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, unknown, known = self._turned, unknown + self._gap, lost + self._counted + dt
@@ -131,14 +134,19 @@ def times(a: Motors, factor: float) -> Motors:
 
 
 class Gaps:
-    """The measured s_a, and the variances of the way in gaps.
+    """Estimates the variances of the motion in gaps.
 
-    After t s without lines the deviation is s_a t2 / 2, along and turning, where s_a is the
-    standard deviation of the acceleration. The limits bound s_a, but few drives stay at them.
-    Therefore s_a is measured while lines come: it compares the way in every fifth of a second with
-    the way that the first and the last speed would have made. The robot may change its acceleration
-    at any time, so s_a2 itself grows with t. The deviation never exceeds the way at the faster
-    speed: a robot that stood before and after the gap has not moved.
+    Let s be the standard deviation of the acceleration, m/s2 or rad/s2. After t s without lines,
+    the motion deviates by s t^2 / 2 from that at the known speeds, so its variance is s^2 t^4 / 4.
+    The robot may change its acceleration at any time, so s^2 itself grows with t, and the variance
+    with t^5 (`GROWTH`).
+
+    s is measured while lines come: in each span of a fifth of a second, the motion is compared with
+    the motion at the mean of the first and the last speed. The limits of the acceleration are not
+    used, because few drives are near them.
+
+    The deviation is never larger than the motion at the faster of both speeds. A robot that stood
+    before and after a gap has therefore not moved.
     """
 
     def __init__(self) -> None:
@@ -148,7 +156,7 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Start a new span with `twist`, independent of the span before."""
+        """Start a new span with the speeds `twist`, and discard the span before."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
@@ -173,9 +181,10 @@ class Gaps:
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
     def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances, m2 along and rad2, that `seconds` more of a filled gap add.
+        """Return the variances that a filled gap adds: of the distance m2, of the turn rad2.
 
-        A gap may come in several consecutive pieces. They count as one gap.
+        The gap lasts `seconds` s. Gaps that follow each other count as one longer gap. `before` and
+        `after` are the speeds before and after this gap.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)
@@ -184,7 +193,10 @@ class Gaps:
         return max(0.0, along - given[0]), max(0.0, yaw - given[1])
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances of `seconds` between two known twists, m2 along and rad2."""
+        """Return the variances of the motion in a gap: of the distance m2, of the turn rad2.
+
+        The gap lasts `seconds` s, and `before` and `after` are the speeds before and after it.
+        """
         scale = (seconds / SPAN) ** GROWTH
         fastest = max(abs(before.linear), abs(after.linear)) * seconds
         turning = max(abs(before.angular), abs(after.angular)) * seconds

@@ -1,8 +1,11 @@
-"""Compares a gyro with the wheels: the ratio of their turns, and the gyro's delay.
+"""Compares a gyro with the wheels: finds the ratio of their turns, and the gyro's delay.
 
-Let w(t) be the turn rate by the wheels and g(t) that by the gyro. Then g(t) = a w(t - T), where a
-is the configured effective track over the true one and T is the gyro's delay. For small T that is g
-= a w - a T dw/dt. Least squares finds its coefficients from means over a tenth of a second. It
+Let w(t) be the turn rate according to the wheels and g(t) that of the gyro, rad/s. Let a be the
+ratio of the configured effective track to the true one, and T the delay of the gyro, s. Then
+
+    g(t) = a w(t - T), which is about a w(t) - a T dw/dt for a small T
+
+A least-squares fit finds the coefficients a and -a T from means over a tenth of a second. It
 forgets old data only while the robot turns.
 """
 
@@ -24,15 +27,19 @@ MEMORY = 0.995
 """Factor by which the weight of a block falls with each new one: the last 20 s of turning count."""
 
 ROUGH, FINE = 0.5, 0.1
-"""Standard deviation of the ratio before any data, and at best: it depends on floor and rate."""
+"""Standard deviation of the ratio before any data, and the smallest one that is assumed.
+
+The ratio depends on the floor and on the turn rate.
+"""
 
 STRETCH = 1.0
-"""Turn to one side over which the error of the ratio is measured, rad. It is long compared with a
-moment's lag."""
+"""Turn to one side over which the error of the ratio is measured, rad.
+
+The delay of the gyro hardly matters over such a turn.
+"""
 
 KEPT, PRIOR = 0.9, 0.1
-"""Factor by which the weight of a stretch falls with each new one; weight of the initial
-assumption."""
+"""Factor by which the weight of a stretch falls with each new one, and weight of the prior."""
 
 DELAY_S = 0.2
 """Standard deviation of the delay before any data, s."""
@@ -44,34 +51,36 @@ BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 """Standard deviation of a block's mean: in rad/s, and as a share of the rate."""
 
 LAG_S = 0.05
-"""Delay that is not a contradiction while the delay is unknown, s."""
+"""Delay of the gyro that is tolerated until the delay is known, s."""
 
 CERTAIN_S = 0.004
 """Standard deviation of the delay below which it is reported, s."""
 
 WINDOW_S = 0.2
-"""Time over which both must contradict each other, s."""
+"""Time over which wheels and gyro must differ to contradict each other, s."""
 
 LEAST_SLIP = 0.015
-"""Difference over that time that is never a contradiction, rad: encoder counts, a shake."""
+"""Difference of the turns over `WINDOW_S` that is never a contradiction, rad.
+
+Encoder counts and vibration can cause it.
+"""
 
 CERTAIN = 3.0
-"""Standard deviations beyond which the difference is a contradiction."""
+"""Number of standard deviations from which the difference is a contradiction."""
 
 
 class Match:
-    """The comparison, from each line's turn by wheels and by gyro."""
+    """Compares the turns of wheels and gyro, feedback line by feedback line."""
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
         """The prior: the ratio is roughly 1."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
-        """For this stretch: the part of the turn that the ratio did not predict, and the turn, both
-        in rad."""
+        """Turn that the ratio did not predict, and whole turn, in the present stretch, rad."""
         self._ways = PRIOR * STRETCH**2
         self._offs = ROUGH**2 * self._ways
-        """The sums of the squares of both over the stretches before."""
+        """Weighted sums of the squares of both over the stretches before."""
         self._lag = LAG_S
         self.blocks = 0.0
         """Number of blocks of turning that are remembered."""
@@ -88,9 +97,9 @@ class Match:
         return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
-        """Return by how many s the gyro is later than assumed, None while that is uncertain.
+        """Return the difference between the delay and the assumed delay, s, or None if uncertain.
 
-        After a result the new delay is assumed.
+        If it returns a number, the caller must assume the new delay from then on.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
@@ -102,13 +111,17 @@ class Match:
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """Take a line: the turns by wheels and gyro, rad, in its `dt` s.
+        """Take a feedback line.
 
-        Do not learn from a slip.
+        Args:
+            wheels: the turn according to the wheels, rad.
+            gyro: the turn according to the gyro, rad.
+            dt: the duration of the line, s.
+            slips: whether the wheels slip. Then nothing is learned from the line.
         """
         self._slide(wheels, gyro, dt)
         rate = wheels / dt
-        # Take the mean of two lines, because a count more or less is a step.
+        # Use the mean of two lines, because the rate of one line jumps with each encoder count.
         smooth, self._rate = (rate + self._rate) / 2, rate
         self._wheels += wheels
         self._gyro += gyro
@@ -120,9 +133,9 @@ class Match:
             self._began = smooth
 
     def contradiction(self, variance: float) -> bool:
-        """Return whether the gyro contradicts the wheels.
+        """Return whether the gyro contradicts the wheels over the last `WINDOW_S`.
 
-        `variance` is that of the gyro's turn over the window, rad2.
+        `variance` is the variance of the gyro's turn over this time, rad2.
         """
         wheels, gyro, time = self._sums
         if time < WINDOW_S * 0.95:
@@ -166,10 +179,10 @@ class Match:
         self._solve()
 
     def _solve(self) -> None:
-        """Solve for the coefficients of w and dw/dt."""
+        """Solve the least-squares equations for the coefficients of w and dw/dt."""
         det = self._ww * self._dd - self._wd * self._wd
         self.ratio = (self._wg * self._dd - self._dg * self._wd) / det
-        """The robot's turn by the gyro per turn by the wheels."""
+        """The ratio a: the turn of the gyro divided by the turn of the wheels."""
         self._slope = (self._dg * self._ww - self._wg * self._wd) / det
         self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
         """Standard deviation of the ratio."""

@@ -1,9 +1,15 @@
-"""Represents errors of a planar pose as motions in SE(2), in the axes of odom at the robot.
+"""Computes with errors of a planar pose as elements of the Lie algebra of SE(2).
 
-The error of an estimate is log(estimate^-1 truth): the constant twist that leads in one unit of
-time from the estimated to the true pose. In the axes of base_link a step transforms it by the
-adjoint of the step's inverse. In the axes of odom, whose direction is fixed, only the lever arm of
-the step remains of that: `seen_from`.
+SE(2) is the group of planar poses (x, y, yaw). The error of an estimate is log(estimate^-1 truth):
+the constant twist that leads from the estimated pose to the true pose in one unit of time. It is a
+vector (x, y, yaw).
+
+Errors are expressed in axes that are parallel to those of odom, with the origin at the robot. When
+the robot moves, an error in these axes changes only by the lever arm of the displacement
+(`seen_from`). In the axes of base_link it would change by the adjoint of the step.
+
+A covariance is that of such a vector. E[...] is an expected value, ' transposes, and [a, b] is the
+Lie bracket of two errors.
 """
 
 from __future__ import annotations
@@ -14,6 +20,7 @@ Vector = tuple[float, float, float]
 """x, y (m) and yaw (rad) of an error."""
 
 Planar = tuple[float, float]
+"""x and y of an error whose yaw is 0."""
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 
@@ -29,7 +36,10 @@ def bracket(a: Vector, b: Vector) -> Planar:
 
 
 def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
-    """Return the rows of `times` E[[a, e] e'], where e has covariance `p`."""
+    """Return `times` E[[a, e] e'], where the error e has the covariance `p`.
+
+    The result has the rows x and y. The row yaw is always 0.
+    """
     x, y, yaw = times * a[0], times * a[1], times * a[2]
     return (
         (y * p.xyaw - yaw * p.xy, y * p.yyaw - yaw * p.yy, y * p.yawyaw - yaw * p.yyaw),
@@ -50,9 +60,9 @@ def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
 
 
 def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
-    """Return E[[e, [e, b]] b'] plus its transpose.
+    """Return E[[e, [e, b]] b'] plus its transpose, for independent errors e and b.
 
-    The error b has the covariance `p`, and `a` is E[e yaw].
+    The error b has the covariance `p`. `a` is E[e e_yaw]: the column of yaw in the covariance of e.
     """
     x, y, yaw = a
     return PoseCovariance(
@@ -66,13 +76,16 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return the same error after the robot has moved by `dx`, `dy` m in odom."""
+    """Return an error after the robot has moved by `dx`, `dy` m in odom."""
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 
 
 def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
-    """Return the covariance `p` of an error after the robot has moved by `dx`, `dy` m."""
+    """Return the covariance of an error after the robot has moved by `dx`, `dy` m in odom.
+
+    Before the motion the covariance is `p`.
+    """
     return PoseCovariance(
         p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
         p.xy + dx * p.xyaw - dy * p.yyaw - dx * dy * p.yawyaw,
@@ -86,7 +99,16 @@ def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
 def added(
     p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
 ) -> PoseCovariance:
-    """Return `p` plus the noise of a step in direction (`c`, `s`): its variances and covariance."""
+    """Return the covariance `p` plus the noise of a step.
+
+    Args:
+        p: the covariance before.
+        along: the variance of the distance, m2.
+        yaw: the variance of the turn, rad2.
+        both: the covariance of distance and turn, m rad.
+        c: the cosine of the direction of the step in odom.
+        s: the sine of the direction of the step in odom.
+    """
     cc, cs = along * c, along * s
     return PoseCovariance(
         p.xx + cc * c,
@@ -108,9 +130,10 @@ def stepped(
     c: float,
     s: float,
 ) -> PoseCovariance:
-    """Return `p` after a move by `dx`, `dy` m, plus the noise of that step.
+    """Return the covariance after a step by `dx`, `dy` m, with the noise of the step.
 
-    This is `carried` and `added` in one function, because each line takes a step.
+    This is `added(carried(p, dx, dy), along, yaw, both, c, s)` in one function, because it runs for
+    each feedback line.
     """
     xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
     cc, cs = along * c, along * s

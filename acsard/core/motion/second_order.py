@@ -1,24 +1,34 @@
-"""Adds what the linear covariance leaves out: errors of the heading that bend the position error.
+"""Adds terms of second order to the covariance of the pose: heading errors bend the position error.
 
-A heading that errs and returns makes a straight shorter, never longer. This is an effect of second
-order, and on a straight it is the whole error along the way. After 60 m at k = 1e-5
-(`error_model.py`) the error is 17 mm to first order, and in truth 0.12 m.
+If the heading deviates and returns, the robot ends short of the estimated place, and never beyond
+it. This is an effect of second order. On a straight it causes nearly the whole error along the
+path: after 60 m with k = 1e-5 (`error_model.py`) the error is 17 mm to first order, but 0.12 m in
+truth.
 
-Each stretch of the way composes the error e so far with an error w of its own. By Baker, Campbell
-and Hausdorff
+The path is divided into stretches. Each stretch composes the error e of the path before it with its
+own error w. The formula of Baker, Campbell and Hausdorff gives the error of both, where [a, b] is
+the Lie bracket (`se2.py`):
 
     log(exp(e) exp(w)) = e + w + [e, w] / 2 + [e, [e, w]] / 12 + [w, [w, e]] / 12 + ...
 
-The error e = x + J p has a part x from noise, of covariance P, and one from the parameters' errors
-p, unit normal, with the columns J. Likewise w = n + W p, with Q and W. The third term adds to x and
-y
+Each of the two errors has a part from noise and a part from the parameters, e = x + J p and
+w = n + W p, with these symbols:
 
-    [x, n] / 2           independent of all before: its covariance is summed
-    p_i M_i              M_i = sum of ([J_i, n] + [x, W_i]) / 2, with its covariance with x
-    p_i p_k C_ik         C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, or half of that for i = k
+- x and n: the errors from noise on the path before and on the stretch, with covariances P and Q.
+- p: the errors of the parameters in standard deviations, independent and normal. p_i is one of
+  them.
+- J and W: the effects of the parameters on the path before and on the stretch, with one column for
+  each parameter. J_i and W_i are columns.
 
-which are uncorrelated with each other and with e. Of the last two terms of the series only the
-noise's part is used. Without parameters the result is equation 55 of Barfoot & Furgale, Associating
+The term [e, w] / 2 then adds these errors to x and y. Sums are over all stretches:
+
+    sum of [x, n] / 2           independent in each stretch, so the covariances are summed
+    sum over i of p_i M_i       M_i = sum of ([J_i, n] + [x, W_i]) / 2, which correlates with x
+    sum over i, k of p_i p_k C_ik
+                                C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, half of it for i = k
+
+They are uncorrelated with each other and with e. Of the last two terms of the series only the part
+from noise is used. Without parameters the result is equation 55 of Barfoot & Furgale, Associating
 Uncertainty with Three-Dimensional Poses for Use in Estimation Problems, IEEE Transactions on
 Robotics 30 (2014).
 """
@@ -39,44 +49,57 @@ from acsard.core.motion.se2 import (
 from acsard.core.values import PoseCovariance
 
 MAX_HEADING_VARIANCE = 1.0
-"""rad2. With a greater variance of the heading the series does not converge, and nothing is added
-to the linear covariance."""
+"""Largest variance of the heading for which the terms are computed, rad2.
+
+With a larger one the series does not converge, and nothing is added.
+"""
 
 NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SecondOrder:
-    """The second moment that noise and parameters add to x and y besides the linear part."""
+    """The terms of second order in the covariance of x and y."""
 
     def __init__(self, columns: int) -> None:
         self._noise: Vector = ORIGIN
-        """xx, xy and yy of the sum of all [x, n] / 2 and M_i."""
+        """Covariance (xx, xy, yy) of the sum of all [x, n] / 2 and M_i."""
         self._with_x: list[tuple[Vector, Vector]] = []
-        """E[M_i x'], row by row."""
+        """E[M_i x'] for each i, with the rows x and y."""
         self._bent: dict[tuple[int, int], Planar] = {}
         """C_ik."""
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
-        """m2 in the axes of odom. No step changes them, because x and y have no lever arm."""
+        """The terms, m2, in the axes of odom.
+
+        A step does not transform them, because only yaw has a lever arm.
+        """
 
     def widen(self) -> None:
-        """Add a column that has had no effect so far."""
+        """Add a parameter that has had no effect so far."""
         self._with_x.append((ORIGIN, ORIGIN))
         i = len(self._with_x) - 1
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
 
     def carry(self, dx: float, dy: float) -> None:
-        """Transform the correlation with x after a move of the robot by `dx`, `dy` m in odom."""
+        """Transform the correlations with x after the robot has moved by `dx`, `dy` m in odom."""
         self._with_x = [(seen_from(a, dx, dy), seen_from(b, dx, dy)) for a, b in self._with_x]
 
     def compose(
         self, p: PoseCovariance, q: PoseCovariance, j: list[Vector], w: list[Vector]
     ) -> PoseCovariance:
-        """Add a stretch with (`q`, `w`) to the way before it with (`p`, `j`).
+        """Add a stretch, and return the covariance to add to p + q.
 
-        All arguments are as seen from the end of the stretch, to which `carry` has moved this
-        object. Return the term to add to the linear p + q.
+        It is the contribution of the last two terms of the series.
+
+        All arguments are seen from the end of the stretch. `carry` must have moved this object
+        there.
+
+        Args:
+            p: the covariance P of the path before the stretch.
+            q: the covariance Q of the stretch.
+            j: the columns of J.
+            w: the columns of W.
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:
@@ -100,11 +123,11 @@ class SecondOrder:
     def _bend_noise(
         self, i: int, p: PoseCovariance, q: PoseCovariance, column: Vector, new: Vector
     ) -> None:
-        """Apply M_i += ([J_i, n] + [x, W_i]) / 2."""
+        """Add ([J_i, n] + [x, W_i]) / 2 to M_i. `column` is J_i, and `new` is W_i."""
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)
-        # [x, W] / 2 also correlates with the earlier M, twice: once from each side.
+        # [x, W_i] / 2 also correlates with the earlier M_i. This counts twice in the variance.
         ax, ay = bracket(new, plus(plus(x, x), by_new_x))
         bx, by = bracket(new, plus(plus(y, y), by_new_y))
         cx, cy = bracket(column, by_noise_x)
@@ -117,8 +140,8 @@ class SecondOrder:
         )
 
     def _settle(self) -> None:
-        # For unit normals E[p_i p_k p_l p_m] is 3 if all are the same one and 1 if they form two
-        # pairs.
+        # For independent unit normals, E[p_i p_k p_l p_m] is 3 if all four indices are equal, 1 if
+        # they form two pairs, and 0 otherwise.
         xx, xy, yy = self._noise
         mean_x = mean_y = 0.0
         for (i, k), (x, y) in self._bent.items():

@@ -1,19 +1,34 @@
 """Computes the covariance of the pose's error, step by step.
 
-The error is log(estimate^-1 truth) in SE(2) (`se2.py`). A step transforms it to the robot's new
-place and adds noise (`error_model.py`): P <- F P F' + G Q G'. The errors of the parameters stay the
-same all the way, so the effect of each on the pose is summed as a column, J <- F J + G_p, and
+The error is e = log(estimate^-1 truth) in SE(2) (`se2.py`), with the components x, y and yaw. It
+has two parts. Noise is independent from step to step, and its covariance is P (3x3). The error of a
+parameter, such as a wheel radius, is the same in every step, so its effects add up. The matrix J
+has a column for each parameter: the error of the pose if this parameter is off by one standard
+deviation. Each step updates both parts, and their sum is published (' transposes):
 
+    P <- F P F' + G Q G'
+    J <- F J + G_p
     P_total = P + J J' + terms of second order (`second_order.py`)
 
-In nav_msgs/Odometry the covariance is that of x and y along the axes of odom and of yaw. To first
-order the position error is that of the twist, so the same numbers are published. Turned by -yaw
-they are those of the Lie algebra in base_link. These still hold when the heading is badly known and
-an ellipse in x and y cannot be right.
+- F (3x3) transforms an error at the robot's place before the step to its place after the step
+  (`se2.seen_from`).
+- Q (2x2) is the covariance of the noise in the distance and the turn of the step
+  (`error_model.Noise`).
+- G (3x2) transforms errors of distance and turn to an error of the pose. The distance points along
+  the chord of the step.
+- G_p has a column for each parameter: the error of the pose that it causes in this step
+  (`error_model.columns`).
 
-A turn counts only as far as it exceeds encoder noise. A count more on one side and then on the
-other is not a turn, but |dyaw| per line would count it as one, 2 to 4 times the yaw's variance on a
-straight. Therefore the heading has a play of one count, and only the part beyond it counts.
+The covariance in nav_msgs/Odometry is that of x and y in the axes of odom, and of yaw. To first
+order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw it is
+the covariance of e in the axes of base_link. The latter is right even if the heading is so
+uncertain that the possible positions form an arc and not an ellipse.
+
+The noise of a turn depends on |dyaw|. On a straight drive, the encoder counts of both sides arrive
+at different times, so the heading turns back and forth by one count. The sum of |dyaw| over all
+feedback lines would count this as turning, and make the variance of yaw 2 to 4 times too large. The
+heading therefore has a dead band of one count, like the backlash of a gear: only turns beyond it
+count.
 """
 
 from __future__ import annotations
@@ -36,46 +51,50 @@ from acsard.core.motion.second_order import SecondOrder
 from acsard.core.values import PoseCovariance
 
 MAX_VARIANCE = 1e9
-"""m2 or rad2. A greater variance carries no information, and the numbers must stay finite for
-years."""
+"""Largest variance, m2 or rad2. It means "unknown", and it keeps the numbers finite for years."""
 
 COARSE_COUNTS = 400
-"""Counts per wheel turn if none are configured. Hardly any encoder has fewer."""
+"""Encoder counts per wheel turn that are assumed if none are configured. Few have fewer."""
 
 SAME_COUNT = 0.02
-"""Relative difference between two angles of a count that rounding to two decimals can cause."""
+"""Relative difference between two measured angles of a count that rounding can cause."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 GYRO_SCALE = 0.004
-"""Relative standard deviation of a gyro's scale. It makes 1.4 degrees after a turn, 29 after twenty
-to the same side, and 0 once they are turned back."""
+"""Relative standard deviation of a gyro's scale.
+
+It causes a heading error of 1.4 degrees after one turn and of 29 degrees after twenty turns to the
+same side. The error is 0 again after as many turns back.
+"""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
 STRETCH = 0.2
-"""Way of the wheels between two updates of the second-order terms, m. These change slowly."""
+"""Distance that the wheels roll between two updates of the second-order terms, m.
+
+These terms change slowly, so they need no update in each step.
+"""
 
 
 class PoseUncertainty:
     """The covariance of the pose, in plain floats because it is updated at 100 Hz."""
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start; `counts` are the encoders' counts per wheel turn, 0 if unknown."""
+        """Start at the pose 0, 0, 0. `counts` are encoder counts per wheel turn, 0 if unknown."""
         self._model = model
         self._parameters = self._effects = model.columns
         self._configured = self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
-        """Motion in odom, and way of the wheels, since the last update of the second-order terms,
-        m."""
+        """Motion in odom and distance rolled since the last update of the second-order terms, m."""
         self.set(0.0)
 
     def bend(self) -> None:
-        """Use the model's columns, as many as before, and its track from now on.
+        """Use the present columns and track of the model from now on.
 
-        Their effects until now stay.
+        The number of columns must not have changed. The effects of earlier steps stay.
         """
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns
@@ -83,16 +102,17 @@ class PoseUncertainty:
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
-        """Set the angle of a count.
+        """Set the angle of one encoder count, rad.
 
-        Each side is the mean of two wheels, which may stand anywhere in it.
+        It determines the dead band and the uncertainty of the position within a count. A side is
+        the mean of two wheels, each of which may stand anywhere within its count.
         """
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: float) -> None:
-        """Reset the covariance to that of the start, with the heading `yaw`."""
+        """Reset the covariance to that of the start. `yaw` is the heading of the new pose, rad."""
         xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
@@ -100,11 +120,12 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """J, column by column. Behind the parameters' columns come those that are added when they
-        first err."""
+        """The columns of J: those of the parameters, then those of the gyro's scale and of gaps.
+
+        The last two are added when they have an effect for the first time.
+        """
         self._of_gyro = self._of_gaps = -1
-        """Index of the column for turns by a gyro, and of that for motion in gaps; -1 without
-        one."""
+        """Indices of the columns for the gyro's scale and for motion in gaps; -1 without one."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
@@ -115,10 +136,10 @@ class PoseUncertainty:
         self._publish()
 
     def show_count(self, angle: float) -> None:
-        """Take the angle of an encoder count that the lines show, rad, unless one is configured.
+        """Take the angle of an encoder count that feedback lines show, rad.
 
-        From now on the pose consists of whole counts, and the start position within a count is
-        unknown too.
+        It is ignored if the counts are configured. From now on the pose consists of whole counts,
+        so the position of the start within a count is unknown as well.
         """
         if self._configured or angle <= 0.0:
             return
@@ -133,11 +154,18 @@ class PoseUncertainty:
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
         variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE,
     ) -> None:  # fmt: skip
-        """Add an arc of `distance` m through `turn` rad; in odom it leads by `dx`, `dy` m.
+        """Add a step, which is an arc.
 
-        `heading` is the direction of the chord. `variance` is that of the turn, rad2, if a gyro
-        measured it instead of the wheels. Then the wheels' parameters affect only the distance, and
-        the gyro's relative `scale` error affects the turn. `slips` means that the wheels slip.
+        Args:
+            distance: the length of the arc, m.
+            turn: the turn along the arc, rad.
+            dx: the displacement along the x axis of odom, m.
+            dy: the displacement along the y axis of odom, m.
+            heading: the direction of the chord in odom, rad.
+            variance: the variance of the turn, rad2, if a gyro measured it; None if the wheels did.
+                With a gyro, the errors of the parameters affect only the distance.
+            slips: whether the wheels slip.
+            scale: the relative standard deviation of the gyro's scale.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -161,17 +189,22 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Add variances to the last way: `along` m2 in its direction, `yaw` rad2 of heading."""
+        """Add variances to the last step: `along` m2 in its direction and `yaw` rad2 of heading."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
 
     def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
-        """Account for a gap in which the robot may have moved on by `distance` and `turn`, unseen.
+        """Account for a gap in the feedback, over which the pose did not move.
 
-        The pose stands still in a gap. Such errors all have one direction and do not average out,
-        so they form a column like a parameter. `along` m2 and `yaw` rad2 are the variances of the
-        unseen motion.
+        The motions that the pose missed in several gaps add up instead of averaging out, so they
+        have a column of J like a parameter.
+
+        Args:
+            distance: the distance that the robot probably moved in the gap, m.
+            turn: the angle that it probably turned, rad.
+            along: the variance of the distance, m2.
+            yaw: the variance of the turn, rad2.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -190,7 +223,7 @@ class PoseUncertainty:
         self._publish()
 
     def _widen(self) -> int:
-        """Add a column without effect so far; return its index."""
+        """Add a column to J that has had no effect so far, and return its index."""
         self._effects = (*self._effects, NO_EFFECT)
         self._columns = [*self._columns, ORIGIN]
         self._columns_before = [*self._columns_before, ORIGIN]
@@ -198,15 +231,16 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Give up the position.
+        """Publish that the pose is unknown, if the robot moves.
 
-        A robot that moves without a known heading or position knows neither.
+        This is called when the position or the heading is unknown. A motion makes the other one
+        unknown too.
         """
         if distance or turn:
             self.covariance = NOWHERE
 
     def _beyond_play(self, turn: float) -> float:
-        """Return the part of `turn` that is not encoder noise, rad."""
+        """Return the part of `turn` beyond the dead band of one count, rad."""
         self._turned += turn
         off = self._turned - self._middle
         if abs(off) <= self._play:
@@ -218,9 +252,11 @@ class PoseUncertainty:
     def _bend(
         self, distance: float, turn: float, dx: float, dy: float, scale: float | None
     ) -> None:
-        """Apply F J + G_p. One half of the step's own heading error acts on its lever arm.
+        """Update the columns: J <- F J + G_p.
 
-        `scale` is that of the gyro that measured the turn, None if the wheels did.
+        Half of the heading error of the step acts on the displacement of the step itself, because
+        the chord points to half of the turn. `scale` is the relative standard deviation of the
+        scale of the gyro that measured the turn, or None if the wheels measured it.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
@@ -242,7 +278,7 @@ class PoseUncertainty:
         self._dx = self._dy = self._rolled = 0.0
 
     def _end_stretch(self) -> None:
-        """Add the second-order terms of the way since the last update."""
+        """Add the second-order terms of the path since the last update."""
         dx, dy, p = self._dx, self._dy, self._p
         before = carried(self._before, dx, dy)
         columns_before = [seen_from(column, dx, dy) for column in self._columns_before]
@@ -276,7 +312,7 @@ class PoseUncertainty:
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:
-    """Return the covariance with capped variances and the same correlations."""
+    """Return the covariance with variances of at most `MAX_VARIANCE` and the same correlations."""
     x, y, yaw = (
         min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
     )

@@ -1,20 +1,29 @@
 """Compares the front and the rear wheel of one side, which roll over the same floor.
 
-If one wheel turns more than the other, the reason is slip, a faulty encoder, or one of four
-harmless effects: the position of each wheel within a count, wheels that differ (a tyre, its load),
-motors of which one follows sooner, and the two decimals of the line. The error by counts does not
-grow with the way, because the next count takes it back. The wheels' difference is a constant share,
-so it is learned. The comparison uses sums of angles, not speeds, and these sums forget:
+If one wheel turns more than the other, it slips or its encoder is faulty, unless one of these
+harmless effects explains the difference:
 
-    |off - r way| > SHARE way + COUNTS count + LEAST (+ LAG_S |speed - its mean|)
+- The position of each wheel within an encoder count is unknown. This error does not grow with the
+  angle, because the next count corrects it.
+- The wheels differ, for example in the pressure of their tyres. This difference is a constant
+  fraction of the angle, so it is learned.
+- One motor reacts later than the other.
+- The speeds in a feedback line have two decimals.
 
-where off is the sum of front - rear, way that of the side's turning and r the learned share. For
-slip the last term, for the motors' lag, is added. A wheel becomes suspect without it.
+The comparison uses sums of wheel angles over the last moments, in which older angles have less
+weight. The wheels contradict each other if
 
-Two wheels at unknown positions within a count differ by up to two counts without any slip. A slip
-of share s at w rad/s therefore cannot be certain before 2 count / (s w). With 96 counts a turn, a
-slip of a tenth at 10 rad/s takes 0.13 s, and 0.26 s if SHARE is left to tyres. With COUNTS and sums
-that forget it is found within 0.2 s above 22 rad/s, and never below 11.5 rad/s.
+    |D - r A| > SHARE A + COUNTS c + LEAST
+
+D is the sum of front minus rear, A is the sum of the side's angle, r is the learned fraction, and c
+is the angle of an encoder count, all in rad but r. They slip if |D - r A| also exceeds this limit
+by LAG_S |v - its mean|, the effect of a motor that reacts later, where v is the speed of the side.
+
+Two wheels at unknown positions within a count can differ by two counts without slip. A slip by the
+fraction s at v rad/s therefore cannot be certain before 2 c / (s v). With 96 counts per turn, a
+slip of a tenth at 10 rad/s takes 0.13 s, and 0.26 s if the fraction SHARE may come from the tyres.
+With COUNTS and sums that forget, such a slip is found within 0.2 s above 22 rad/s, and never below
+11.5 rad/s.
 """
 
 from __future__ import annotations
@@ -22,49 +31,53 @@ from __future__ import annotations
 import math
 
 MEMORY_S = 0.14
-"""Time after which a sum has fallen to 1 / e, s."""
+"""Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Share of the way that may differ: half of the slip of 10 % that must be found."""
+"""Allowed difference as a fraction of the angle: half of the slip of 10 % that must be found."""
 
 COUNTS = 1.2
-"""Counts that may differ. Two wheels anywhere within a count are seldom further apart."""
+"""Allowed difference in encoder counts. Wheels at any positions within a count rarely exceed it."""
 
 LAG_S = 0.03
-"""Lag of one motor behind the other that is allowed, s."""
+"""Allowed delay of one motor behind the other, s."""
 
 LEAST = 0.002
-"""rad that may differ besides, for the two decimals and for play."""
+"""Allowed difference in addition, rad, for the two decimals and for backlash."""
 
 UNEQUAL = 0.05
-"""Share by which two healthy wheels of a side may differ permanently."""
+"""Largest fraction by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
-"""Seconds of driving in which that share is learned: normally, and while the wheels contradict each
-other."""
+"""Time constants with which the fraction is learned, s: normally, and from a contradiction."""
 
 SLOWEST = 1.0
-"""rad/s. Slower wheels show nothing about their size."""
+"""Wheel speed below which the fraction is not learned, rad/s."""
 
 WILD = 0.1
-"""Greatest share that a contradicting line can teach. A slip soon ends, but a tyre stays."""
+"""Fraction towards which a contradiction is learned. A slip ends soon, unlike a flat tyre."""
 
 
 class Residual:
-    """The sums of one side."""
+    """The sums of one side, and the fraction that was learned."""
 
     def __init__(self) -> None:
         self.ratio = 0.0
-        """Learned share by which the front wheel turns more than the rear one."""
+        """Learned fraction by which the front wheel turns more than the rear one."""
         self.learns = True
         self.slips = False
-        """Whether a contradicting pair differs by more than a lag of one motor explains."""
+        """In a contradiction, whether the difference is too large for a motor that reacts later."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
-        """Take a line of `dt` s, with the wheels' angles in rad; return whether the wheels agree.
+        """Take a feedback line, and return whether the wheels agree.
 
-        `keep` is the factor by which the line reduces the sums, and `count` the angle of a count.
+        Args:
+            front: the angle of the front wheel, rad.
+            rear: the angle of the rear wheel, rad.
+            keep: the factor by which the line reduces the weight of the earlier angles.
+            dt: the duration of the line, s.
+            count: the angle of an encoder count, rad.
         """
         mean = (front + rear) / 2
         size = abs(mean) if front * rear >= 0.0 else (abs(front) + abs(rear)) / 2
@@ -74,7 +87,7 @@ class Residual:
         self._net = keep * (self._net + mean)
         most = SHARE * way + COUNTS * count + LEAST
         if abs(total) > most:
-            # One motor may lag the other while the speed changes.
+            # One motor may react later than the other while the speed changes.
             late = LAG_S * abs(mean / dt - self._net / MEMORY_S)
             self.slips = abs(total) > most + late
             self._learn(math.copysign(WILD, off * mean) * dt / DOUBTED_S)
@@ -84,13 +97,16 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the ratio of the angles, front to rear, or rear to front if not `front`."""
+        """Return the angle of one wheel divided by that of the other, for wheels that agree.
+
+        If `front` is true, the result is front / rear, otherwise rear / front.
+        """
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
 
     @property
     def rolling(self) -> bool:
-        """Whether the wheels roll so fast that their agreement means something."""
+        """Whether the wheels roll fast enough to show a difference."""
         return self._way > SLOWEST * MEMORY_S
 
     def _learn(self, more: float) -> None:

@@ -1,1 +1,1 @@
-"""ROS 2 over Zenoh, pure: names, tokens, attachments and parameters of its two transports."""
+"""ROS 2 over Zenoh: names, tokens, attachments and parameters of the two transports."""

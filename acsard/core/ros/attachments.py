@@ -1,6 +1,7 @@
-"""The 33-byte attachment of every rmw_zenoh_cpp sample: sequence number, time and GID.
+"""Encodes and decodes the attachment of rmw_zenoh_cpp: sequence number, time and GID in 33 bytes.
 
-Both rmw_zenoh_cpp and acsard drop a sample or a request without it.
+rmw_zenoh_cpp attaches it to every sample and request. Both rmw_zenoh_cpp and acsard drop a sample
+or a request without it.
 """
 
 from __future__ import annotations
@@ -16,22 +17,22 @@ _LAYOUT = Layout(f"<qqB{GID_BYTES}s")
 
 
 class Attachment(Struct, frozen=True):
-    """Attachment of a sample or a request.
-
-    `sequence` counts from 1 for each publisher or client, and `stamp_ns` is its wall-clock time.
-    """
+    """Attachment of a sample or a request."""
 
     sequence: int
+    """Number of the sample or request. Each publisher or client counts from 1."""
     stamp_ns: int
+    """Time of sending by the wall clock, ns since 1970."""
     gid: bytes
+    """The 16 bytes that identify the publisher or client."""
 
     def pack(self) -> bytes:
-        """Encode the attachment."""
+        """Return the attachment as bytes."""
         return _LAYOUT.pack(self.sequence, self.stamp_ns, GID_BYTES, self.gid)
 
 
 def unpack(data: bytes) -> Attachment:
-    """Decode an attachment; raise `DecodeError` if it is not valid."""
+    """Return the attachment in these bytes. Raises `DecodeError` if it is missing or not valid."""
     if not data:
         raise DecodeError(
             "no_attachment", "has no attachment, but rmw_zenoh gives every sample one"

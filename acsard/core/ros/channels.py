@@ -1,11 +1,12 @@
-"""The table of topics for a file or a live viewer: name, ROS type with definition, encoded struct.
+"""The table of the topics in an MCAP file and in a live viewer: name, ROS type, and its definition.
 
-Every topic is CDR with its message definition (MCAP's `ros2msg`). Foxglove, Lichtblick and
-PlotJuggler read any such type. `ros2 bag play` refuses a file in which any topic has another
-encoding. ROS has no message for `state`, so it has a type of its own package (`shapes.py`).
-`ros2 bag play` reports that it leaves out this topic, and the other programs show it. Names and
-types that exist in the ROS tree come from `transports.py`. The definitions are those of ROS 2
-(Jazzy and later).
+Each topic is encoded as CDR and has its message definition (`ros2msg` of MCAP), so Foxglove,
+Lichtblick and PlotJuggler can read it. No topic may have another encoding, because `ros2 bag play`
+refuses such a file.
+
+ROS has no type for `state`, so this topic has a type of the package `acsard` (`shapes.py`). `ros2
+bag play` reports that it leaves out the topic, and the other programs show it. The names and types
+of all other topics come from `transports.py`. The definitions are those of ROS 2 Jazzy and later.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from acsard.core.ros.shapes import Log, State, state
 from acsard.core.ros.transports import PUBLISHED
 
 OURS = "acsard/msg/"
-"""Prefix of the types that ROS does not know. A file defines them like any other type."""
+"""Prefix of the types that ROS does not have. A file contains their definitions as well."""
 
 Field = tuple[str, str]
 """Type and name of a field."""
@@ -70,9 +71,10 @@ acsard/msg/RobotState: \
     string refused, string gyro, string effective_track, string wheel_fault, \
     string recording_error, string certificate_expiry, acsard/msg/Counter[] counters
 """
-"""Message definitions. Each type has one line: its name, a colon, and its fields as `type name`,
-separated by commas. `[]` marks a sequence and `[n]` an array. Types without a ROS message are in
-the package `acsard` (`shapes.py`).
+"""Message definitions, one type in each line.
+
+A line has the name of the type, a colon, and the fields as `type name`, separated by commas. `[]`
+marks a sequence and `[n]` an array.
 """
 
 
@@ -99,7 +101,7 @@ def schema_text(name: str) -> str:
 
 
 def nested(name: str) -> tuple[str, ...]:
-    """Return the types that a type contains at any depth, in the order of their first use."""
+    """Return the types of the fields of a type and of their fields, in the order of first use."""
     return tuple(dict.fromkeys(_nested(name)))
 
 
@@ -116,7 +118,7 @@ def _fields(name: str) -> str:
 
 
 def _short(kind: str) -> str:
-    """Shorten `pkg/msg/Type` to `pkg/Type`, as message definitions write it."""
+    """Return `pkg/msg/Type` as `pkg/Type`, the form in message definitions."""
     return re.sub("/msg/", "/", kind)
 
 
@@ -127,16 +129,16 @@ SOURCE = "<source>"
 
 
 class Channel(Struct, frozen=True):
-    """A topic, or one topic for each source of commands."""
+    """A topic. If its name contains `<source>`, it is one topic for each source of commands."""
 
     name: str
-    """Topic name relative to the namespace; it may contain `<source>`."""
+    """Topic name relative to the namespace."""
     native: str
-    """Key in the native tree with the same content."""
+    """Native key with the same content."""
     schema_name: str
     """ROS type as `pkg/msg/Name`."""
     message: type[Struct]
-    """Struct that is encoded; for `state`, the result of `shapes.state`."""
+    """Type of the struct that is encoded. For `state` it is the type in `shapes.py`."""
     qos: Qos = Qos()
 
     def topic(self, namespace: str, source: str = "") -> str:
@@ -145,11 +147,11 @@ class Channel(Struct, frozen=True):
 
     @property
     def schema(self) -> str:
-        """The text of the message definition with all nested types."""
+        """The message definition with the definitions of all nested types."""
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
-        """Encode a message as CDR. A `RobotState` is first converted to the shape of `state`."""
+        """Return a message as CDR. A `RobotState` is first converted to the type in `shapes.py`."""
         return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
 
 
@@ -165,9 +167,12 @@ def _published() -> dict[str, Channel]:
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
 STATE = Channel("state", "state", OURS + "RobotState", State)
+
 LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
+"""The events, each as one log message."""
+
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""The command of each source, stamped with its arrival. `LOG` has one log line for each event."""
+"""The commands of each source. A stamp is the time of arrival."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
 """The channels of the messages that `Report` builds, by native key."""
@@ -175,8 +180,9 @@ BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
 CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 
 
-def said(silent: Container[str]) -> tuple[Channel, ...]:
-    """Return the channels on which a robot publishes; `silent` is the result of
-    `transports.left_out`.
+def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
+    """Return the channels on which a robot publishes.
+
+    `silent` has the native keys without content, as `transports.left_out` returns them.
     """
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

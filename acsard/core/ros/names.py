@@ -1,10 +1,10 @@
-"""ROS 2 names: types with their hashes, the keys of topics and services, and liveliness tokens.
+"""Makes the Zenoh keys and liveliness tokens of ROS 2 topics and services.
 
-zenoh-bridge-ros2dds uses the bare name as the key. rmw_zenoh_cpp adds domain, type and type hash,
-so with a wrong hash no message arrives. The list of the robot's topics is in
+zenoh-bridge-ros2dds uses the name of a topic as its key. rmw_zenoh_cpp adds the domain, the type
+and the hash of the type, so no message arrives if the hash is wrong. The robot's own topics are in
 `core/ros/transports.py`.
 
-A token says that an endpoint exists. Data flows without it, but `ros2 topic list` and
+A token announces an endpoint to ROS. Messages arrive without it, but `ros2 topic list` and
 `wait_for_service` do not find the endpoint. The formats of tokens, QoS strings and GIDs are those
 of rmw_zenoh_cpp (Jazzy 0.2.4 and later) and zenoh-plugin-ros2dds 1.10.
 """
@@ -50,8 +50,10 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
 }
 # fmt: on
-"""RIHS01 type hashes of every ROS type in use, for Jazzy, Kilted and Lyrical. They are literals
-because they are part of the wire format; a test computes them from the message definitions.
+"""RIHS01 hashes of the ROS types in use, for Jazzy, Kilted and Lyrical.
+
+They are literals because they are part of the wire format. A test computes them again from the
+message definitions.
 """
 
 
@@ -61,37 +63,39 @@ def full_name(namespace: str, name: str) -> str:
 
 
 def bridge_key(name: str) -> str:
-    """Return the key that zenoh-bridge-ros2dds uses for a fully qualified name."""
+    """Return the key of zenoh-bridge-ros2dds for a fully qualified name."""
     return name.removeprefix("/")
 
 
 def rmw_key(domain: int, name: str, type_name: str) -> str:
-    """Return the key that rmw_zenoh_cpp uses for a fully qualified name with this type."""
+    """Return the key of rmw_zenoh_cpp for a fully qualified name and its type."""
     return f"{domain}/{name.removeprefix('/')}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}"
 
 
 def dds_type(type_name: str) -> str:
-    """Return `pkg/msg/Name` in the spelling of DDS."""
+    """Return `pkg/msg/Name` as `pkg::msg::dds_::Name_`, the form in DDS."""
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
 Kind = Literal["MP", "MS", "SS"]
-"""Publisher, subscription and service server."""
+"""Kind of an endpoint in a token: publisher, subscription or service server."""
 
 RMW_DEFAULT_DEPTH = 42
 
 
 class Qos(Struct, frozen=True):
-    """QoS profile: keep the last `depth` samples; `transient` also keeps them for late subscribers.
-
-    A `best_effort` reader accepts reliable writers too. A reliable reader accepts only reliable
-    ones.
-    """
+    """QoS profile of an endpoint."""
 
     depth: int = 10
+    """Number of samples that are kept."""
     transient: bool = False
+    """Whether a subscriber that comes later receives the kept samples."""
     best_effort: bool = False
+    """False means reliable.
+
+    A best-effort subscription accepts every publisher, and a reliable one only reliable publishers.
+    """
 
 
 class Node(Struct, frozen=True):
@@ -99,17 +103,26 @@ class Node(Struct, frozen=True):
 
     domain: int
     zid: str
+    """Id of the Zenoh session."""
     namespace: str
     """Namespace without slashes at its ends; "" is the root."""
     name: str
 
     @property
     def token(self) -> str:
-        """Token of the node itself, which has the first id of the session."""
+        """Token of the node itself, which has the number 0 in its session."""
         return f"{self._head}/0/NN/%/{_mangled('/' + self.namespace)}/{self.name}"
 
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
-        """Return the token of endpoint `number` (from 1) with the fully qualified `name`."""
+        """Return the token of an endpoint.
+
+        Args:
+            number: the number of the endpoint in its session, from 1.
+            kind: the kind of the endpoint.
+            name: the fully qualified name of the topic or service.
+            type_name: the type as `pkg/msg/Name`.
+            qos: the QoS profile.
+        """
         return (
             f"{self._head}/{number}/{kind}/%/{_mangled('/' + self.namespace)}/{self.name}"
             f"/{_mangled(name)}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}/{rmw_qos(qos)}"
@@ -121,24 +134,27 @@ class Node(Struct, frozen=True):
 
 
 def rmw_qos(qos: Qos) -> str:
-    """Encode a QoS profile as rmw_zenoh_cpp does: values that equal the default are left out."""
+    """Return a QoS profile in the form of rmw_zenoh_cpp, which leaves out default values."""
     depth = "" if qos.depth == RMW_DEFAULT_DEPTH else qos.depth
     reliability = "2" if qos.best_effort else ""
     return f"{reliability}:{'1' if qos.transient else ''}:,{depth}:,:,:,,"
 
 
 def gid(token: str) -> bytes:
-    """Return the 16 bytes that identify an endpoint: XXH3-128 of its token, low half first."""
+    """Return the GID of an endpoint: the XXH3-128 hash of its token, low half first, 16 bytes."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
 def bridge_presence(zid: str) -> str:
-    """Return the token by which a ros2dds bridge announces itself."""
+    """Return the token with which a ros2dds bridge announces itself."""
     return f"@/{zid}/@ros2_lv"
 
 
 def bridge_token(zid: str, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
-    """Return the token by which a ros2dds bridge announces a fully qualified name."""
+    """Return the token with which a ros2dds bridge announces an endpoint.
+
+    The arguments are those of `Node.endpoint_token`, and the id of the Zenoh session.
+    """
     head = f"{bridge_presence(zid)}/{kind}/{_in_one_chunk(bridge_key(name))}"
     head += f"/{_in_one_chunk(type_name)}"
     if kind == "SS":

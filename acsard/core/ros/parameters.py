@@ -1,10 +1,10 @@
-"""The configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
+"""Offers the configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
 
-A parameter is named as in `acsard.toml`, with dots between table and key. Those in
-`core/config/live.py` can be set. This module only translates a request to set; the robot decides
-and applies it. The rcl_interfaces structs are here because no other module uses them. The
-descriptors (description, range, and when a key may be set) are derived from the declarations that
-the configuration is checked with, so both agree.
+A parameter has the name of its key in `acsard.toml`, with dots between table and key. The settings
+in `core/config/live.py` can be set. This module only decodes a request to set parameters; the robot
+accepts or refuses it. The description and the range of a parameter come from the types of
+`core/config/settings.py`, which the configuration is checked with. The module also has the types of
+rcl_interfaces, because no other module uses them.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """Return a parameter's descriptor; `type_of` is its ROS type, 0 for an unknown parameter."""
+    """Return the descriptor of a parameter. `type_of` is its ROS type, 0 if it does not exist."""
     if not type_of:
         return ParameterDescriptor(name, type_of)
     return _described(name, type_of)
 
 
-# The cache stays small: there are about a hundred known names.
+# The cache stays small, because only about a hundred names exist.
 @cache
 def _described(name: str, type_of: int) -> ParameterDescriptor:
     kind, row = kind_of(name), live(name)
@@ -88,14 +88,14 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 
 
 def kind_of(name: str) -> inspect.Type:
-    """Return the declared type of a key of `acsard.toml`.
+    """Return the declared type of a setting.
 
-    A source is named in place of its index. Raises `KeyError` if the key is a table.
+    The name of a source stands in place of its index. Raises `KeyError` if the name is a table's.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
     for part in parts:
-        (field,) = (one for one in fields(cls) if one.encode_name == part)
+        (field,) = (field for field in fields(cls) if field.encode_name == part)
         kind = inspect.type_info(field.type)
         if isinstance(kind, inspect.VarTupleType) and isinstance(
             kind.item_type, inspect.StructType
@@ -110,14 +110,15 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List of requested parameters. All parameters together are fewer; a longer request would take
-too long to answer in one step.
+"""List of parameters to set, longer than the list of all parameters.
+
+A longer list would take too much time of one control step.
 """
 Many = Annotated[list[T], Meta(max_length=256)]
-"""List of names, which is quicker to read and may be longer."""
+"""List of names. It may be longer, because names take less time to decode."""
 
 MAX_REQUEST_BYTES = 16384
-"""Largest size of a request: as many of the longest names as a list may hold."""
+"""Largest size of a request in bytes. A list of the longest names fits."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
@@ -128,7 +129,7 @@ Q = TypeVar("Q")
 
 
 class ParameterValue(Struct, frozen=True):
-    """Value of a parameter; `type` says which field holds it."""
+    """Value of a parameter. `type` says which field has the value."""
 
     type: Unsigned8 = NOT_SET
     bool_value: bool = False
@@ -157,13 +158,12 @@ class SetParametersResult(Struct, frozen=True):
 
 
 class ListRequest(Struct, frozen=True):
-    """Request to list parameters.
-
-    `depth` 0 means any depth; without prefixes all parameters are listed.
-    """
+    """Request to list parameters."""
 
     prefixes: Many[str]
+    """Prefixes of the names to list; without any, all names are listed."""
     depth: Unsigned64
+    """Largest number of dots in a name, after its prefix; 0 means any number."""
 
 
 class ListReply(Struct, frozen=True):
@@ -216,14 +216,20 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that the robot must carry out."""
+"""The services that set parameters, which only the robot can answer."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
-    """Return the reply to a request that is not served.
+    """Return the reply to a request that is refused.
 
-    A client without a reply would wait for ever, and a client that sets parameters expects a result
-    for each. As in rclcpp, a reply without a field for `why` is empty.
+    Without a reply, the client would wait for ever. A reply to a request that sets parameters has a
+    result with the reason for each parameter. Other replies have no field for a reason, so they are
+    empty, as in rclcpp.
+
+    Args:
+        service: the name of the service.
+        why: the reason.
+        request: the payload of the request.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -254,7 +260,7 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """Answer a CDR request with a CDR reply; raise `CdrError` if the request is not valid."""
+        """Return the reply to a request, both in CDR. Raises `CdrError` if it is not valid."""
         return self._services[service](payload)
 
     def _list(self, asked: ListRequest) -> ListReply:
@@ -282,21 +288,24 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """Return the wished values by name from a request to set.
+    """Return the values of a request to set parameters, by name.
 
-    Raises `CdrError` if it is not valid.
+    Raises `CdrError` if the request is not valid.
     """
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
-    for one in asked.parameters:
-        if one.name in wishes:
-            raise CdrError(f"{one.name} is in the request twice; nothing was set")
-        wishes[one.name] = _plain(one)
+    for parameter in asked.parameters:
+        if parameter.name in wishes:
+            raise CdrError(f"{parameter.name} is in the request twice; nothing was set")
+        wishes[parameter.name] = _plain(parameter)
     return wishes
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
-    """Return the reply to a request to set. The robot applies all parameters or none."""
+    """Return the reply to a request to set parameters, with the same result for each of them.
+
+    The robot applies all parameters or none. `payload` is that of the request.
+    """
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":
         return Cdr(SetAtomicallyReply).encode(SetAtomicallyReply(result))
@@ -311,7 +320,7 @@ def _plain(parameter: Parameter) -> Plain:
         INTEGER: value.integer_value,
         DOUBLE: value.double_value,
         STRING: value.string_value,
-        INTEGER_ARRAY: [float(one) for one in value.integer_array_value],
+        INTEGER_ARRAY: [float(item) for item in value.integer_array_value],
         DOUBLE_ARRAY: [*value.double_array_value],
         STRING_ARRAY: [*value.string_array_value],
     }

@@ -1,4 +1,4 @@
-"""The structs whose ROS shape differs from the native one: the log, and `state`.
+"""Converts the messages whose fields in ROS differ from the native ones: log messages and `state`.
 
 CDR has neither maps nor null. The counters are therefore a list, and NaN stands for null.
 """
@@ -29,7 +29,7 @@ Natural = Annotated[int, Meta(extra={"cdr": "I"})]
 
 
 class Log(Struct, frozen=True):
-    """The message rcl_interfaces/msg/Log; `name` is the name of the event."""
+    """The message rcl_interfaces/msg/Log. `name` is the name of the event."""
 
     stamp: Time
     level: Byte
@@ -41,23 +41,23 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""Start of a text that `core/motion/event_throttle.py` has combined from several events."""
+"""Pattern of the start of a text into which `event_throttle.py` has combined several events."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""
 
 
 def log(event: Event | LogEvent, stamp: Time) -> Log:
-    """Return an event of a step or of `events` as one log line."""
+    """Return an event as a log message."""
     by = f" (by {event.by})" if event.by else ""
     text = f"{event.text}{by}{how_often(event.text, event.count)}"
     return Log(stamp, LEVELS.get(event.level, 20), event.name, text)
 
 
 def how_often(text: str, count: int) -> str:
-    """Return the suffix that says how often an event happened.
+    """Return the suffix of an event's text with the number of occurrences, such as " (3 times)".
 
-    It is "" for a single event, and for a text that begins with its own number.
+    It is "" for a single occurrence, and for a text that begins with its own number.
     """
     return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
 
@@ -70,14 +70,14 @@ def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
 
 
 class Counter(Struct, frozen=True):
-    """A counter, counted since the start."""
+    """A counter since the start of the daemon."""
 
     name: str
     count: Whole
 
 
 class Source(Struct, frozen=True):
-    """A source of commands; `age` is in s, NaN if it has never sent a command."""
+    """A source of commands. `age` is in s, or NaN before the first command."""
 
     name: str
     priority: Whole
@@ -86,10 +86,7 @@ class Source(Struct, frozen=True):
 
 
 class State(Struct, frozen=True):
-    """`RobotState` without the figures of the control loop, which `diagnostics` holds.
-
-    NaN stands for null.
-    """
+    """`RobotState` as acsard/msg/RobotState, without the latencies. NaN stands for null."""
 
     header: Header
     mode: str
@@ -115,7 +112,7 @@ class State(Struct, frozen=True):
 
 
 def state(message: RobotState) -> State:
-    """Convert a `RobotState` to the shape of `acsard/msg/RobotState`."""
+    """Return a `RobotState` as acsard/msg/RobotState."""
     return State(
         header=Header(message.stamp),
         mode=message.mode,

@@ -1,7 +1,8 @@
-"""The robot's ROS names, and the native key that each of them stands for.
+"""The table of the robot's ROS topics and services, with the native key of each.
 
-One list serves both transports, and the bus declares its endpoints from it. A message on a ROS key
-means the same as on its native key, in both directions.
+A message on a ROS key means the same as on its native key, in both directions. Both transports use
+this table: the bridge zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw"). The bus declares
+its endpoints from it.
 """
 
 from __future__ import annotations
@@ -31,10 +32,12 @@ Transport = Literal["bridge", "rmw"]
 
 
 class RosName(Struct, frozen=True):
-    """A topic or service with its relative `name`, and the native key that it stands for."""
+    """A topic or service, and the native key that it stands for."""
 
     name: str
+    """Name relative to the namespace."""
     native: str
+    """Native key."""
     direction: Direction
     """Direction of the native key. In ROS a query is a service too."""
     type: str
@@ -42,23 +45,26 @@ class RosName(Struct, frozen=True):
 
 
 class Endpoint(Struct, frozen=True):
-    """A key to declare on the bus."""
+    """A ROS key to declare on the bus."""
 
     transport: Transport
     native: str
+    """Native key that the ROS key stands for."""
     direction: Direction
     key: str
     token: str
-    """Liveliness token, or "" if it has none. On rmw, the GID is derived from it."""
+    """Liveliness token, or "" if the endpoint is not announced. The GID is derived from it."""
     latched: bool
+    """True if a new subscriber receives the last message at once."""
     type: str
-    """ROS type that the key names. A bridge's key that accepts two types has the first of them."""
+    """ROS type of the messages. A key of the bridge with two types has the first of them."""
 
     @property
     def encoding(self) -> str:
-        """Encoding to assume for an incoming sample, because the samples themselves name none.
+        """Zenoh Encoding to assume for an incoming sample, because samples of ROS have none.
 
-        On a bridge's key only the length tells a Twist from a TwistStamped.
+        A key of the bridge does not name the type: the length of a sample shows whether it is a
+        Twist or a TwistStamped.
         """
         cdr = encoding_name("cdr")
         return f"{cdr};{self.type}" if self.transport == "rmw" else cdr
@@ -80,7 +86,7 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Prefix of the parameter services in place of a native key; the native tree has `config`."""
+"""Prefix of the parameter services, which have no native key. The native tree has `config`."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -97,11 +103,14 @@ SOURCES = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2
 """The command source of each topic that commands the robot."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
-"""Subscription to a gyro; its QoS accepts drivers that publish with SensorDataQoS or better."""
+"""Subscription to a gyro. It is best effort, so it also accepts drivers with SensorDataQoS."""
 
 
 def left_out(config: Config) -> frozenset[str]:
-    """Return the native keys without content, so that ROS tools do not show them as topics."""
+    """Return the native keys on which this daemon neither publishes nor listens.
+
+    ROS tools must not show them as topics.
+    """
     silent = set() if config.odometry.publish_tf else {"tf"}
     # The simulated robot has a gyro of its own.
     if not config.odometry.gyro or config.mcu.simulated:
@@ -112,9 +121,10 @@ def left_out(config: Config) -> frozenset[str]:
 
 
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
-    """Return all topics and services.
+    """Return the topics and services of a robot.
 
-    A twist topic that accepts both types appears once for each type.
+    A topic that accepts both types of twists is in the result twice, once for each type. `silent`
+    has the native keys to leave out, as `left_out` returns them.
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
@@ -143,12 +153,18 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
 
 
 def in_ros_words(text: str, ros: RosConfig) -> str:
-    """Replace the services in a text by their ROS names: srv/clear by /acsard/clear."""
+    """Return a text with the ROS names of services: srv/clear becomes /acsard/clear."""
     return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
-    """Return the keys of every enabled transport, for a session with this Zenoh id."""
+    """Return the ROS keys of the transports that are switched on.
+
+    Args:
+        ros: the configuration.
+        zid: the id of the Zenoh session.
+        silent: the native keys to leave out, as `left_out` returns them.
+    """
     names = ros_names(ros, silent)
     found: list[Endpoint] = []
     if ros.bridge:
@@ -159,7 +175,7 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
 
 
 def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
-    """Return the tokens besides those of the endpoints, which announce the node or the bridge."""
+    """Return the tokens that announce the node and the bridge. `zid` is the id of the session."""
     tokens = []
     if ros.bridge and ros.announce:
         tokens.append(bridge_presence(zid))
@@ -174,15 +190,15 @@ def command_keys(ros: RosConfig) -> tuple[str, ...]:
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:
-    """Return tokens that say which ROS names a daemon obeys.
+    """Return the tokens that claim the ROS names on which this daemon takes commands.
 
-    Two daemons with a common token would both be driven by one `cmd_vel`. The tokens are in
-    acsard's own tree, because other nodes may have the same names, and not every daemon announces
-    itself to ROS.
+    Two daemons with a common token would both obey the same `cmd_vel`, so the second one does not
+    start. The tokens are in acsard's own tree, because not every daemon announces itself to ROS,
+    and because other ROS nodes may have the same names.
     """
     name = full_name(ros.namespace, "cmd_vel")
-    ways = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
-    return tuple(f"{ROOT}/@ros/{way}{name}" for way, on in ways if on)
+    trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
+    return tuple(f"{ROOT}/@ros/{tree}{name}" for tree, on in trees if on)
 
 
 def _node(ros: RosConfig, zid: str) -> Node:
@@ -190,9 +206,9 @@ def _node(ros: RosConfig, zid: str) -> Node:
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
-    """Yield one endpoint per name.
+    """Yield one endpoint for each name.
 
-    A topic with two types is not announced, as a DDS reader has one type.
+    A topic with two types is not announced, because a DDS reader has only one type.
     """
     for row in names:
         twins = [other for other in names if other.name == row.name]

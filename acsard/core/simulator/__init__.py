@@ -1,1 +1,1 @@
-"""Pure package that simulates the robot: a vehicle and the microcontroller that drives it."""
+"""Simulates the robot: the vehicle, and the microcontroller that drives it."""

@@ -9,15 +9,15 @@ from __future__ import annotations
 BITS = 10
 
 
-def garbled(data: bytes, sent: int, heard: int) -> bytes:
-    """Return the bytes that a receiver at `heard` baud gets from `data` sent at `sent` baud.
+def garbled(data: bytes, sent: int, received: int) -> bytes:
+    """Return the bytes that a receiver reads from `data`. Both rates are in baud.
 
-    A byte with a wrong stop bit is read as zero, as the kernel delivers it.
+    A byte with a wrong stop bit is read as zero, because the kernel delivers it like that.
     """
-    if sent == heard or not data:
+    if sent == received or not data:
         return data
     levels = [bit for byte in data for bit in (0, *(byte >> n & 1 for n in range(8)), 1)]
-    step = sent / heard
+    step = sent / received
     got, at, end = bytearray(), 0.0, len(levels)
 
     def level(when: float) -> int:
@@ -25,7 +25,7 @@ def garbled(data: bytes, sent: int, heard: int) -> bytes:
 
     while at < end:
         if level(at):
-            at = int(at) + 1.0  # the line is idle: skip to the next bit
+            at = int(at) + 1.0  # the wire is idle: skip to the next bit
             continue
         bits = [level(at + (n + 0.5) * step) for n in range(BITS)]
         if bits[0]:
@@ -35,5 +35,5 @@ def garbled(data: bytes, sent: int, heard: int) -> bytes:
         got.append(byte if bits[9] else 0)
         at += (BITS - 0.5) * step
         while at < end and not level(at):
-            at = int(at) + 1.0  # a break: the next start bit cannot come before it ends
+            at = int(at) + 1.0  # a break: the next start bit comes after its end at the earliest
     return bytes(got)

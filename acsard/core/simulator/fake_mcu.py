@@ -1,12 +1,12 @@
-"""Simulates the board's side of the serial protocol, byte for byte and in time.
+"""Simulates the board: its side of the serial protocol, byte by byte, with the times of the bytes.
 
-Bytes and the time come in, bytes go out. By default the simulated board keeps the contract: it
-boots stopped, obeys only whole valid lines, stops the motors after 300 ms without a valid line, and
-answers a checked line with a checked one. It shares no parser with the host, so an error in one is
-not hidden by the other. Its faults are in `faults.py`, each as a `with` block. Those of `[sim]
-faults` stay on:
+Without faults the simulated board does what the daemon expects of a board. It boots with stopped
+motors, obeys only complete valid lines, stops the motors after 300 ms without a valid line, and
+answers a checked line with a checked one. It shares no parser with the host, so that an error in
+one parser is not hidden by the same error in the other.
 
-    with mcu.mute(): ...
+The faults are `with` blocks, such as `with mcu.mute():` (`faults.py`). The faults in `[sim] faults`
+stay on.
 """
 
 from __future__ import annotations
@@ -30,22 +30,23 @@ from acsard.core.values import NS_PER_S
 MS = 1_000_000
 
 RESET_NS = 2 * NS_PER_S
-"""Time for which a board with a bootloader ignores its input after a reset."""
+"""Time for which a board with a bootloader ignores its input after a reset, ns."""
 
 SHORTEST_WINDOW_NS = 4 * MS
-"""Shortest time over which speeds are computed from counts. Before it ends the last speeds are
-repeated."""
+"""Shortest time over which the board computes speeds from encoder counts, ns.
+
+A reply within this time repeats the last speeds.
+"""
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Times from the end of a line to the start of its answer, used in turn: 1 to 5 ms, without
-randomness."""
+"""Times from the end of a line to the start of its answer, ms. The board uses them in turn."""
 
 
 class FakeMcu(Faults):
     """The simulated board.
 
-    The caller passes bytes to `receive`, asks `next_ns` for the next event and collects bytes with
-    `advance`.
+    The caller passes the bytes of the host to `receive`, waits until the time that `next_ns`
+    returns, and gets the bytes of the board from `advance`.
     """
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
@@ -55,7 +56,7 @@ class FakeMcu(Faults):
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns
-        """Monotonic times of the last `advance`, and until which the vehicle has moved."""
+        """Monotonic time of the last `advance`, and time up to which the vehicle has moved."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -66,15 +67,14 @@ class FakeMcu(Faults):
         self._on_ns = self._boot_until_ns
         self._angles: list[float] = []
         self._seen: list[int] = []
-        """The counts that the encoders showed last."""
+        """The last counts of the encoders."""
         self._window = (now_ns, self._encoders())
         self._measured = [0.0] * 4
         self._moved = [0] * 4
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last lines received, valid or not, with the time at which each was complete, in
-        order."""
+        """The last lines that the board received, valid or not, each with the time of its end."""
         self.valid_lines = 0
         self._watchdog_trips = 0
         if config.sim.boot_time:
@@ -85,7 +85,7 @@ class FakeMcu(Faults):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The robot at the last `advance`. It moves only when its state is needed."""
+        """The robot at the time of the last `advance`. It is computed only when it is needed."""
         self._catch_up()
         return self._vehicle
 
@@ -98,7 +98,7 @@ class FakeMcu(Faults):
     # Time.
 
     def receive(self, now_ns: int, data: bytes) -> None:
-        """Take bytes that the host wrote. They arrive at the pace of the wire."""
+        """Take bytes that the host wrote. They arrive at the board at the rate of the wire."""
         start, taken = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
@@ -115,10 +115,7 @@ class FakeMcu(Faults):
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`.
-
-        Return the bytes that have arrived at the host meanwhile.
-        """
+        """Let time pass up to `now_ns`, and return the bytes that arrived at the host meanwhile."""
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
@@ -143,9 +140,9 @@ class FakeMcu(Faults):
         return out
 
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
-        """Power on again.
+        """Reset the board.
 
-        The board is stopped, ignores its input while the bootloader runs, and sends noise first.
+        Its motors stop, it ignores its input for `deaf_ns`, and it sends noise meanwhile.
         """
         self._now_ns = now_ns
         self._events.clear()
@@ -164,7 +161,7 @@ class FakeMcu(Faults):
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _catch_up(self) -> None:
-        """Move the vehicle up to now. The watchdog trips at its own time on the way."""
+        """Move the vehicle up to now. If the watchdog trips meanwhile, the motors stop then."""
         vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
         deadline = self._fed_ns + self.watchdog_ns
         if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
@@ -190,7 +187,7 @@ class FakeMcu(Faults):
                 self._catch_up()
                 self._fed_ns = now_ns
             return
-        # Until now the vehicle has obeyed the line before.
+        # `vehicle` moves the robot up to now first, with the set points of the last command.
         set_points = self.vehicle.set_points
         for motor, value in command.values.items():
             wheel, forward = self._wiring[self.drivers[motor]]
@@ -226,7 +223,7 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the bytes that the USB adapter passes to the host now, and keep the rest."""
+        """Return the bytes that the USB adapter passes to the host now. It keeps the others."""
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
@@ -242,7 +239,7 @@ class FakeMcu(Faults):
         return waited[:full]
 
     def _encoders(self) -> list[int]:
-        """Return the counts of the motors a to d."""
+        """Return the encoder counts of the motors a to d."""
         angles = self.vehicle.angles
         if angles != self._angles:
             floor, tau, per_turn = math.floor, math.tau, self._counts
@@ -251,7 +248,7 @@ class FakeMcu(Faults):
         return self._seen
 
     def _speeds(self, now_ns: int) -> list[float]:
-        """Return the speeds by the encoders: whole counts over the time since the last reading."""
+        """Return the speeds of the motors a to d: encoder counts divided by the time they took."""
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -259,7 +256,7 @@ class FakeMcu(Faults):
         if now_ns - since >= SHORTEST_WINDOW_NS:
             counts = self._encoders()
             if counts == before and self.frozen is None:
-                # No motor has turned by a count, so no gain and no swapped wire can show.
+                # No motor has turned by a count, so faults of gains and swapped wires show nothing.
                 self._moved, self._measured = [0] * 4, [0.0] * 4
                 self._window = (now_ns, counts)
                 return [0.0] * 4
@@ -270,10 +267,10 @@ class FakeMcu(Faults):
             if self.frozen is not None:
                 moved[self.frozen] = self._moved[self.frozen]
             self._moved = moved
-            said = [count * scale for count in moved]
+            measured = [count * scale for count in moved]
             if self.frozen is not None:
-                said[self.frozen] = self._measured[self.frozen]
-            self._measured = said
+                measured[self.frozen] = self._measured[self.frozen]
+            self._measured = measured
             rows = zip(self._counted, moved, gains, strict=True)
             self._counted = [total + count * gain for total, count, gain in rows]
             self._window = (now_ns, counts)
@@ -281,17 +278,17 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
-        """Return the ms from power-on to the last encoder reading, and its counts."""
+        """Return the ms from power-on to the last reading of the encoders, and their counts."""
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
-    # The fault that needs a clock of its own.
+    # This fault is here because it needs the events of the board.
 
     @contextmanager
     def free_running(self, period_s: float = 0.1) -> Iterator[None]:
-        """Report by its own clock instead of answering: unpadded, with a trailing comma."""
+        """Report every `period_s` s instead of answering, unpadded and with a trailing comma."""
         period_ns = int(period_s * NS_PER_S)
-        # A new name, so that events of an older clock are ignored.
+        # The name of the clock is new, so that events of an older clock are ignored.
         clock = b"clock %d" % next(self._order)
         self._schedule(self._now_ns + period_ns, "report", clock)
         with self._with(
@@ -301,7 +298,10 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return the configured wheel (`values.WHEELS` order) and sign of the motors a to d."""
+    """Return the wheel that each of the motors a to d turns, and its sign.
+
+    A wheel is an index in the order of `values.WHEELS`. The sign is -1 for a reversed motor.
+    """
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

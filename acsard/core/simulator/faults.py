@@ -1,7 +1,7 @@
-"""Faults of the simulated board and its wire, each a small named `with` block.
+"""The faults of the simulated board and its wire. Each is a method that returns a `with` block.
 
-This module has the switches, and `fake_mcu.py` implements their effect. Nothing is random: a fault
-hits every n-th line.
+This module has the switches, and `fake_mcu.py` implements their effects. No fault is random: a
+fault of lines affects every n-th line.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from acsard.core.values import NS_PER_S
 Fault = AbstractContextManager[None]
 
 USB_PACKET = 62
-"""Bytes at which an FTDI adapter sends a packet without waiting for its timer."""
+"""Number of bytes at which an FTDI adapter sends a packet without waiting for its timer."""
 
 WATCHDOG_NS = 300_000_000
-"""Silence after which the board stops the motors by itself."""
+"""Silence of the host after which the board stops the motors, ns."""
 
 
 class Faults:
-    """The switches of all faults. All are off, and a `with` block turns one on for its duration."""
+    """The switches of all faults. A `with` block turns a fault on, and off at its end."""
 
     def __init__(self) -> None:
         self.muted = False
@@ -40,25 +40,25 @@ class Faults:
         self.watchdog = True
         self.watchdog_ns = WATCHDOG_NS
         self.any_feeds = False
-        """Whether invalid lines feed the watchdog too."""
+        """Whether invalid lines reset the watchdog too."""
         self.baud_rate = 115200
         self.reply_gap_ns = 0
         self.drivers = [0, 1, 2, 3]
-        """The motor that the output of each channel turns."""
+        """The motor that each channel drives."""
         self.drives = [1.0] * 4
-        """Factor from a channel's command to its motor: 1, -1 if reversed, 0 if dead."""
+        """Factor between the command of a channel and its motor: 1, -1 if reversed, 0 if dead."""
         self.push: float | None = None
-        """Speed at which a person pushes the robot, m/s, None if nobody does."""
+        """Speed at which a person pushes the robot, m/s; None if nobody pushes it."""
         self.encoders = [0, 1, 2, 3]
         """The motor whose encoder each channel reads."""
         self.encoder_signs = [1, 1, 1, 1]
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
         self.latency_ns = 0
-        """Interval between two packets of the host's USB adapter, 0 for no adapter."""
+        """Interval between two packets of the host's USB adapter, ns; 0 means no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
-        """The fault hits every n-th reply, command or line. 0 means never."""
+        """The fault affects every n-th reply, command or line. 0 means none."""
         self._passed = {"reply": 0, "command": 0, "bit": 0}
         self._clock = b""
 
@@ -72,28 +72,28 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        """Set these switches. Until now the vehicle has moved with the old values."""
+        """Set these switches, after the vehicle has moved up to now with the old values."""
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)
 
     def _catch_up(self) -> None:
-        """Move the vehicle up to now, in the subclass that has one."""
+        """Move the vehicle up to now. The subclass with the vehicle implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event of this kind; return whether it is an n-th one."""
+        """Count an event of kind `what`, and return whether its number is a multiple of `every`."""
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
 
     def _damaged(self, data: bytes) -> bytes:
-        """Return the data after the wire, which may flip one bit."""
+        """Return the data that the wire delivers. It may have one flipped bit."""
         if not data or not self._hit("bit", self.bit_error):
             return data
         place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
         return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
 
     def having(self, fault: NamedFault) -> Fault:
-        """Return the `with` block of a fault named in the configuration."""
+        """Return the `with` block of a fault from the configuration or the command line."""
         block: Fault = getattr(self, fault.name)(*fault.values)
         return block
 
@@ -102,7 +102,7 @@ class Faults:
         return self._with(muted=True)
 
     def noise(self, data: bytes = b"\x00\xff~") -> Fault:
-        """Put garbage in front of every reply."""
+        """Send other bytes in front of each reply."""
         return self._with(noise_bytes=data)
 
     def partial_line(self) -> Fault:
@@ -123,21 +123,21 @@ class Faults:
 
     @contextmanager
     def swapped_wheels(self, wheel: int, other: int) -> Iterator[None]:
-        """Connect two channels to each other's wheel, both motor and encoder."""
+        """Swap the wheels of two channels, both motor and encoder."""
         with self.swapped_motors(wheel, other), self.swapped_encoders(wheel, other):
             yield
 
     def swapped_motors(self, wheel: int, other: int) -> Fault:
-        """Connect two channels to each other's motor."""
+        """Swap the motors of two channels."""
         return self._with(drivers=_swapped(self.drivers, wheel, other))
 
     def swapped_encoders(self, wheel: int, other: int) -> Fault:
-        """Connect two channels to each other's encoder."""
+        """Swap the encoders of two channels."""
         return self._with(encoders=_swapped(self.encoders, wheel, other))
 
     @contextmanager
     def reversed_wheel(self, wheel: int) -> Iterator[None]:
-        """Mount the wheel the other way round: its motor turns backward and its encoder agrees."""
+        """Reverse both the motor and the encoder of a wheel, as if it were mounted backwards."""
         with self.reversed_motor(wheel), self.reversed_encoder(wheel):
             yield
 
@@ -159,11 +159,11 @@ class Faults:
         return self._with(push=speed)
 
     def slow_reply(self, delay_s: float = 0.03) -> Fault:
-        """Take `delay_s` longer to act and answer."""
+        """Obey and answer each line `delay_s` s later."""
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
 
     def sparse_replies(self, period_s: float = 0.1) -> Fault:
-        """Answer only one line in `period_s`."""
+        """Answer at most one line in `period_s` s."""
         return self._with(reply_gap_ns=int(period_s * NS_PER_S))
 
     def wrong_baud(self, baud_rate: int) -> Fault:
@@ -183,61 +183,61 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Obey a value only if a comma follows it, as the old sketches do.
-
-        The check is ignored.
-        """
+        """Obey each value that a comma follows, as old firmware does, and ignore the checksum."""
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
-        """Ignore everything after the fourth value: obey checked lines, answer plain ones."""
+        """Ignore the text after the fourth value: obey checked lines, but answer plain ones."""
         return self._with(understand=protocol.prefix)
 
     def plain_only(self) -> Fault:
-        """Obey plain lines only and treat a checked line as invalid."""
+        """Obey only plain lines, and treat a checked line as invalid."""
         return self._with(understand=protocol.plain_only)
 
     def no_sample(self) -> Fault:
-        """Answer with the check, but never with the sample fields."""
+        """Answer with the checksum, but without the sample fields."""
         return self._with(samples=False)
 
     def no_watchdog(self) -> Fault:
-        """Keep the motors running when the host falls silent."""
+        """Keep the motors running when the host is silent."""
         return self._with(watchdog=False)
 
     def late_watchdog(self, time_s: float = 1.0) -> Fault:
-        """Stop the motors only after `time_s` of silence."""
+        """Stop the motors only after the host was silent for `time_s` s."""
         return self._with(watchdog_ns=int(time_s * NS_PER_S))
 
     def watchdog_fed_by_bad_lines(self) -> Fault:
-        """Keep the motors running for broken lines, which are not obeyed."""
+        """Keep the motors running while invalid lines arrive, although they are not obeyed."""
         return self._with(any_feeds=True)
 
     def lost_replies(self, every: int = 5) -> Fault:
-        """Lose every n-th reply on the way to the host."""
+        """Lose each n-th reply on the way to the host, where n is `every`."""
         return self._with(lose_reply=every)
 
     def lost_commands(self, every: int = 5) -> Fault:
-        """Lose every n-th line on the way to the board."""
+        """Lose each n-th line on the way to the board, where n is `every`."""
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip one bit in every n-th line of either direction, another bit each time."""
+        """Flip one bit in each n-th line of either direction, where n is `every`.
+
+        It is a different bit each time.
+        """
         return self._with(bit_error=every)
 
     def ftdi(self, latency_s: float = 0.016) -> Fault:
-        """Send through a USB adapter that passes data on at intervals, or when a packet is full.
+        """Send through a USB adapter that waits until a packet is full or its timer expires.
 
-        Bytes are late by up to `latency_s`, and several lines come at once.
+        Bytes arrive up to `latency_s` s late, and several lines arrive at once.
         """
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:
-        """Hold all bytes to the host for `length_s` s in every `every_s` s."""
+        """Hold back all bytes to the host for `length_s` s, once in `every_s` s."""
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
     def _stalled_until(self, now_ns: int) -> int:
-        """Return when the present stall ends, or `now_ns` if none is under way."""
+        """Return the end of the present stall, or `now_ns` without a stall."""
         if not self.stall_every_ns:
             return now_ns
         began_ns = now_ns // self.stall_every_ns * self.stall_every_ns

@@ -1,8 +1,8 @@
-"""The protocol from the board's side: which lines it accepts as commands, and its answers.
+"""The serial protocol as the board implements it: the lines that it obeys, and its answers.
 
-Today's firmware (`whole`) accepts only whole valid lines, plain or with a correct suffix. Older
-firmware does not know the suffix: `plain_only` rejects a line that has one, while `prefix` and
-`latched` obey its plain part. The module shares no code with the host.
+The reference firmware (`whole`) obeys only complete valid lines, plain or with a correct suffix.
+Other firmware does not know the suffix of checked lines: `plain_only` refuses a line with a suffix,
+and `prefix` and `latched` obey its plain part. The module shares no code with the host.
 """
 
 from __future__ import annotations
@@ -21,21 +21,24 @@ HEX = b"0123456789ABCDEF"
 _LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d),?")
 
 PLAIN = 31
-"""Bytes of a plain line without its comma and end."""
+"""Length of a plain line in bytes, without a trailing comma and the line end."""
 
 
 class Command(Struct, frozen=True):
-    """The speeds of a command by motor, rad/s, and the digits of a checked line's sequence."""
+    """A line that the board obeys."""
 
     values: dict[int, float]
+    """Speeds by motor (0 to 3 for a to d), rad/s."""
     sequence: bytes = b""
+    """The two digits of the sequence number of a checked line; b"" for a plain line."""
     wants_sample: bool = False
+    """Whether the line asks for the sample fields."""
 
 
 def whole(line: bytes) -> Command | None:
-    """Decode a line as today's firmware.
+    """Decode a line like the reference firmware, or return None if it is not valid.
 
-    The line must be valid, and with `#` or `*` it must have a correct suffix.
+    A line with `#` or `*` must have a correct suffix.
     """
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
@@ -54,17 +57,17 @@ def whole(line: bytes) -> Command | None:
 
 
 def plain_only(line: bytes) -> Command | None:
-    """Decode a line as firmware that accepts only the plain form: a suffix makes it invalid."""
+    """Decode a line like firmware that accepts only plain lines: a suffix makes it invalid."""
     return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
 
 
 def prefix(line: bytes) -> Command | None:
-    """Decode a line as firmware that is strict up to the fourth value and ignores the rest."""
+    """Decode a line like firmware that checks the four values and ignores the text after them."""
     return _plain(line[:PLAIN])
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line as the old sketches: a value counts if a comma ends it, in any line."""
+    """Decode a line like old firmware: each value with a comma after it counts, in any line."""
     values = {}
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]
@@ -83,7 +86,7 @@ def _plain(text: bytes) -> Command | None:
     return None if values is None else Command(dict(enumerate(values)))
 
 
-# A steady robot gets the same speeds again and again.
+# A robot at a constant speed gets the same values again and again, so cache them.
 @lru_cache(256)
 def _values(text: bytes) -> tuple[float, ...] | None:
     match = _LINE.fullmatch(text)
@@ -107,7 +110,13 @@ def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> by
 
 
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
-    """Return the suffix of a checked reply; `sample` is empty, or ms and four counts."""
+    """Return the suffix of a checked reply.
+
+    Args:
+        text: the plain part of the reply.
+        sequence: the two digits of the command's sequence number.
+        sample: the milliseconds and the four encoder counts, or nothing for a reply without them.
+    """
     body = b"#" + sequence
     if sample:
         ms, a, b, c, d = sample
@@ -118,13 +127,16 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
 
 
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
-    """Return the line with which the firmware identifies itself."""
+    """Return the line with which the firmware identifies itself.
+
+    `counts` are the encoder counts per wheel turn, and `sample` says whether it has sample fields.
+    """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"
 
 
 def _crc(data: bytes, crc: int = 0) -> int:
-    """Return the CRC-16/XMODEM: polynomial x16 + x12 + x5 + 1, initial value 0 or `crc`."""
+    """Return the CRC-16/XMODEM of `data`: polynomial x^16 + x^12 + x^5 + 1, initial value `crc`."""
     table = _CRC_OF
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ table[crc >> 8 ^ byte]

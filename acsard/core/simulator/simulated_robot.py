@@ -1,6 +1,6 @@
-"""The simulated robot with an observer of its true state, and with a gyro.
+"""Observes the true state of the simulated robot a hundred times per second, and simulates a gyro.
 
-The board does not use these observations. It sends only what its encoders show.
+The board does not use these observations. Its feedback has only the speeds of its encoders.
 """
 
 from __future__ import annotations
@@ -20,18 +20,21 @@ LOOK_NS = NS_PER_S // 100
 
 
 class Sight(Struct, frozen=True):
-    """An observation at monotonic `at_ns`: the true pose, and the turn rate by the gyro, rad/s.
-
-    The gyro reports the mean over the time between two observations, delayed by `[sim] gyro_delay`.
-    """
+    """An observation of the simulated robot."""
 
     at_ns: int
+    """Monotonic time of the observation, ns."""
     pose: Pose
+    """True pose of the robot."""
     gyro: float
+    """Turn rate that the gyro reports, rad/s.
+
+    It is the mean over the time between two observations, delayed by `[sim] gyro_delay`.
+    """
 
 
 class WatchedMcu(FakeMcu):
-    """A `FakeMcu` whose robot is observed a hundred times per second of simulated time."""
+    """A `FakeMcu` that calls `see` with an observation a hundred times per simulated second."""
 
     def __init__(self, config: Config, now_ns: int, see: Callable[[Sight], None]) -> None:
         super().__init__(config, now_ns)
@@ -48,10 +51,7 @@ class WatchedMcu(FakeMcu):
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`.
-
-        Return the bytes that have arrived at the host meanwhile.
-        """
+        """Let time pass up to `now_ns`, and return the bytes that arrived at the host meanwhile."""
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
@@ -72,9 +72,9 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """Return the angle in rad at this time.
+        """Return the angle that the robot has turned up to this time, rad.
 
-        The robot stood still before the first observation.
+        Before the first observation it is that of the first observation.
         """
         before_ns, before = self._history[0]
         if at_ns <= before_ns:

@@ -7,21 +7,27 @@ from acsard.core.messages.schema import Header, Imu, Pose, PoseStamped, Quaterni
 from acsard.core.simulator.simulated_robot import Sight
 
 FRAME = "sim"
-"""Frame of the robot's start. It is in no tree of transforms, so nobody takes the truth for
-`odom`."""
+"""Frame of the true pose: the pose at the start of the simulator.
+
+No transform connects it with `odom`, so no program takes the true pose for odometry.
+"""
 
 
 def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
-    """Return the true pose of base_link at `wall_ns`, m from its start, in the frame `sim`."""
+    """Return the true pose of base_link with the stamp `wall_ns`, in the frame `sim`."""
     pose = sight.pose
     where = Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
     return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)
 
 
 def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
-    """Return the gyro's measurement at `wall_ns`, rad/s.
+    """Return the measurement of the gyro.
 
-    `deviation` is the standard deviation of its noise, rad/s.
+    Args:
+        sight: the observation.
+        frame: the frame of the measurement.
+        deviation: the standard deviation of the gyro's noise, rad/s.
+        wall_ns: the stamp, wall-clock ns since 1970.
     """
     unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
     known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]

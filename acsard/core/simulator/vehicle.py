@@ -1,18 +1,19 @@
-"""Simulates four motors with lag on a moving base: the motion that encoders and the floor see.
+"""Simulates the robot: four motors with lag, and the motion of the base on the floor.
 
-Motors follow their set points as first-order systems. The base moves by the wheels' real speeds,
-real radii and real effective track, which `[sim]` can set apart from the configured ones. With
-`turn_slip` skidding wheels turn the base less than they roll; with `load` the motors deliver less
-than their set points. A person who pushes the robot is stronger than the motors. Wheels are in
-`values.WHEELS` order.
+A motor follows its set point as a first-order system. The base moves according to the true speeds
+of the wheels, the true radii and the true effective track. `[sim]` can make the radii and the track
+differ from the configured ones. With `turn_slip` the base turns less than the wheels roll. With
+`load` the motors are slower than their set points. A person who pushes the robot is stronger than
+the motors. Wheels are in the order of `values.WHEELS`.
 
-Let w be the turn rate in rad/s that the wheels would give at track_multiplier times the configured
-effective track L, and k = track_rate_dependence. The base turns at
+The true track depends on the turn rate. Let L be the configured effective track, m the setting
+`track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s that the
+wheels would give with the track m L. The base turns at the rate
 
     w / (1 + 2 k |w| / (1 + |w|))
 
-The effective track is therefore L x track_multiplier at creeping speed, (1 + k) times that at 1
-rad/s, and it stays bounded.
+The true track is therefore m L at very low turn rates, (1 + k) m L at 1 rad/s, and it approaches
+(1 + 2 k) m L.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from acsard.core.simulator.noise import uniform
 from acsard.core.values import Pose
 
 GRIP_S = 0.25
-"""Seconds for which the wheels keep their present grip of the floor."""
+"""Time after which the wheels get another grip on the floor, s."""
 
 HANDS_S = 0.1
-"""Seconds in which a person brings the robot to speed, as a time constant like a motor's."""
+"""Time constant with which a person who pushes the robot changes its speed, s."""
 
 
 class Vehicle:
-    """The true state of the robot: speeds in rad/s, angles in rad, pose in m and rad."""
+    """The true state of the robot: wheel speeds in rad/s, wheel angles in rad, and the pose."""
 
     def __init__(self, sim: SimConfig, drive: DriveConfig) -> None:
         self._lag = sim.motor_time_constant
@@ -49,14 +50,17 @@ class Vehicle:
         self.pose = Pose()
         """The true pose of base_link relative to its start."""
         self.turned = 0.0
-        """Angle in rad to the left since the start, with whole turns counted."""
+        """Angle that the robot has turned since the start, with whole turns, rad to the left."""
         self.turn_slip = 0.0
-        """Fraction of every turn that is lost to skidding, 0 to 1."""
+        """Fraction of each turn that is lost because wheels skid, 0 to 1."""
         self.load = 0.0
-        """Fraction by which the motors fall short of every set point, 0 to 1."""
+        """Fraction of each set point that the motors do not reach, 0 to 1."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
-        """Let `dt` s pass under the present set points, or pushed by hand at `push` m/s."""
+        """Let `dt` s pass with the present set points.
+
+        If `push` is a number, a person pushes the robot at `push` m/s instead.
+        """
         if dt <= 0.0:
             return
         if push is None and not (any(self.set_points) or any(self.speeds)):
@@ -90,7 +94,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that the floor does not take now."""
+        """Return the fraction of a turn that is not lost because wheels skid at present."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

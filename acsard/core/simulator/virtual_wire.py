@@ -1,7 +1,7 @@
-"""A serial line to the simulated board in virtual time: no clock runs and waiting costs nothing.
+"""A serial connection to the simulated board in virtual time, in which waiting costs nothing.
 
-It implements the line that `acsard mcu check` uses (`checkup.board.Wire`). A wrong baud rate
-garbles both directions.
+It implements the connection that `acsard mcu check` uses (`checkup.board.Wire`). With a wrong baud
+rate, the bytes of both directions arrive garbled.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ Piece = tuple[int, bytes]
 
 
 class VirtualWire:
-    """The host's end of the line."""
+    """The host's end of the connection."""
 
     def __init__(self, mcu: FakeMcu, now_ns: int = 0) -> None:
         self.mcu = mcu
@@ -22,11 +22,11 @@ class VirtualWire:
         self._now_ns = now_ns
 
     def open(self, baud_rate: int) -> None:
-        """Open the line, or change the baud rate of the open line."""
+        """Open the connection, or change the baud rate of the open connection."""
         self.is_open, self._baud_rate = True, baud_rate
 
     def close(self) -> None:
-        """Close the line: nothing goes out any more."""
+        """Close the connection. No bytes can be sent after that."""
         self.is_open = False
 
     def now_ns(self) -> int:
@@ -38,12 +38,12 @@ class VirtualWire:
         return 0
 
     def send(self, data: bytes) -> None:
-        """Send bytes now."""
-        assert self.is_open, "a closed line carries nothing"
+        """Send bytes to the board."""
+        assert self.is_open, "the connection is closed"
         self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.baud_rate))
 
     def listen(self, until_ns: int) -> list[Piece]:
-        """Let time pass; return the data that came, in pieces, each with its time."""
+        """Let time pass up to `until_ns`, and return the received pieces with their times, ns."""
         pieces = []
         while (due_ns := self.mcu.next_ns()) is not None and due_ns <= until_ns:
             due_ns = max(due_ns, self._now_ns)

@@ -18,7 +18,7 @@ from types import TracebackType
 import serial
 import serial_asyncio
 
-from acsard.core.link.line_gate import Gate, Offered
+from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.values import Event, Instant, Received
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.host import clock
@@ -69,7 +69,7 @@ class SerialPort:
         self._period_ns = period_ns
         self._wake, self._log = wake, log
         self._received: list[Received] = []
-        self._gate = Gate(baud_rate, stop, period_ns)
+        self._output = SerialOutput(baud_rate, stop, period_ns)
         self._transport: serial_asyncio.SerialTransport | None = None
         self._lost = asyncio.Event()
         self._fd = -1
@@ -83,7 +83,7 @@ class SerialPort:
     @property
     def sent_ns(self) -> int:
         """Monotonic time at which the kernel took the last line."""
-        return self._gate.sent_ns
+        return self._output.sent_ns
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
@@ -114,7 +114,7 @@ class SerialPort:
             return "down"
         # Ask before the time is read, because asking the driver takes time.
         waiting = unsent(self._fd)
-        data = self._gate.prepare(line, now.mono_ns, clock.mono_ns(), waiting)
+        data = self._output.prepare(line, now.mono_ns, clock.mono_ns(), waiting)
         if data is None:
             return "superseded"
         try:
@@ -125,7 +125,7 @@ class SerialPort:
             self._leave(error)
             return "down"
         # The wire is busy from the moment of the write, not from the start of the step.
-        return self._gate.took(line, data, taken, clock.mono_ns())
+        return self._output.took(line, data, taken, clock.mono_ns())
 
     # Opening and reopening.
 
@@ -181,7 +181,7 @@ class SerialPort:
             raise OSError(errno.EIO, HUNG) from None
         self._lost.clear()
         self._fd = device.fileno()
-        self._gate = Gate(baud_rate, self._stop, self._period_ns)
+        self._output = SerialOutput(baud_rate, self._stop, self._period_ns)
         self._received.clear()
         loop = asyncio.get_running_loop()
         try:

@@ -123,7 +123,7 @@ BODIES: dict[str, bytes] = {
     "a room's builtins": named("acsard.core.robot", "__builtins__"),
     "a function of a room": named("acsard.core.motion.arbiter_text", "chosen"),
     "another room": named("acsard.host.atomic_file", "replace"),
-    "a room that is not loaded": named("acsard.core.link.line_gate", "Port"),
+    "a room that is not loaded": named("acsard.core.link.serial_output", "Port"),
     "a room that is none": named("acsard.core.motion.none", "None"),
     "colours": named("\x1b[31mred", "\x1b]0;title\x07"),
     "an error": named("acsard.core.values", "AcsardError") + NOTHING + pickle.NEWOBJ,

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.incoming.commands import Arrival
-from acsard.core.link.line_gate import Offered
+from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Instant, Latch, Latches, Outputs
 from acsard.recording import recorder as module

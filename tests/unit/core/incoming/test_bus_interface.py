@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from acsard.core.incoming.bus_interface import GATEWAY_KEY, GatewayReports, RouterChanges
+from acsard.core.incoming.bus_interface import GATEWAY_KEY, GatewayFollower, RouterFollower
 from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import GatewayState
@@ -20,11 +20,11 @@ class GatewayDaemon:
     """The daemon's record of the gateway's reports."""
 
     def __init__(self) -> None:
-        self.told, self.counters = GatewayReports(), Counter[str]()
+        self.told, self.counters = GatewayFollower(), Counter[str]()
 
     def hears(self, state: GatewayState) -> int | None:
         heard = arrival(encode(state, "msgpack"), encoding_name("msgpack", "GatewayState"))
-        return self.told.take(heard, self.counters)
+        return self.told.receive(heard, self.counters)
 
 
 def test_each_opening_and_each_look_at_a_crowd_counts_once() -> None:
@@ -63,7 +63,7 @@ def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
 )
 def test_what_cannot_be_read_counts_nothing(payload: bytes) -> None:
     counters = Counter[str]()
-    assert GatewayReports().take(arrival(payload), counters) is None
+    assert GatewayFollower().receive(arrival(payload), counters) is None
     assert not counters
 
 
@@ -74,11 +74,11 @@ class Daemon:
     """The daemon's record of its routers."""
 
     def __init__(self) -> None:
-        self.told, self.counters = RouterChanges(), Counter[str]()
+        self.told, self.counters = RouterFollower(), Counter[str]()
 
     def hears(self, connected: tuple[str, ...], missing: tuple[str, ...]) -> list[Event]:
         events: list[Event] = []
-        self.told.take(RoutersStatus(connected, missing), self.counters, events)
+        self.told.receive(RoutersStatus(connected, missing), self.counters, events)
         return events
 
 
@@ -110,11 +110,11 @@ def test_of_two_routers_only_the_one_that_went_is_told() -> None:
 
 
 def test_a_peer_in_a_routers_place_is_told_once_with_what_it_means() -> None:
-    told, counters = RouterChanges(), Counter[str]()
+    told, counters = RouterFollower(), Counter[str]()
     events: list[Event] = []
-    told.take(RoutersStatus((A,)), counters, events)  # the type of this peer is not known yet
-    told.take(RoutersStatus((A,), peers=(A,)), counters, events)
-    told.take(RoutersStatus((A,), peers=(A,)), counters, events)
+    told.receive(RoutersStatus((A,)), counters, events)  # the type of this peer is not known yet
+    told.receive(RoutersStatus((A,), peers=(A,)), counters, events)
+    told.receive(RoutersStatus((A,), peers=(A,)), counters, events)
     found = [(event.name, event.level) for event in events]
     assert found == [("router_found", "info"), ("not_a_router", "warning")]
     assert events[-1].text.startswith(f"{A} is not a router")

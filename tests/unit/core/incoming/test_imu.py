@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.incoming.commands import Arrival
-from acsard.core.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, ImuSamples, reading
+from acsard.core.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, GyroFollower, reading
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.values import Event, GyroSample
@@ -60,7 +60,7 @@ def test_of_json_only_the_angular_velocity_is_required() -> None:
 @given(st.binary(max_size=400))
 def test_whatever_comes_is_a_sample_or_refused(payload: bytes) -> None:
     counters = Counter[str]()
-    sample = ImuSamples().take(arrival(payload), counters, [])
+    sample = GyroFollower().receive(arrival(payload), counters, [])
     assert counters.total() == (sample is None)
 
 
@@ -94,7 +94,7 @@ REFUSED: dict[str, Arrival] = {
 @each("reason", REFUSED)
 def test_what_is_refused_is_counted_and_told_by_its_reason(reason: str) -> None:
     counters, events = Counter[str](), list[Event]()
-    assert ImuSamples().take(REFUSED[reason], counters, events) is None
+    assert GyroFollower().receive(REFUSED[reason], counters, events) is None
     assert counters == {f"imu_{reason}": 1}
     (event,) = events
     assert (event.name, event.kind, event.level) == ("imu_refused", reason, "warning")
@@ -107,10 +107,10 @@ def test_a_negative_variance_is_none() -> None:
 
 class Daemon:
     def __init__(self) -> None:
-        self.told, self.counters, self.events = ImuSamples(), Counter[str](), list[Event]()
+        self.told, self.counters, self.events = GyroFollower(), Counter[str](), list[Event]()
 
     def hears(self, rate: float, at_ns: int, who: str) -> bool:
-        got = self.told.take(turning(rate, at_ns, who), self.counters, self.events)
+        got = self.told.receive(turning(rate, at_ns, who), self.counters, self.events)
         assert got is None or got.rate == rate
         return got is not None
 
@@ -127,33 +127,33 @@ def test_of_two_gyros_the_first_is_followed_until_it_is_silent() -> None:
 
 
 def test_the_first_sample_of_another_gyro_says_that_it_is_one() -> None:
-    told, anew = ImuSamples(), []
+    told, anew = GyroFollower(), []
     heard = [(0, "one"), (1, "one"), (FOLLOWED_NS + 1, "other"), (FOLLOWED_NS + 2, "other")]
     for at_ns, who in heard:
-        sample = told.take(turning(0.1, at_ns, who), Counter(), [])
+        sample = told.receive(turning(0.1, at_ns, who), Counter(), [])
         assert sample is not None
         anew.append(sample.anew)
     assert anew == [False, False, True, False]
 
 
 def test_who_comes_back_after_a_silence_is_no_other() -> None:
-    told = ImuSamples()
+    told = GyroFollower()
     for at_ns in (0, 10 * FOLLOWED_NS):
-        sample = told.take(turning(0.1, at_ns, "one"), Counter(), [])
+        sample = told.receive(turning(0.1, at_ns, "one"), Counter(), [])
         assert sample == GyroSample(at_ns, None, 0.1)
 
 
 def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_silent() -> None:
     counters, events = Counter[str](), list[Event]()
-    told = ImuSamples(own=True)
-    assert told.take(turning(0.2, 0, "other"), counters, events) is None
-    assert told.take(turning(0.1, 10 * FOLLOWED_NS, OWN), counters, events) is not None
-    assert told.take(turning(0.2, 20 * FOLLOWED_NS, "other"), counters, events) is None
+    told = GyroFollower(own=True)
+    assert told.receive(turning(0.2, 0, "other"), counters, events) is None
+    assert told.receive(turning(0.1, 10 * FOLLOWED_NS, OWN), counters, events) is not None
+    assert told.receive(turning(0.2, 20 * FOLLOWED_NS, "other"), counters, events) is None
     assert counters == {"imu_second_sender": 2}
     assert "simulat" in events[0].text
 
 
 def test_what_is_refused_keeps_nobody_out() -> None:
     daemon = Daemon()
-    daemon.told.take(REFUSED["out_of_range"], daemon.counters, daemon.events)
+    daemon.told.receive(REFUSED["out_of_range"], daemon.counters, daemon.events)
     assert daemon.hears(0.1, 8, "other")

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.config.settings import McuConfig
-from acsard.core.link.check import Checked, Reading
+from acsard.core.link.checksum import Checked, Reading
 from acsard.core.link.codec import FrameError
 from acsard.core.link.negotiation import (
     BLIND_PERIOD_NS,

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, JointsConfig, McuConfig, OdometryConfig
 from acsard.core.incoming.commands import Arrival, Receiver
-from acsard.core.incoming.imu import ImuSamples
+from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import interfaces, topic_table
 from acsard.core.link.link_state import TABLE as LINKS
 from acsard.core.messages.encodings import DecodeError, encode
@@ -181,7 +181,7 @@ def taken(name: str, value: object) -> bool:
         return _decodes(lambda: Receiver.request("set_pose", 1, "application/json", payload))
     arrival = Arrival(key, True, payload, "application/json", 1_000_000_000, None, "")
     if key == "imu":
-        return ImuSamples().take(arrival, {"imu_wrong_shape": 0}, []) is not None
+        return GyroFollower().receive(arrival, {"imu_wrong_shape": 0}, []) is not None
     receiver = Receiver(JointsConfig(), Kinematics(Config().drive))
     return _decodes(lambda: receiver.command(arrival))
 

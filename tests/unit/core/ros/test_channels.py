@@ -24,7 +24,7 @@ from acsard.core.ros.channels import (
     STATE,
     Channel,
     nested,
-    said,
+    published_channels,
     schema_text,
 )
 from acsard.core.ros.names import TYPE_HASHES
@@ -94,7 +94,7 @@ def test_topics_are_called_as_in_the_ros_tree() -> None:
 
 
 def test_what_a_robot_has_nothing_to_say_on_has_no_channel() -> None:
-    assert set(CHANNELS) - set(said(frozenset({"tf"}))) == {BY_KEY["tf"]}
+    assert set(CHANNELS) - set(published_channels(frozenset({"tf"}))) == {BY_KEY["tf"]}
 
 
 def test_events_and_commands_have_a_channel_beside_the_keys() -> None:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.link.check import ASK_NOTHING, ASK_SAMPLE, seal
-from acsard.core.link.line_gate import Gate
+from acsard.core.link.checksum import ASK_NOTHING, ASK_SAMPLE, seal
+from acsard.core.link.serial_output import SerialOutput
 from tests.each import each
 
 MS = 1_000_000
@@ -21,7 +21,7 @@ class Wire:
     """A send stage and a kernel that accepts part of each line."""
 
     def __init__(self, baud_rate: int = 115200, stop: bytes = STOP, period_ms: int = 10) -> None:
-        self.gate = Gate(baud_rate, stop, period_ms * MS)
+        self.gate = SerialOutput(baud_rate, stop, period_ms * MS)
         self._stop = stop
         self.out = b""
 
@@ -139,7 +139,7 @@ def test_only_the_bytes_that_were_taken_occupy_the_wire_and_count_as_sent() -> N
 def test_the_gate_never_lets_bytes_queue_on_the_wire(
     baud: int, sends: list[tuple[int, int]]
 ) -> None:
-    gate, now_ns, busy_until_ns = Gate(baud, STOP, PERIOD_NS), 0, 0
+    gate, now_ns, busy_until_ns = SerialOutput(baud, STOP, PERIOD_NS), 0, 0
     for pause_ns, takes in sends:
         now_ns += pause_ns
         data = gate.prepare(GO, now_ns, now_ns, 0)
