@@ -336,7 +336,7 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -
     ended = tool(shared, "call", "stop", "--id", "other")
     assert (ended.code, ended.out) == (69, "")
     assert "other" in ended.err
-    assert "there is acsar: --id acsar" in ended.err
+    assert "there is acsar: choose one, --id acsar" in ended.err
 
 
 @each("robot_id", ["a/b*", "", "**", "robot 1"])
