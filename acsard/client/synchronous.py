@@ -49,9 +49,6 @@ from acsard.host.errors import (
 )
 from acsard.host.own_identity import new_secret, own_name, sender_id
 
-AGAIN_S = 0.03
-"""Pause before the next try, s, if the daemon reports too many queries."""
-
 REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
@@ -337,7 +334,7 @@ class Client:
             # client since.
             if said != BUSY or name in VERBS or time.monotonic() > end_s:
                 raise ReplyError(f"{name}: {said}")
-            time.sleep(AGAIN_S)
+            time.sleep(0.03)
 
     def _first(self, name: str, payload: bytes | None) -> zenoh.Reply | None:
         try:

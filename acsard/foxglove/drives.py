@@ -33,9 +33,6 @@ TOO_SLOW = (
 )
 
 
-LOST = "the bus accepts no commands: all commands of a panel are lost until it does"
-
-
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 """Decoder for twists only. They depend on neither joints nor wheels, so the defaults are
 sufficient."""
@@ -180,4 +177,5 @@ class Drives:
         try:
             robot.send(twist.linear, twist.angular, stamp_ns=wished.stamp_ns)
         except zenoh.ZError as error:
-            self._notices.say("error", "drive", f"{LOST} ({error})")
+            words = "the bus accepts no commands: all commands of a panel are lost until it does"
+            self._notices.say("error", "drive", f"{words} ({error})")

@@ -35,14 +35,12 @@ TOGETHER_NS = 50_000
 another process gets the core between them.
 """
 
-TRIES = 5
-
 NS_PER_US = 1000
 
 
 def now() -> Instant:
     """Read both clocks as close together as possible."""
-    for _ in range(TRIES):
+    for _ in range(5):
         mono, wall = mono_ns(), time.time_ns()
         if mono_ns() - mono < TOGETHER_NS:
             break

@@ -16,7 +16,6 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 CLOCK_MONOTONIC: Final = 1
-_FLAGS: Final = os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class _Timespec(ctypes.Structure):
@@ -38,7 +37,7 @@ class TimerFd:
         self._spec = _Itimerspec()
         self._where = ctypes.byref(self._spec)
         self._settime = libc.timerfd_settime
-        self._fd = libc.timerfd_create(CLOCK_MONOTONIC, _FLAGS)
+        self._fd = libc.timerfd_create(CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")
 

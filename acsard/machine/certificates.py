@@ -141,6 +141,8 @@ def _load(directory: Path) -> Authority:
     _writable(directory)
     try:
         return maker.load(directory, _password)
+    except UsageError:  # it is a ValueError, too
+        raise
     except FileNotFoundError:
         if (directory / CA).exists():
             text = f"{directory} has no {CA_KEY}: bring the authority's key back for this command"

@@ -107,12 +107,6 @@ def check(running: Running) -> str:
     )
 
 
-APART_S = 0.4
-"""Clock difference that is reported, s.
-
-From 0.5 s on, Zenoh replaces the stamps of the clock that is ahead.
-"""
-
 GYRO_MENDS = {
     "used": "",
     "waiting for rest": "",
@@ -133,10 +127,6 @@ ANOTHER = (
     "select a daemon with another id with --id (`acsard fleet` lists the robots); or does "
     "another program use that port?"
 )
-
-ROUTER = "acsard: router"
-LOOP = "acsard: control loop"
-"""Names of rows in the daemon's diagnostics."""
 
 SIGN = "commands signed as the README describes need no common clock"
 
@@ -225,7 +215,7 @@ def late(running: Running) -> Iterator[Finding]:
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
-    told = [row.message for row in running.rows if row.name == LOOP and row.level]
+    told = [row.message for row in running.rows if row.name == "acsard: control loop" and row.level]
     if missed > 0.01 * max(1, lines):
         told = [f"missed {missed} control periods"]
     for text in told:
@@ -241,7 +231,8 @@ def clocks(running: Running) -> Iterator[Finding]:
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
-    if not running.here and abs(apart) > APART_S + running.trip_ns / 2 / NS_PER_S:
+    # From 0.5 s on, Zenoh replaces the stamps of the clock that is ahead.
+    if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
         yield Finding("clock", "warning", text, f"let NTP set both (timedatectl); {SIGN}")
@@ -267,7 +258,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
 
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
     """Yield a finding about the daemon's connection to its routers, if any are configured."""
-    row = rows.get(ROUTER)
+    row = rows.get("acsard: router")
     if row is not None:
         mend = START_ROUTER if row.level else ""
         if any(one.value == NO_ROUTER for one in row.values):

@@ -6,15 +6,6 @@ from collections.abc import Mapping
 
 from acsard.core.thinning import Curve
 
-GOOD = "lines"
-"""Name of the counter of lines that could be read."""
-
-BAD = "line_"
-"""Prefix of the counters of dropped lines."""
-
-IMPOSSIBLE = "line_implausible"
-"""Counter of lines that could be read, but whose content was impossible."""
-
 
 class SerialTotals:
     """Number of sent, accepted, dropped and unanswered lines of the collected steps."""
@@ -93,6 +84,6 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the number of accepted and of dropped lines."""
-    bad = sum(count for name, count in counters.items() if name.startswith(BAD))
-    return counters.get(GOOD, 0) - counters.get(IMPOSSIBLE, 0), bad
+    """Return the number of accepted and dropped lines. An implausible line could be read, too."""
+    bad = sum(count for name, count in counters.items() if name.startswith("line_"))
+    return counters.get("lines", 0) - counters.get("line_implausible", 0), bad

@@ -23,12 +23,6 @@ MOST = 1000
 """Maximum number of robots. The bound is needed because any client of the bus can invent robot
 names."""
 
-GATHER_S = 1.5
-"""Time within which every robot that is present has answered, s."""
-
-NOBODY_S = 3.0
-"""Time after which no robot is there, s. On a busy computer the first answer arrives late."""
-
 
 class _Known:
     """The known facts of one robot."""
@@ -86,11 +80,14 @@ class Fleet:
         return rows
 
     def gather(self) -> list[Row]:
-        """Wait until every robot that is present has answered; return no rows if none is there."""
+        """Wait until every robot that is present has answered; return no rows if none is there.
+
+        It takes 1.5 s, or 3 s if no robot is there: on a busy computer the first answer is late.
+        """
         began, rows = time.monotonic(), self.rows()
         while not self.whole:
             present = any(row.here or row.state for row in rows)
-            if time.monotonic() - began >= (GATHER_S if present else NOBODY_S):
+            if time.monotonic() - began >= (1.5 if present else 3.0):
                 return self.rows() if present else []
             time.sleep(0.05)
             rows = self.rows()

@@ -25,10 +25,6 @@ SHORT_WORDS, LONG_WORDS = 21, 56
 
 MOST_REASONS, MOST_PORT = 16, 34
 
-LATE_S = 0.2
-"""Difference in s between stamps and local clock that network delay explains; more means that the
-robot's clock was set."""
-
 LINKS = {"up": "green", "booting": "yellow"}
 
 FIGURES = {
@@ -171,9 +167,10 @@ def certificate(state: RobotState) -> Text:
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
     """Return a function that formats the rate and the total of a counter."""
-    # Stamps are exact, but if the robot's clock was set, the local clock decides.
+    # Stamps are exact. If they differ from the local clock by more than a network's delay, the
+    # robot's clock was set, and the local clock decides.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
-    if abs(seconds - seen.passed) > LATE_S:
+    if abs(seconds - seen.passed) > 0.2:
         seconds = seen.passed
 
     def counted(name: str) -> str:

@@ -537,7 +537,7 @@ def test_no_certificate_is_made_that_the_authority_may_not_sign(
 def test_renew_leaves_out_a_name_of_the_machine_that_the_authority_may_not_sign(
     own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("acsard.machine.identities.own_addresses", lambda: ["203.0.113.99"])
+    monkeypatch.setattr("acsard.machine.certificates.own_addresses", lambda: ["203.0.113.99"])
     assert tls("renew", "--directory", str(own)) == 0
     assert "203.0.113.99" not in names_of(own)
 
