@@ -17,7 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 
 from tests.simulate import pairs, shrink
-from tests.simulate.actors import Result, played
+from tests.simulate.actors import Result, collect_seldom, played
 from tests.simulate.plan import Plan, made
 
 HERE = Path(__file__).parent
@@ -35,7 +35,7 @@ def commit() -> str:
 def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterator[Result]:
     """Play this seed and those behind it until so much time is simulated or has passed."""
     end = time.monotonic() + within_s
-    with ProcessPoolExecutor(workers) as pool:
+    with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
         running = {pool.submit(_play, seed + n) for n in range(workers)}
         following, total = seed + workers, 0.0
         while running:

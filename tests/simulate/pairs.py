@@ -50,8 +50,9 @@ Step = dict[str, Any]
 
 def serve(where: Path) -> None:
     """Answer plans on the standard input until it ends."""
-    from tests.simulate.actors import played
+    from tests.simulate.actors import collect_seldom, played
 
+    collect_seldom()
     print(json.dumps(str(where)), flush=True)
     for line in sys.stdin:
         asked = json.loads(line)

@@ -108,8 +108,8 @@ def _config(dice: random.Random, odd: bool) -> tuple[dict[str, Any], dict[str, A
     extras: dict[str, Any] = {"board": []}
     if odd:
         _make_odd(dice, config, extras)
-    if "odometry" not in config and dice.random() < 0.3:
-        config["sim"]["motor_time_constant"] = round(dice.uniform(0.2, 0.4), 3)
+    if "odometry" not in config and dice.random() < 0.4:
+        config["sim"]["motor_time_constant"] = round(dice.uniform(0.25, 0.4), 3)
     return config, extras
 
 
@@ -196,6 +196,25 @@ def _phases(dice: random.Random, seconds: float, lawful: bool) -> list[list[Any]
             for at, v, w in phases]  # fmt: skip
 
 
+def _tried_again(
+    dice: random.Random, phases: list[list[Any]], congestion: list[list[Any]]
+) -> list[list[Any]]:
+    """Return the phases of a person who lets go and tries again when the robot does not follow."""
+    if all(speed != 0.0 for _, speed, _ in phases):
+        return phases
+    for begin, end, _, _ in congestion:
+        if end - begin < 4.0 or dice.random() < 0.5:
+            continue
+        t = begin + dice.uniform(0.5, 2.0)
+        phases = [phase for phase in phases if not t <= phase[0] < end]
+        while t < end:
+            phases.append([round(t, 3), 0.0, 0.0])
+            t += dice.choice((0.3, 0.6, 1.3, 2.5))
+            phases.append([round(t, 3), round(dice.uniform(-1.2, 1.2), 3), 0.0])
+            t += dice.uniform(0.5, 3.0)
+    return sorted(phases, key=lambda phase: float(phase[0]))
+
+
 def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> dict[str, Any]:
     way = dice.choice(WAYS)
     # Most plans need a sender that drives: a robot at rest hides most defects.
@@ -247,13 +266,14 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
                 length *= 1.5
             size = {
                 "grow": dice.choice((0.01, 0.03, 0.045, 0.08, 0.5)),
-                "jump": dice.choice((0.3, 0.6, 1.0, 3.0, 8.0)),
+                "jump": dice.choice((0.3, 0.6, 1.0, 2.0, 3.0, 8.0)),
                 "hole": 0.0,
                 "drain": dice.uniform(1.2, 6.0),
                 "burst": dice.choice((0.1, 0.3, 1.0)),
             }[shape]
             sender["congestion"].append([round(t, 3), round(t + length, 3), shape, round(size, 3)])
             t += length + dice.uniform(1.0, 15.0)
+        sender["phases"] = _tried_again(dice, sender["phases"], sender["congestion"])
     if "sender clocks" in kinds and way not in ("client", "page"):
         t = dice.uniform(2.0, 30.0)
         while t < seconds:
@@ -274,12 +294,13 @@ def _events(
     senders: list[dict[str, Any]],
 ) -> list[dict[str, Any]]:
     events: list[dict[str, Any]] = []
-    changes = [
-        phase[0]
+    phases = [
+        phase
         for sender in senders
         for phase in sender["phases"]
         if sender["from"] <= phase[0] < sender["to"]
     ]
+    changes, drives = [phase[0] for phase in phases], [phase[0] for phase in phases if phase[1]]
 
     def moment() -> float:
         """Return a bad moment: half of them lie just behind what a sender or an event begins."""
@@ -345,10 +366,17 @@ def _events(
     for at in add("resets", 60):
         once(at, "reset", deaf=dice.choice((0.3, 1.0, 2.0)))
     for at in add("unplugging", 60):
+        if drives and dice.random() < 0.7:
+            # A loose contact opens for a moment when the robot shakes.
+            for begin in dice.sample(drives, min(len(drives), dice.randrange(2, 7))):
+                shaken = round(min(begin + dice.uniform(0.5, 4.0), seconds), 3)
+                once(shaken, "unplug", **{"for": round(dice.uniform(0.05, 0.4), 3)}, new=False)
+            continue
         once(at, "unplug", **{"for": round(dice.uniform(0.05, 5.0), 3)}, new=dice.random() < 0.4)
     for at in add("blocked output", 40):
         times = series(at)
-        lasts = dice.choice((0.02, 0.2, 0.6, 2.0) if len(times) == 1 else (0.02, 0.1, 0.2))
+        # The board stays silent in a pause of the output, so one of 0.1 s already loses the link.
+        lasts = dice.choice((0.02, 0.06, 0.08, 0.2) if len(times) > 1 else (0.02, 0.08, 0.6, 2.0))
         for each in times:
             if dice.random() < 0.5:
                 once(each, "block", **{"for": lasts})

@@ -39,10 +39,10 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 FIRST_SEED = 1
 
 CHILD = """
-import gc, json, sys
-from tests.simulate.actors import played
+import json, sys
+from tests.simulate.actors import collect_seldom, played
 from tests.simulate.plan import made
-gc.freeze()
+collect_seldom()
 seed, left = int(sys.argv[1]), float(sys.argv[2])
 while left > 0.0:
     result = played(made(seed))

@@ -170,6 +170,14 @@ class _Clock:
         self._accepted: tuple[int, int] | None = None
         """Stamp and sequence number of the last accepted command."""
 
+    @property
+    def was_known(self) -> bool:
+        """Whether a command of this clock was accepted, so that its floor and order are known.
+
+        A proof that begins again does not change that.
+        """
+        return self._accepted is not None
+
     def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
         """Return the verdict on the next command of this clock."""
         at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
@@ -301,7 +309,7 @@ class Freshness:
         verdict = clock.judge(command, command.stamp_ns, timeout_ns)
         if verdict == "set":
             self.forgiven_ns += clock.forgiven_ns
-        held = self._newcomers if clock.state == "new" else self._clocks
+        held = self._clocks if clock.was_known else self._newcomers
         held[name] = clock
         self._forget(at_ns)
         return verdict

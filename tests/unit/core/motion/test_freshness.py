@@ -402,6 +402,15 @@ def test_a_steady_clock_whose_minimum_was_that_of_a_backlog_proves_itself_again(
     assert verdicts == ["first", *["unproven"] * 4, *["fresh"] * 3]
 
 
+def test_a_silence_does_not_make_a_known_steady_clock_forget_its_lowest_delay() -> None:
+    clock = Clock(known=False, steady=True)
+    assert "fresh" in clock.steadily(8000.0, 500)
+    assert clock.sends(3000.0) == "first", "a backlog pours in"
+    clock.sends(0.0, after=2500.0, name="another sender")
+    clock.now += 2500.0
+    assert set(clock.steadily(8000.0, 1000)) == {"stale"}
+
+
 def test_a_foreign_clock_is_forgiven_a_second_and_a_second_more_each_minute() -> None:
     clock = Clock()
     late, forgiven = 0.0, 0.0
