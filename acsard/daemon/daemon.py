@@ -35,7 +35,7 @@ from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulated_board import Simulated
 from acsard.daemon.supervisor import GATEWAY, PAGE, Kind, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
-from acsard.host import clock, huge_pages, real_time
+from acsard.host import clock, real_time
 from acsard.host.logs import Log
 from acsard.host.systemd import PATIENCE_S, Systemd
 from acsard.recording.recorder import Recorder
@@ -269,7 +269,6 @@ async def _control(
     await asyncio.sleep(0)
     gc.collect()
     gc.freeze()  # the present objects live to the end, so later collections skip them
-    huge_pages.gather()
     with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
 
         def step() -> Next | None:
