@@ -45,8 +45,8 @@ CASES = (
         "case 4",
         "the output was blocked for minutes, and then the robot drives on",
         SESSION,
-        "self.blocked = self._held_up and (self.blocked or (long and not late))",
-        "self.blocked = False",
+        "            self.blocked = True\n",
+        "            self.blocked = False\n",
     ),
     Fault(
         "case 5",

@@ -397,7 +397,7 @@ def test_services_answer_in_the_daemon_s_words(viewer: Viewer, bus: Bus) -> None
     assert bus.state()["y"] == 2.0
     refused = viewer.call("/acsard/set_pose", {"x": "here"})
     assert not refused["success"]
-    assert "set_pose needs {x, y, yaw}" in refused["message"]
+    assert 'set_pose needs a payload like {"x": 0, "y": 0, "yaw": 0}' in refused["message"]
     assert viewer.call("/acsard/deactivate", {})["success"]
     assert bus.state()["mode"] == "inactive"
     assert viewer.call("/acsard/activate", {})["success"]
