@@ -298,8 +298,8 @@ def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
 
 def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]:
     return [
-        f"column {name} says ({unit[:20]}), an unknown unit: the tool read it as "
-        f"{SI.get(name, 'rad/s')}"
+        f"column {name} has the unknown unit ({unit[:20]}): it was read as "
+        f"{SI.get(name, 'rad/s')}; correct the header if that is wrong"
         for (_, unit), name in zip(header, names, strict=True)
         if name and name != "run" and factor(name, unit) is None
     ]

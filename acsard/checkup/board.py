@@ -402,6 +402,7 @@ class Board:
     def settles(self, comma: bool) -> bool:
         """Send zeros until two replies show that every motor stands.
 
+        `comma` says whether the lines end with a comma.
         Returns False if a motor still turns and none of the motors slows down any more.
         """
         began_s = self.now_s

@@ -111,7 +111,7 @@ class Commander:
         return silence if begins else None
 
     def due_ns(self) -> int | None:
-        """Return the time at which `send` has a command, which may be in the past, or None."""
+        """Return the time from which `send` has a command, or None if it has none."""
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns

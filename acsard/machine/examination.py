@@ -35,9 +35,9 @@ from acsard.machine.serial_ports import BOARDS, serial_devices
 
 
 def certificates(tls: str) -> Iterator[Finding]:
-    """Yield findings about these files: whether they exist, are private and have not expired.
+    """Yield findings about the certificates in the directory `tls`; none if `tls` is "".
 
-    Yields nothing if `tls` is "".
+    The findings say whether the files exist, are private and have not expired.
     """
     if not tls:
         return

@@ -98,7 +98,7 @@ class Bounds(NamedTuple):
 
 
 def share(bound: int, own: int, disk: Disk) -> int:
-    """Return the largest size of one file, bytes.
+    """Return how large one recording file may become, bytes.
 
     `bound` is the largest total size of all recordings, and `own` is their present total size.
     """

@@ -28,12 +28,12 @@ MOST_REASONS, MOST_PORT = 16, 34
 LINKS = {"up": "green", "booting": "yellow"}
 
 FIGURES = {
-    "period_lateness": ("period due → step", "from a period due (the first missed) to its step"),
+    "period_lateness": ("period due → step", "from the due time (first missed one) to the step"),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
     "command_to_wire": (
         "arrival → first line",
-        "from arrival in the source's turn to the first line",
+        "from a driving source's command to its first line",
     ),
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),

@@ -241,7 +241,7 @@ class Page:
             raise RefusedError("malformed", f"the body must be a JSON object: {error}") from None
         robot = given.pop("robot", "")
         if not isinstance(robot, str):
-            text = "robot must be the id of another robot, which may be stopped"
+            text = "robot must be the id of a robot; a robot of another page can only be stopped"
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
         told = await self._calls.call(request[WHO], verb, given, robot)

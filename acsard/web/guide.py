@@ -247,7 +247,7 @@ class _Errand:
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
-        """Return the message that this child is running, addressed to `viewer`."""
+        """Return a message for `viewer`, which says that this guided drive is running."""
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:

@@ -65,7 +65,8 @@ class Keys:
             self._out.refuse("subscribe", "too_many", f"at most {MOST} keys")
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
-                f"at most {STREAMS_OF_ONE} keys of other robots for one token, and {STREAMS} in all"
+                f"one token may follow {STREAMS_OF_ONE} keys of other robots at once, "
+                f"and all tokens together {STREAMS}"
             )
             self._out.refuse("subscribe", "too_many", f"no room: {text}; unsubscribe some")
         else:

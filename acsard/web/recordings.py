@@ -71,7 +71,8 @@ class BlackBox:
         if not (is_loopback(host) or host == "localhost"):
             raise TroubleError(
                 404,
-                "the recordings are on the robot, but this page's server runs on another machine",
+                "the recordings are on the robot, but this page's server runs on another machine: "
+                "open the page that the robot serves",
             )
         if not self._robots.about.recordings:
             raise TroubleError(404, "nothing is recorded, because record.directory is empty")

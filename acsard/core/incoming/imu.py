@@ -58,7 +58,7 @@ class GyroFollower:
     def __init__(self, own: bool = False) -> None:
         """Start without a gyro.
 
-        `own` says that the robot is the simulated one. Then only the simulator's gyro is accepted.
+        `own` says that the daemon runs its own simulator. Then only its gyro is accepted.
         """
         self._own = own
         self._followed = public_name(OWN) if own else ""

@@ -286,7 +286,7 @@ def _fits(pattern: str, chunk: str) -> bool:
 
 
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
-    """Return the reply that refuses a query, or None if the caller could not recognize a reply.
+    """Return the reply that refuses a query, or None if the client could not read a reply.
 
     A ROS client does not receive the error replies of Zenoh, so it gets a response with `success`
     or `successful` false. `why` is the reason.

@@ -56,11 +56,11 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 
 
 def least_role(key: str) -> Role:
-    """Return the least role that may use a key, given below the robot's id, in its usual way.
+    """Return the least role that may use `key`, the part of the full key behind the robot's id.
 
-    The usual way is to put on a key for commands, to query or call a key that answers, and to
-    follow any other key. An unknown key gets the lowest role. This grants nothing, because this
-    function only chooses the words for a client that received nothing.
+    To use means to put on a key for commands, to query a key that answers, and to follow any other
+    key. An unknown key gets the lowest role. This function gives no permission: it only names the
+    role in the hint for a client that has received nothing.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

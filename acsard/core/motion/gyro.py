@@ -272,7 +272,7 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """Correct the gyro's delay. This happens at rest, where it moves nothing."""
+        """Correct the gyro's delay. At rest this does not change the heading."""
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:
             earliest, latest = DELAYS_NS

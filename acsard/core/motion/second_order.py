@@ -23,11 +23,12 @@ w = n + W p, with these symbols:
 The term [e, w] / 2 then adds these errors to x and y. Sums are over all stretches:
 
     sum of [x, n] / 2           independent in each stretch, so the covariances are summed
-    sum over i of p_i M_i       M_i = sum of ([J_i, n] + [x, W_i]) / 2, which correlates with x
-    sum over i, k of p_i p_k C_ik
+    sum over i of p_i M_i       M_i = sum of ([J_i, n] + [x, W_i]) / 2, where M_i correlates with x
+    sum over i <= k of p_i p_k C_ik
                                 C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, half of it for i = k
 
-They are uncorrelated with each other and with e. Of the last two terms of the series only the part
+Each p_i is independent of the rest and has the mean 0, so these sums are uncorrelated with each
+other and with e. Of the last two terms of the series only the part
 from noise is used. Without parameters the result is equation 55 of Barfoot & Furgale, Associating
 Uncertainty with Three-Dimensional Poses for Use in Estimation Problems, IEEE Transactions on
 Robotics 30 (2014).

@@ -159,9 +159,9 @@ class Suspect:
             self._gyro.add(own, other, known.gyro, known.gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether this wheel is faulty, and not the other.
+        """Return whether this wheel is faulty, and not the other wheel of its side.
 
-        `count` rad is the angle of a count.
+        `count` is the angle between two encoder counts, rad.
         """
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:

@@ -224,7 +224,7 @@ def test_what_cannot_be_read_is_told_with_what_to_do(data: bytes, words: str) ->
 
 def test_a_unit_that_is_not_known_is_told() -> None:
     notes = read(LOG_HEADER.replace(b"left", b"left (m/s)") + b"1,2,3,4\n").notes
-    assert "column left says (m/s)" in notes[0]
+    assert "column left has the unknown unit (m/s)" in notes[0]
 
 
 @given(st.binary(max_size=300), st.integers(0, 100))
