@@ -128,8 +128,7 @@ def place(asked: Asked, names: Collection[str]) -> Place:
 
 def require_own_origin(asked: Asked) -> None:
     """Raise `RefusedError` if a web page of another origin made the browser send this request."""
-    own = f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
-    strange = asked.origin is not None and asked.origin.lower() != own
+    strange = asked.origin is not None and asked.origin.lower() != _own_origin(asked)
     if strange or asked.site not in (None, "same-origin", "none"):
         raise RefusedError("origin", "a page from another origin may not do that")
 
@@ -137,9 +136,17 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    `origins` are in lower case.
+    `origins` are in lower case. The robot's own page is never a listed one, because the robot does
+    not look at the cookie of a listed page: a robot whose own origin is listed too could not be
+    stopped by its page.
     """
-    return asked.origin is not None and asked.origin.lower() in origins
+    if asked.origin is None or asked.origin.lower() == _own_origin(asked):
+        return False
+    return asked.origin.lower() in origins
+
+
+def _own_origin(asked: Asked) -> str:
+    return f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
 
 
 def tokens_offered(protocols: str) -> list[str]:

@@ -6,6 +6,7 @@ A client is on the machine, or uses one of the robot's names.
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.web.callers import (
     MAINTAINER,
@@ -184,6 +185,15 @@ def test_only_a_listed_origin_in_full_is_listed() -> None:
     }.items():
         asked = Asked("127.0.0.1", False, "localhost:8080", origin)
         assert by_listed_page(asked, origins) == listed, origin
+
+
+def test_the_robot_s_own_page_keeps_its_cookie_if_its_origin_is_listed_too() -> None:
+    origins = {"https://robot1.local:8443", "http://robot1.local:8443"}
+    own = Asked("192.168.1.7", True, "Robot1.local:8443", "https://robot1.local:8443")
+    require_own_origin(own)
+    assert not by_listed_page(own, origins)
+    assert by_listed_page(replace(own, host="192.168.1.4:8443"), origins)
+    assert by_listed_page(replace(own, secure=False), origins)
 
 
 def test_a_token_may_be_the_name_of_a_subprotocol() -> None:
