@@ -39,8 +39,9 @@ Domain, and for all paths."""
 PROTOCOL, TOKEN = "acsard", "acsard.token."
 """Subprotocol of the WebSocket, and prefix of one that carries a token."""
 
-MOST_COOKIES = 8
-"""Maximum number of cookies that are checked for a token."""
+MOST_TOKENS = 8
+"""Maximum number of tokens of one request that are checked. Each one is compared with all valid
+tokens."""
 
 
 class RefusedError(AcsardError):
@@ -150,12 +151,12 @@ def _own_origin(asked: Asked) -> str:
 
 
 def tokens_offered(protocols: str) -> list[str]:
-    """Return the tokens in a `Sec-WebSocket-Protocol` header.
+    """Return the first tokens in a `Sec-WebSocket-Protocol` header.
 
     A script in a browser can set no other header of a WebSocket.
     """
     offered = (one.strip() for one in protocols.split(","))
-    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)]
+    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MOST_TOKENS]
 
 
 def cookie_name(robot: str, port: int) -> str:
@@ -174,7 +175,7 @@ def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
     """
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
     names = [name for name in cookies if name.rpartition("-")[0] == ours]
-    return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_COOKIES]
+    return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_TOKENS]
 
 
 def host_name(host: str) -> str:
