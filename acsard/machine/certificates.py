@@ -40,6 +40,10 @@ UNLIMITED = (
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 """Matches a host name or an IP address."""
 
+LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
+HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
+"""Matches a common name that OpenSSL takes for a host name if it has a dot, `10.0.0.5` too."""
+
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
     """Create an authority, the robot's certificate and one for each role.
@@ -91,13 +95,14 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> tuple[list[st
 def _names_of(name: str) -> list[str]:
     """Return the host names under which the holder of a certificate is reached.
 
-    The name in mDNS is needed for a common name like `anna.meyer` too: without any host name TLS
-    would take that for one, and compare it with the names that the authority may sign.
+    The name in mDNS is needed for a common name like `anna.meyer` or `10.0.0.5` too: without any
+    host name TLS would take that for one, and compare it with the names that the authority may
+    sign.
     """
-    if not ADDRESS.match(name):
-        return []
-    numeric = ":" in name or name.replace(".", "").isdigit()
-    return [name] if numeric or name.endswith(".local") else [name, f"{name}.local"]
+    named = [name] if ADDRESS.match(name) else []
+    if not HOST_LIKE.match(name) or name.endswith(".local"):
+        return named
+    return [*named, f"{name}.local"]
 
 
 def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:

@@ -39,8 +39,9 @@ Domain, and for all paths."""
 PROTOCOL, TOKEN = "acsard", "acsard.token."
 """Subprotocol of the WebSocket, and prefix of one that carries a token."""
 
-MOST_COOKIES = 8
-"""Maximum number of cookies that are checked for a token."""
+MOST_TOKENS = 8
+"""Maximum number of tokens of one request that are checked. Each one is compared with all valid
+tokens."""
 
 
 class RefusedError(AcsardError):
@@ -128,8 +129,7 @@ def place(asked: Asked, names: Collection[str]) -> Place:
 
 def require_own_origin(asked: Asked) -> None:
     """Raise `RefusedError` if a web page of another origin made the browser send this request."""
-    own = f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
-    strange = asked.origin is not None and asked.origin.lower() != own
+    strange = asked.origin is not None and asked.origin.lower() != _own_origin(asked)
     if strange or asked.site not in (None, "same-origin", "none"):
         raise RefusedError("origin", "a page from another origin may not do that")
 
@@ -137,18 +137,26 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    `origins` are in lower case.
+    `origins` are in lower case. The robot's own page is never a listed one, because the robot does
+    not look at the cookie of a listed page: a robot whose own origin is listed too could not be
+    stopped by its page.
     """
-    return asked.origin is not None and asked.origin.lower() in origins
+    if asked.origin is None or asked.origin.lower() == _own_origin(asked):
+        return False
+    return asked.origin.lower() in origins
+
+
+def _own_origin(asked: Asked) -> str:
+    return f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
 
 
 def tokens_offered(protocols: str) -> list[str]:
-    """Return the tokens in a `Sec-WebSocket-Protocol` header.
+    """Return the first tokens in a `Sec-WebSocket-Protocol` header.
 
     A script in a browser can set no other header of a WebSocket.
     """
     offered = (one.strip() for one in protocols.split(","))
-    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)]
+    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MOST_TOKENS]
 
 
 def cookie_name(robot: str, port: int) -> str:
@@ -167,7 +175,7 @@ def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
     """
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
     names = [name for name in cookies if name.rpartition("-")[0] == ours]
-    return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_COOKIES]
+    return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_TOKENS]
 
 
 def host_name(host: str) -> str:

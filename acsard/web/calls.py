@@ -194,10 +194,11 @@ class Merged:
         """
         if name in self._next:
             return await asyncio.shield(self._next[name])
-        if name not in self._rests:
+        rest = self._rests.get(name)
+        if rest is None:
             self._rest(name)
             return await stop()
-        task = self._next[name] = asyncio.create_task(self._later(name, stop))
+        task = self._next[name] = asyncio.create_task(self._later(name, rest, stop))
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
         return await asyncio.shield(task)
 
@@ -205,8 +206,9 @@ class Merged:
         self._rests[name] = asyncio.Event()
         asyncio.get_running_loop().call_later(MERGE_S, lambda: self._rests.pop(name).set())
 
-    async def _later(self, name: Hashable, stop: Stop) -> ServiceReply:
-        await self._rests[name].wait()
+    async def _later(self, name: Hashable, rest: asyncio.Event, stop: Stop) -> ServiceReply:
+        # If the event loop is late, `rest` may have ended and be forgotten before this task starts.
+        await rest.wait()
         del self._next[name]  # later callers share the next stop
         self._rest(name)
         return await stop()

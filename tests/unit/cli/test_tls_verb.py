@@ -28,6 +28,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.cli import main
 from acsard.core.config.parsing import parse
+from acsard.daemon.bus import tls as bus_tls
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
 from acsard.machine.authority import Authority
@@ -246,6 +247,15 @@ def test_add_makes_one_more_by_the_same_authority_and_touches_nothing_else(own: 
     issued.verify_directly_issued_by(certificate(own, "ca.pem"))
     left = issued.not_valid_after_utc - datetime.now(UTC)
     assert abs(left - timedelta(days=7)) < timedelta(minutes=10)
+
+
+@each("name", ["anna.meyer", "anna_b.meyer", "10.0.0.5", "2001:db8::9", "anna b.meyer"])
+def test_a_certificate_whose_name_looks_like_a_host_is_valid_and_names_its_owner(
+    own: Path, name: str
+) -> None:
+    """A client without a readable common name commands on a key that TLS does not admit."""
+    assert tls("add", name, "--directory", str(own)) == 0
+    assert bus_tls.common_name(str(own / "clients" / name)) == name
 
 
 def test_add_does_not_replace_a_certificate(own: Path, capsys: pytest.CaptureFixture[str]) -> None:

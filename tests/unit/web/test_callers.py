@@ -6,10 +6,11 @@ A client is on the machine, or uses one of the robot's names.
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.web.callers import (
     MAINTAINER,
-    MOST_COOKIES,
+    MOST_TOKENS,
     Asked,
     RefusedError,
     Who,
@@ -158,7 +159,7 @@ def test_a_page_looks_at_its_own_cookie_first_and_at_no_other_robot_s() -> None:
 def test_of_cookies_without_end_a_few_are_looked_at_and_the_page_s_own_is_one() -> None:
     shown = {cookie_name("robot1", port): str(port) for port in range(9000)}
     told = tokens_in(shown, "robot1", 8443)
-    assert (len(told), told[0]) == (MOST_COOKIES, "8443")
+    assert (len(told), told[0]) == (MOST_TOKENS, "8443")
 
 
 def test_an_ipv6_address_counts_by_its_network_and_an_ipv4_address_by_itself() -> None:
@@ -186,6 +187,17 @@ def test_only_a_listed_origin_in_full_is_listed() -> None:
         assert by_listed_page(asked, origins) == listed, origin
 
 
+def test_the_robot_s_own_page_keeps_its_cookie_if_its_origin_is_listed_too() -> None:
+    origins = {"https://robot1.local:8443", "http://robot1.local:8443"}
+    own = Asked("192.168.1.7", True, "Robot1.local:8443", "https://robot1.local:8443")
+    require_own_origin(own)
+    assert not by_listed_page(own, origins)
+    assert by_listed_page(replace(own, host="192.168.1.4:8443"), origins)
+    assert by_listed_page(replace(own, secure=False), origins)
+
+
 def test_a_token_may_be_the_name_of_a_subprotocol() -> None:
     assert tokens_offered("acsard, acsard.token.a-B_9") == ["a-B_9"]
     assert tokens_offered("acsard") == tokens_offered("") == tokens_offered("token.x") == []
+    many = ", ".join(f"acsard.token.{n}" for n in range(500))
+    assert tokens_offered(many) == [str(n) for n in range(MOST_TOKENS)]
