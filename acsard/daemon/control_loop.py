@@ -271,6 +271,9 @@ class ControlLoop:
                         arrival.arrived_ns,
                     )
                 )
+        for source in got.overrun_sources:
+            text = f"source {source}: too many commands came at once, and the oldest were dropped"
+            refusals.append(Refusal("displaced", text, source))
         for query in got.queries:
             served = self._served(query, now, refusals)
             if served is not None:

@@ -56,6 +56,8 @@ class Mailbox(Generic[T]):
         self.waiting: deque[T] = deque(maxlen=most)
         """The items that wait, the oldest on the left. Only the reader may take from it directly.
         In each step the daemon looks at about forty mailboxes, too many for a method call each."""
+        self.lost = 0
+        """Number of items that newer ones have displaced. It is exact for a single writer."""
         self._bell = Bell()
         self.wake = wake or self._bell.ring
         """Wakes the reader. A writer that uses `store` calls it afterwards."""
@@ -71,6 +73,8 @@ class Mailbox(Generic[T]):
         """
         items = self.waiting
         room = len(items) < items.maxlen  # type: ignore[operator]
+        if not room:
+            self.lost += 1  # before the item: a reader that has the item knows of the loss
         items.append(item)
         return room
 

@@ -107,13 +107,19 @@ class MemoryBus:
         self.replies: dict[int, list[Reply]] = {}
         self.finished: set[int] = set()
         self.arrivals: list[Arrival] = []
+        self.overrun_sources: set[str] = set()
         self.queries: list[Query] = []
 
     def take(self, queries: int) -> BusInput:
         if not (self.arrivals or self.queries):
             return NOTHING
-        got = BusInput(tuple(self.arrivals), tuple(self.queries[:queries]))
+        got = BusInput(
+            tuple(self.arrivals),
+            tuple(self.queries[:queries]),
+            overrun_sources=tuple(sorted(self.overrun_sources)),
+        )
         self.arrivals.clear()
+        self.overrun_sources.clear()
         del self.queries[:queries]
         return got
 

@@ -247,6 +247,7 @@ class Product:
                 same = [one for one in arrivals if one.key == key]
                 if len(same) > HELD:
                     arrivals.remove(same[0])
+                    world.bus.overrun_sources.add(key.split("/")[1])
                     self.dropped += 1
         if at_ns == world.now_ns and (world._listens or key == "stop"):
             world._step()

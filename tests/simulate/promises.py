@@ -507,7 +507,7 @@ class Witness:
                 if armed_ns < self.armed_since_ns:
                     why = f"{source} by {wish.identity} is not armed"
                     continue
-            if not grows or self._leads(wish, wheels, before):
+            if not grows or self.pending or self._leads(wish, wheels, before):
                 return wish, ""
             why = f"{source} by {wish.identity} wishes {wish.v:g}, {wish.w:g}"
         return None, why

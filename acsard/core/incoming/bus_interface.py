@@ -26,6 +26,8 @@ class BusInput(Struct, frozen=True):
     queries: tuple[Query, ...] = ()
     overrun: int = 0
     """Number of samples that were dropped because the control loop did not take them in time."""
+    overrun_sources: tuple[str, ...] = ()
+    """The sources of which commands were dropped for that reason."""
     dropped: int = 0
     """Number of published messages that were dropped because the bus did not take them in time."""
     stuck: bool = False

@@ -187,9 +187,17 @@ class Arbiter:
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
-        """Note a message that could not be decoded: its sender is not silent."""
+        """Note a message that could not be decoded: its sender is not silent.
+
+        `sender` is "" for messages that nobody has read.
+        """
         known = self._sources.get(source)
-        if known is not None and sender in known.senders:
+        if known is None:
+            return
+        if not sender:
+            for each in known.senders.values():
+                each.missed()
+        elif sender in known.senders:
             known.senders[sender].notice(arrived_ns)
 
     def choose(self, now_ns: int) -> Choice:

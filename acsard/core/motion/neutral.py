@@ -77,6 +77,10 @@ class Sender:
         self._zero_ns = self._proven_zero_ns = None
         self.noticed_ns = at_ns
 
+    def missed(self) -> None:
+        """Take note of messages that were lost unread: each may have been a speed."""
+        self._zero_ns = self._proven_zero_ns = None
+
     def refuse(self, command: Command, why: Verdict) -> None:
         """Take note of a command that is stale."""
         self.notice(command.arrived_ns)

@@ -18,7 +18,7 @@ from itertools import count
 import zenoh
 
 from acsard.core.incoming.bus_interface import NOTHING, BusInput, Waker
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
 from acsard.core.incoming.queries import BUSY, Query, Reply, most_bytes, refused
 from acsard.core.messages.topics import IMU, JSON_TREE, VERBS, full_key, service_key, source_keys
 from acsard.core.ros.transports import Endpoint
@@ -172,8 +172,8 @@ class Inbox:
 
         One of these takes as long as all other queries of a step.
         """
-        self._overrun = 0
-        """Number of samples that newer ones have displaced since the last `take`."""
+        self._lost = dict.fromkeys(self._arrivals, 0)
+        """Number of samples that newer ones had displaced in each buffer at the last `take`."""
         self._any = False
         """True if an item has arrived. It is set after the item is queued, so that `take` misses no
         item.
@@ -189,9 +189,15 @@ class Inbox:
         if not self._any:
             return NOTHING
         self._any = False
-        arrivals = [
-            arrival for box in self._arrivals.values() if box.waiting for arrival in box.take()
-        ]
+        arrivals, overrun, sources = list[Arrival](), 0, set[str]()
+        for key, box in self._arrivals.items():
+            if not box.waiting:
+                continue
+            arrivals += box.take()
+            if box.lost != self._lost[key]:
+                overrun += box.lost - self._lost[key]
+                self._lost[key] = box.lost
+                sources.add(parts(key)[1])
         arrivals.sort(key=lambda arrival: arrival.arrived_ns)
         arrivals = self._stops.take() + arrivals
         taken = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
@@ -199,8 +205,7 @@ class Inbox:
         if self._services or self._slow or self._others:
             # The other queries wait for the next step.
             self._any = True
-        overrun, self._overrun = self._overrun, 0
-        return BusInput(tuple(arrivals), tuple(taken), overrun)
+        return BusInput(tuple(arrivals), tuple(taken), overrun, tuple(sorted(sources - {""})))
 
     # Zenoh's threads call the methods below.
 
@@ -247,10 +252,7 @@ class Inbox:
         if key == "stop" and put:
             self._stops.put(arrival)
         else:
-            buffer = self._buffer(key)
-            # Count before the wake-up, because `take` takes the samples and the count together.
-            self._overrun += not buffer.store(arrival)
-            buffer.wake()
+            self._buffer(key).put(arrival)
 
     def _buffer(self, key: str) -> Mailbox[Arrival]:
         """Return the buffer of a key. All certificates of one source share a buffer."""

@@ -90,6 +90,14 @@ def test_a_message_that_may_have_been_a_speed_ends_the_wait_of_a_shared_zero() -
     assert one.armed(1600 * MS)
 
 
+def test_messages_that_were_lost_unread_end_the_wait_of_a_shared_zero() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0)
+    one.missed()
+    one.take(sent(GO, 1001, shared=True), 0)
+    assert not one.armed(1001 * MS)
+
+
 @pytest.mark.parametrize("shared", [False, True])
 def test_an_unproven_zero_arms_unless_its_clock_proves_wrong(shared: bool) -> None:
     for wrong in (False, True):

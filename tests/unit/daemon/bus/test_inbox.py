@@ -79,9 +79,10 @@ def test_a_flood_on_a_key_displaces_only_samples_of_that_key_and_is_counted() ->
     arrived(inbox, "cmd/nav", "stop", *["cmd/app"] * (ARRIVALS + 5))
     taken = inbox.take(8)
     assert [one.key for one in taken.arrivals] == ["stop", "cmd/nav", *["cmd/app"] * ARRIVALS]
-    assert taken.overrun == 5
+    assert (taken.overrun, taken.overrun_sources) == (5, ("app",))
     arrived(inbox, "cmd/app")
-    assert inbox.take(8).overrun == 0
+    taken = inbox.take(8)
+    assert (taken.overrun, taken.overrun_sources) == (0, ())
 
 
 def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
