@@ -162,14 +162,22 @@ class Commander:
 
 
 class Sender:
-    """The identity of one sender, and the number of its last command."""
+    """The identity of one sender, and the number and the newest stamp of its commands."""
 
     def __init__(self, sender_id: str) -> None:
-        self._id, self._sequence = sender_id, 0
+        self._id, self._sequence, self._newest_ns = sender_id, 0, 0
 
-    def sign(self, stamp_ns: int | None, *, steady: bool) -> Signature:
-        """Return the signature of the next command."""
+    def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
+        """Return the signature of the next command.
+
+        `zero` says that the command is a zero. Its stamp is never older than an earlier stamp of
+        this sender, because the daemon refuses an older command after a newer one. A sender that
+        drives as two sources has one clock, but its commands may overtake each other.
+        """
         self._sequence += 1
+        if stamp_ns is not None:
+            newest_ns = max(stamp_ns, self._newest_ns)
+            self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
         return Signature(self._id, stamp_ns, self._sequence, steady)
 
 

@@ -13,6 +13,7 @@ from acsard.client import Client
 from acsard.client.commander import Commander, Sender, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.messages.schema import Twist, Vector3
+from acsard.core.values import REST
 from acsard.web.counts import Counts
 
 
@@ -40,7 +41,9 @@ class Hand:
             client = self._client()
             if client is not None:
                 twist = Twist(Vector3(x=wish.twist.linear), Vector3(z=wish.twist.angular))
-                client.put(twist, sender.sign(wish.stamp_ns, steady=wish.steady), source)
+                zero = wish.twist == REST
+                signature = sender.sign(wish.stamp_ns, steady=wish.steady, zero=zero)
+                client.put(twist, signature, source)
                 self._counts.add("commands")
                 return
         except Exception:  # noqa: BLE001, S110 - only this one command is lost

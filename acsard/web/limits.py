@@ -20,6 +20,9 @@ SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
 """Maximum number of TCP connections without a valid token from one network, and of connections that
 one token keeps from being displaced."""
 
+SOCKETS_OF_BROWSER = 7
+"""Number of connections that a token always keeps: those of one browser."""
+
 SOCKETS_LEAST = 16
 """Connections from other machines that are accepted even if the limit of open files is very low."""
 
@@ -77,7 +80,8 @@ class Sockets(Generic[C]):
     """The open TCP connections. A new one displaces the oldest one that has shown no valid token.
 
     It is displaced from the network that has the most such connections, so a flood from a few
-    networks displaces its own connections.
+    networks displaces its own connections. If every connection has shown a valid token, the oldest
+    one of the token that has the most goes, if that token has more than one browser needs.
     """
 
     def __init__(self, most: int) -> None:
@@ -93,8 +97,7 @@ class Sockets(Generic[C]):
     def enter(self, network: str, one: C) -> C | None:
         """Take a place; return the connection to close for it, or None if there was room.
 
-        If all places are taken by connections with a valid token, return `one` itself, which then
-        has no place.
+        If no connection may be displaced, return `one` itself, which then has no place.
         """
         own = self._strangers.get(network, {})
         gone = None
@@ -109,10 +112,14 @@ class Sockets(Generic[C]):
 
     def displaced(self) -> C | None:
         """Take the place of the connection that has to go first, and return it, if there is one."""
-        if not self._strangers:
-            return None
-        network = max(self._strangers, key=lambda name: len(self._strangers[name]))
-        gone = next(iter(self._strangers[network]))
+        if self._strangers:
+            network = max(self._strangers, key=lambda name: len(self._strangers[name]))
+            gone = next(iter(self._strangers[network]))
+        else:
+            token, count = max(self._tokens.items(), key=lambda item: item[1], default=("", 0))
+            if count <= SOCKETS_OF_BROWSER:
+                return None
+            gone = next(one for one, its in self._known.items() if its == token)
         self.leave(gone)
         return gone
 

@@ -191,6 +191,14 @@ def test_the_last_zero_of_a_sender_with_a_steady_clock_is_by_that_clock() -> Non
     assert commander.end(7) == Wish(REST, 1007, True)
 
 
+def test_a_zero_has_no_older_stamp_than_the_commands_before_it() -> None:
+    sender = Sender("joe/aa")
+    sender.sign(9, steady=True)
+    assert sender.sign(8, steady=True).stamp == 8  # a late speed must look late
+    assert sender.sign(8, steady=True, zero=True).stamp == 9
+    assert sender.sign(10, steady=True, zero=True).stamp == 10
+
+
 def test_the_commands_of_a_sender_are_numbered() -> None:
     sender = Sender("joe/aa")
     signed = [sender.sign(9, steady=False) for _ in range(3)]

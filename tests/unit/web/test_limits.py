@@ -20,6 +20,7 @@ from acsard.web.limits import (
     SOCKETS,
     SOCKETS_HERE,
     SOCKETS_LEAST,
+    SOCKETS_OF_BROWSER,
     SOCKETS_OF_ONE,
     SOCKETS_OF_TOKEN,
     Seats,
@@ -168,10 +169,17 @@ def test_a_token_keeps_a_share_of_the_places_only() -> None:
     assert gone < {f"stranger {n}" for n in range(SOCKETS_OF_TOKEN, SOCKETS)}
 
 
-def test_if_all_connections_have_shown_a_token_the_next_one_finds_no_place() -> None:
+def test_if_all_connections_have_shown_a_token_the_token_with_the_most_gives_a_place() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
     for n in range(SOCKETS):
-        sockets.prove(f"stranger {n}", f"token {n // SOCKETS_OF_TOKEN}")
+        sockets.prove(f"stranger {n}", f"token {min(n // 50, 4)}")  # token 4 has 56
+    assert sockets.enter("phone", "phone") == "stranger 200"
+
+
+def test_no_token_loses_the_connections_of_one_browser() -> None:
+    sockets = _filled("a", "b", "c", "d", "e")
+    for n in range(SOCKETS):
+        sockets.prove(f"stranger {n}", f"token {n // SOCKETS_OF_BROWSER}")
     assert sockets.enter("phone", "phone") == "phone"
     sockets.leave("phone")  # it has no place to give back
     sockets.leave("stranger 9")
