@@ -776,7 +776,7 @@ def by_hand(page: Phone, script: str) -> list[Any]:
     return list(page.browser.js(HAND.replace("SCRIPT", script)))
 
 
-STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
+STOPPING = """(async () => {
     const out = [], now = Date.now;
     let ok = false, lost = true;
     const send = async () => (out.push("sent"), {ok, lost, text: "no answer"});
@@ -788,7 +788,7 @@ STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
     Date.now = now;
     delete performance.now;
     return out;
-})"""
+})()"""
 
 FAILS = ["sent", "STOP: no answer; this page sends it again"]
 """The expected trace of a first attempt that gets no answer."""

@@ -1,20 +1,24 @@
 // The page: one link, one drive control, and the views.
 
-import { invited, refusal } from "./access.js";
+import { barred, hint, invited, permit, refusal } from "./access.js";
 import { Drive, SOURCE } from "./drive.js";
 import { Guide } from "./guide.js";
 import { objection } from "./hand.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
-import { Minute } from "./minute.js";
+import { Minute } from "./plots.js";
 import { Recordings } from "./recordings.js";
-import { barred, hint, permit } from "./roles.js";
 import { Settings } from "./settings.js";
-import { Stopping } from "./stopping.js";
 import * as views from "./views.js";
 import { figure, milliseconds, said as clickable, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
+const { stopping, alarm } = window; // of stop.js, which has run before
+if (!stopping) {
+  $("alarm").hidden = false;
+  views.text("alarm", "STOP does not work here, because a part of this page did not load. Reload the page.");
+  throw new Error("stop.js did not load, and a page without STOP does not drive");
+}
 /** Id of another robot that this page shows. It can be watched and stopped here; its own page drives and
  *  configures it. */
 const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
@@ -26,7 +30,6 @@ const link = new Link(refused);
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), told);
 const guide = new Guide(link);
-const stopping = new Stopping(() => (link.open ? link.call("stop", undefined, OTHER) : posted()), views.alarm);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
 const plots = new Minute();
@@ -63,27 +66,9 @@ function followed(key, rate, wanted) {
   else link.unsubscribe(key);
 }
 
-function stop() {
-  drive.release();
-  guide.leave();
-  stopping.press();
-}
-
-/** Send STOP by HTTP, without the WebSocket: the server may have refused this page's connection. */
-async function posted() {
-  try {
-    const body = JSON.stringify({ robot: OTHER });
-    const answer = await fetch("api/srv/stop", { method: "POST", body, signal: AbortSignal.timeout(3000) });
-    const told = await answer.json();
-    return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
-  } catch {
-    return { ok: false, lost: true, text: "no connection to the robot" };
-  }
-}
-
 async function asked(verb, payload) {
   const told = await link.call(verb, payload);
-  views.alarm(told.ok ? "" : words(told.text)); // the alarm is visible in every view
+  alarm(told.ok ? "" : words(told.text)); // the alarm is visible in every view
   said(told.ok ? told : { ok: true, text: "" });
 }
 
@@ -270,17 +255,8 @@ document.querySelector("nav").addEventListener("keydown", (event) => {
   open(VIEWS[(VIEWS.indexOf(view) + step + VIEWS.length) % VIEWS.length]);
   $(`tab-${view}`).focus();
 });
-$("stop").addEventListener("pointerdown", stop);
-$("stop").addEventListener("click", (event) => event.detail === 0 && stop()); // Enter or Space key
-addEventListener("keydown", (event) => {
-  if (event.code !== "Space") return;
-  event.preventDefault();
-  if (!event.repeat) stop();
-}, true);
-addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
 // The daemon refuses if a stop or a "deactivate" came after the state that this person sees.
 $("clear").addEventListener("click", () => (stopping.over(), asked("clear", { latch: state?.latch })));
-addEventListener("pagehide", () => stopping.over());
 $("activate").addEventListener("click", () => asked("activate", { latch: state?.latch }));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));
@@ -305,6 +281,13 @@ for (const [key, rate] of [["state", 10], ["odom", 20], ["cmd_vel_out", 10], ["w
 setInterval(looked, 100);
 // Refresh the list, because recordings grow and new ones begin while it is visible.
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
+const post = stopping.send;
+stopping.send = () => (link.open ? link.call("stop", undefined, OTHER) : post());
+stopping.before = () => {
+  drive.release();
+  guide.leave();
+};
+stopping.complete();
 // Opening an invitation where this page is already open only changes the part behind the #, so reload.
 addEventListener("hashchange", () => location.reload());
 uninvited = await invited(views.lost);

@@ -125,12 +125,6 @@ export function freshness(old, fresh, way, none, seen) {
   text("age", old === Infinity ? none : stale ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
 }
 
-/** Show a message in every view until `words` is "". */
-export function alarm(words) {
-  text("alarm", words);
-  document.getElementById("alarm").hidden = !words;
-}
-
 export function text(id, words) {
   const element = document.getElementById(id);
   if (element.textContent !== words) element.textContent = words;
