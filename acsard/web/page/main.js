@@ -1,6 +1,7 @@
 // The page: one link, one drive control, and the views.
 
 import { barred, hint, invited, permit, refusal } from "./access.js";
+import { Camera } from "./camera.js";
 import { Drive, SOURCE } from "./drive.js";
 import { Guide } from "./guide.js";
 import { boarded, objection, still } from "./hand.js";
@@ -30,6 +31,7 @@ const LATCHED = ["stopped", "fault"];
 const link = new Link(refused);
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), told);
+const camera = new Camera($("camera"));
 const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
@@ -142,6 +144,7 @@ function looked() {
   views.freshness(old, lasts(), link.way, none, seen, Boolean(state) && !boarded(state));
   if (state && performance.now() - heard > lasts()) views.unheard(silent);
   readied();
+  camera.look(performance.now());
   if (old > 2 * lasts()) drive.release("released: nothing is received from the robot");
   if (view !== "status" || document.hidden) return;
   plots.draw(performance.now());
@@ -230,6 +233,7 @@ function greeted({ detail }) {
   if (!OTHER) $("simulated").hidden = !hello.simulated;
   $("role").textContent = hello.role;
   drive.sender = hello.sender;
+  camera.show(!OTHER && hello.camera);
   drive.limits = hello.limits;
   drive.allowed = !OTHER && !barred(hello, "drive");
   permit(hello, OTHER ? `only on the own page of ${OTHER}` : "");
