@@ -26,7 +26,7 @@ from tests import pictures
 from tests.pictures import VIEWS
 from tests.system.browser import NAME, Hands, Page, answer, hands, run
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
-from tests.system.harness import Bus, Daemon, Program, until
+from tests.system.harness import Bus, Daemon, Peer, Program, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -99,6 +99,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     until(lambda: bus.state()["mode"] == "stopped", 5.0, "it stops")
     page.shows("mode", "STOPPED")
     page.shows("reason", "press Release")
+    assert "stopped by a page at the robot at" in browser.text("reason")
     # A person who still holds the stick does not drive when another person clears.
     browser.touch("End")
     browser.tap("clear")
@@ -519,6 +520,37 @@ def test_a_robot_without_its_board_has_no_speed(tmp_path: Path, browser: Browser
         assert greyed(browser)
 
 
+def test_a_pulled_cable_is_red_and_greys_the_pose_until_it_is_back(
+    tmp_path: Path, peer: Peer, browser: Browser
+) -> None:
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, tmp_path) as server,
+    ):
+        bus.linked()
+        page = Phone(daemon, bus, server, browser)
+        browser.size(*PHONE)
+        browser.open(server.here)
+        page.shows("mode", "READY")
+        before, pose = drawing(browser), colour(browser, "where")
+        peer.unplug()
+        page.shows("mode", "NO BOARD")
+        page.shows("age", "no board")
+        page.shows("doubt", "Nobody can stop the motors from here")
+        assert colour(browser, "mode") == colour(browser, "doubt") == BAD
+        grey = "getComputedStyle(document.getElementById('where')).fontStyle"
+        assert browser.js(grey) == "italic"
+        until(lambda: browser.js(DRAWN) != before, 5.0, "the robot on the map is grey")
+        peer.plug()
+        page.shows("mode", "READY")
+        page.shows("age", "live")
+        assert browser.js(grey) == "normal"
+        assert colour(browser, "where") == pose
+        until(lambda: browser.js(DRAWN) == before, 5.0, "the robot on the map is back")
+        browser.open("about:blank")
+
+
 def row(page: Phone, source: str) -> str:
     """Return the row of a source in the table."""
     rows = "[...document.querySelectorAll('#sources tr')].map(row => row.textContent)"
@@ -696,6 +728,7 @@ def test_a_second_driver_is_told_at_once_who_drives_and_the_ring_is_not_blue(pag
         browser = page.browser
         page.shows("reason", "Driven by another page at the robot.")
         page.shows("who", "another page at the robot")
+        page.shows("hint", "another page at the robot drives: you can when they release.")
         browser.push(0, 0, "Start")
         browser.push(0, 90)
         ring = "getComputedStyle(document.getElementById('stick')).borderColor"
@@ -1136,7 +1169,7 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             )
             browser.tap("stop")
             until(lambda: bus.state()["mode"] == "stopped", 5.0, "a viewer stops")
-            page.shows("reason", "an operator clears it")
+            page.shows("reason", "an operator releases it")
 
 
 REPORT = """(() => {

@@ -172,7 +172,9 @@ function readied() {
   drive.barred = link.open ? still(fresh ? state : null) : "No connection.";
   const off = !drive.allowed || Boolean(drive.barred);
   $("stick").setAttribute("aria-disabled", String(off));
-  views.text("hint", drive.allowed && drive.barred ? drive.barred : hint(hello, OTHER));
+  const taken = state?.mode === "driving" && state.source === SOURCE && state.sender && state.sender !== hello?.sender;
+  const why = drive.barred || (taken ? `${objection(state, SOURCE, hello?.sender)}: you can when they release.` : "");
+  views.text("hint", drive.allowed && why ? why : hint(hello, OTHER));
 }
 
 function stated({ detail }) {

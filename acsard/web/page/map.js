@@ -169,7 +169,7 @@ export class PathMap {
       paper.lineTo(...at(right, n * step));
     }
     paper.stroke();
-    scale(paper, step, step * this.#zoom, look("--ink"));
+    scale(paper, height - 34, step, step * this.#zoom, look("--ink"));
   }
 }
 
@@ -178,18 +178,18 @@ function rotated(x, y, angle) {
   return [x * cos - y * sin, x * sin + y * cos];
 }
 
-/** Draw a bar of `metres`, which is `wide` px. */
-function scale(paper, metres, wide, colour) {
+/** Draw a bar of `metres`, which is `wide` px, at the left, above the words of the pose. */
+function scale(paper, low, metres, wide, colour) {
   paper.strokeStyle = paper.fillStyle = colour;
   paper.lineWidth = 2;
   paper.beginPath();
-  paper.moveTo(10, 24);
-  paper.lineTo(10, 30);
-  paper.lineTo(10 + wide, 30);
-  paper.lineTo(10 + wide, 24);
+  paper.moveTo(10, low - 6);
+  paper.lineTo(10, low);
+  paper.lineTo(10 + wide, low);
+  paper.lineTo(10 + wide, low - 6);
   paper.stroke();
   paper.font = "12px system-ui, sans-serif";
-  paper.fillText(`${metres} m`, 10, 18);
+  paper.fillText(`${metres} m`, 16, low - 5);
 }
 
 /** Draw the robot, and a dashed ray from its front in the direction that it faces. */

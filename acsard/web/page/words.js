@@ -69,11 +69,13 @@ export function reason(state, elsewhere) {
   return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason, elsewhere);
 }
 
-/** Replace service names by button names: of this page, or of the own page of the robot `elsewhere`. */
+/** Replace senders and service names by a person's words. The buttons are those of this page, or of the own page of
+ *  the robot `elsewhere`. */
 export function said(text, elsewhere = "") {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere
     ? { "call srv/clear": `Release is ${there}`, "srv/clear": `Release ${there}`, "call srv/activate": `Switch on is ${there}` }
     : { "call srv/clear": "press Release", "srv/clear": "Release", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on under Settings" };
-  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), text);
+  const named = text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page at the robot");
+  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), named);
 }
