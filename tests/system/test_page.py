@@ -813,6 +813,12 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
     # Nothing is hidden behind an edge that would need scrolling.
     more = "(one => one.scrollHeight - one.clientHeight)(document.querySelector('main'))"
     assert page.browser.js(more) <= 0
+    page.bus.get("srv/deactivate")  # more words above and below the stick
+    page.shows("hint", "Switched off")
+    assert page.browser.js(more) <= 0
+    page.bus.get("srv/stop")
+    page.shows("hint", "Stopped")
+    assert page.browser.js(more) <= 0
     for view in VIEWS:
         page.browser.js(f"document.getElementById('tab-{view}').click()")
         assert page.browser.js("document.documentElement.scrollWidth") <= size[0], view

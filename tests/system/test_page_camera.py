@@ -46,7 +46,8 @@ class Stream:
 
     def __init__(self) -> None:
         self.port = int(free_endpoint().rpartition(":")[2])
-        self.grey, self.runs, self.silent, self.clients = 0, True, False, 0
+        self.grey, self.clients = 0, 0
+        self.runs, self.silent, self.ends = True, False, False
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(5.0)
@@ -64,7 +65,7 @@ class Stream:
         await answer.prepare(request)
         self.clients += 1
         try:
-            while True:
+            while not self.ends:
                 if not self.silent:
                     body = picture(self.grey)
                     head = f"--frame\r\nContent-Length: {len(body)}\r\n\r\n".encode()
@@ -75,8 +76,9 @@ class Stream:
             self.clients -= 1
 
     async def _end(self) -> None:
+        self.ends = True
+        await asyncio.sleep(2 / HZ)
         await self._runner.cleanup()
-        await asyncio.sleep(0.1)  # the cancelled handlers end
 
     def close(self) -> None:
         asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(5.0)

@@ -17,7 +17,7 @@ export const FROZEN = 1000; // after a longer gap the page stood still, and the 
 
 /** What keeps the robot from driving in a mode, and the remedy. */
 const BARS = {
-  inactive: "Switched off. Press Switch on under Settings first.",
+  inactive: "Switched off. Press Switch on first.",
   stopped: "Stopped. Press Release first.",
   fault: "Fault. Press Release first.",
   shutdown: "The robot's daemon is ending.",
@@ -33,7 +33,7 @@ export function boarded(state) {
 /** Return why a push of the stick would not move the robot, in words, or "". */
 export function still(state) {
   if (!state) return "Nothing is received from the robot.";
-  return BARS[state.mode] ?? (boarded(state) ? "" : "No board: the robot's computer cannot reach the motors.");
+  return BARS[state.mode] ?? (boarded(state) ? "" : "No board: nothing can drive.");
 }
 
 /** Return why the robot does not follow `sender`, in words, or "" if it does. */
