@@ -182,3 +182,18 @@ def test_a_robot_without_a_camera_says_which_setting_names_one(tmp_path: Path) -
 
     with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as server:
         asyncio.run(story(server.here))
+
+
+def test_a_stream_that_cannot_be_read_is_named_with_the_reason(tmp_path: Path) -> None:
+    port = free_endpoint().rpartition(":")[2]
+
+    async def story(url: str) -> None:
+        async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as told:
+            assert told.status == 503
+            error = (await told.json())["error"]
+            assert "the camera's stream cannot be read" in error
+            assert port in error
+
+    seen = {"web": {"camera": f"http://127.0.0.1:{port}/stream"}}
+    with Daemon(tmp_path, config=seen) as daemon, Page(daemon, tmp_path) as server:
+        asyncio.run(story(server.here))
