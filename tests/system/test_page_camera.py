@@ -74,6 +74,7 @@ class Stream:
                 await asyncio.sleep(1 / HZ)
         finally:
             self.clients -= 1
+        return answer
 
     async def _end(self) -> None:
         self.ends = True

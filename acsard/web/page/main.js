@@ -11,7 +11,7 @@ import { Minute } from "./plots.js";
 import { Recordings } from "./recordings.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { figure, milliseconds, person, said as clickable, signed, yaw } from "./words.js";
+import { figure, milliseconds, named, person, said as clickable, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const { stopping, alarm } = window; // of stop.js, which has run before
@@ -24,7 +24,7 @@ if (!stopping) {
  *  configures it. */
 const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
 const VIEWS = ["drive", "status", "events", "set", "robots"];
-const words = (told) => clickable(told, OTHER);
+const words = (told) => clickable(named(told), OTHER);
 const READ = 8000; // ms in which a message can be read
 const LATCHED = ["stopped", "fault"];
 

@@ -1,7 +1,7 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./hand.js";
-import { age, ago, clock, person, reason, said, signed } from "./words.js";
+import { age, ago, clock, named, person, reason, said, signed } from "./words.js";
 
 const LEVELS = ["", "warning", "error", "warning"];
 
@@ -42,8 +42,7 @@ export function counters(list, state) {
   );
 }
 
-/** Return the events with equal neighbours made one, which has the time of the first and counts them. An event may
- *  have a count of its own, which includes earlier ones. */
+/** Return the events with equal neighbours made one, which has the time of the first, and their number as `equal`. */
 export function folded(events) {
   const rows = [];
   for (const event of events) {
@@ -51,12 +50,12 @@ export function folded(events) {
     if (last && ["name", "level", "text", "by"].every((key) => last[key] === event[key])) last.equal++;
     else rows.push({ ...event, equal: 1 });
   }
-  return rows.map(({ equal, ...event }) => ({ ...event, count: Math.max(equal, event.count) }));
+  return rows;
 }
 
 export function happened(list, told, elsewhere) {
   const rows = folded([...told.events].reverse()).map((one) => {
-    const by = `${one.by ? ` — ${one.by}` : ""}${one.count > 1 ? ` ×${one.count}` : ""}`;
+    const by = `${one.by ? ` — ${one.by}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
     const head = made("strong", "", one.name.replaceAll("_", " "));
     return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(one.text, elsewhere)}${by}`);
   });
@@ -80,7 +79,7 @@ export function cards(list, robots, own, here) {
     const [, mode, why, what] = card.children;
     card.className = bad;
     mode.textContent = one.mode ?? "silent";
-    why.textContent = said(one.reason ?? "", one.robot === here ? "" : one.robot);
+    why.textContent = said(named(one.reason ?? ""), one.robot === here ? "" : one.robot);
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
   });

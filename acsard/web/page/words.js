@@ -66,16 +66,19 @@ export function person(sender, own = "") {
 export function reason(state, elsewhere) {
   if (state.mode === "ready" && state.reason.startsWith("waiting for a command")) return "Nobody drives.";
   const before = `${state.mode}: `;
-  return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason, elsewhere);
+  return said(named(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason), elsewhere);
 }
 
-/** Replace senders and service names by a person's words. The buttons are those of this page, or of the own page of
- *  the robot `elsewhere`. */
+/** Return a sentence with senders in a person's words. The log keeps their digits, which tell two of one name apart. */
+export function named(text) {
+  return text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page at the robot");
+}
+
+/** Replace service names by button names: of this page, or of the own page of the robot `elsewhere`. */
 export function said(text, elsewhere = "") {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere
     ? { "call srv/clear": `Release is ${there}`, "srv/clear": `Release ${there}`, "call srv/activate": `Switch on is ${there}` }
     : { "call srv/clear": "press Release", "srv/clear": "Release", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on under Settings" };
-  const named = text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page at the robot");
-  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), named);
+  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), text);
 }
