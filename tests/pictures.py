@@ -1,14 +1,15 @@
 """Take pictures of the robot's page and of a recording's report, for people to look at.
 
 `python -m tests.pictures DIRECTORY` writes every view of the page as PNG: on a phone upright and
-sideways and on a desktop, in light and dark colours. It also writes the whole report of a drive,
-1280 and 390 pixels wide. `--report` writes the report alone.
+sideways and on a desktop, in light and dark colours, and the view *Drive* in each state. It also
+writes the whole report of a drive, 1280 and 390 pixels wide. `--report` writes the report alone.
 """
 
 from __future__ import annotations
 
 import itertools
 import random
+import signal
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -75,13 +76,55 @@ def show(browser: Browser, view: str) -> None:
         until(lambda: browser.js(there), 5.0, row)
 
 
-def _picture(browser: Browser, directory: Path, size: str, look: str, view: str) -> Path:
+def _picture(
+    browser: Browser, directory: Path, size: str, look: str, view: str, name: str = ""
+) -> Path:
     browser.size(*SIZES[size], touch=size != "desktop", dark=look == "dark")
     show(browser, view)
     browser.js("new Promise(done => setTimeout(() => requestAnimationFrame(done), 300))")
-    path = directory / f"{size}-{look}-{view}.png"
+    path = directory / f"{size}-{look}-{name or view}.png"
     browser.picture(path)
     return path
+
+
+def states(directory: Path, sizes: Sequence[str] = tuple(SIZES)) -> list[Path]:
+    """Write the view *Drive* in each state, with names like `phone-dark-stopped.png`."""
+    directory.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+
+    def draw(state: str, words: str) -> None:
+        until(lambda: browser.text("mode") == words, 10.0, words)
+        for size, look in itertools.product(sizes, LOOKS):
+            written.append(_picture(browser, directory, size, look, "drive", state))
+
+    with tempfile.TemporaryDirectory() as place, browsing() as browser:
+        there = Path(place)
+        with Daemon(there) as daemon, Bus(daemon.endpoint) as bus, Page(daemon, there) as page:
+            bus.linked()
+            browser.size(*PHONE)
+            browser.open(page.here)
+            draw("ready", "READY")
+            with bus.commanding(0.2, source="teleop"):
+                draw("another-drives", "DRIVING")
+            bus.at_rest()
+            bus.get("srv/stop")
+            draw("stopped", "STOPPED")
+            bus.get("srv/clear")
+            bus.get("srv/deactivate")
+            draw("inactive", "INACTIVE")
+            daemon.signal(signal.SIGSTOP)
+            try:
+                draw("no-data", "NO DATA")
+            finally:
+                daemon.signal(signal.SIGCONT)
+            page.process.kill()
+            draw("no-connection", "NO CONNECTION")
+    with tempfile.TemporaryDirectory() as place, browsing() as browser:
+        there = Path(place)
+        with Daemon(there, there / "none") as daemon, Page(daemon, there) as page:
+            browser.open(page.here)
+            draw("no-board", "NO BOARD")
+    return written
 
 
 DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
@@ -121,7 +164,7 @@ def _recorded(path: Path) -> Path:
 
 def main() -> None:
     *words, directory = sys.argv[1:]
-    for write_one in (report,) if words == ["--report"] else (write, report):
+    for write_one in (report,) if words == ["--report"] else (write, states, report):
         for path in write_one(Path(directory)):
             print(path)
 

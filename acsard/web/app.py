@@ -31,6 +31,7 @@ from acsard.web.admission import WHO, Admission, own_port, peer_of
 from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
 from acsard.web.calls import Calls
+from acsard.web.camera import Camera
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE, Files
@@ -102,18 +103,21 @@ class Page:
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
         self._guide, self._counts, self._vault = guide, counts, vault
         self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
-        self._seats = Seats()
+        self._seats, self._camera = Seats(), Camera(rules.camera)
+        self._has_camera = bool(rules.camera)
         self._viewers: set[Viewer] = set()
         self._admission = Admission(robots.id, names, vault, acceptor, counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """End the report and every connection; `Viewer.end` also stops a robot that a viewer is
-        driving.
+        """End the report, the camera and every connection.
+
+        `Viewer.end` also stops a robot that a viewer is driving.
 
         `why` is sent as the close reason, at most 120 characters.
         """
         self._reports.end()
+        self._camera.close()
         for viewer in list(self._viewers):
             viewer.end(why)
 
@@ -189,7 +193,7 @@ class Page:
             _limit_buffer(request)
             viewer = Viewer(
                 served, request, who, self._robots, self._hand, self._calls, self._fleet,
-                self._guide, self._counts,
+                self._guide, self._counts, camera=self._has_camera,
             )  # fmt: skip
             self._viewers.add(viewer)
             try:
@@ -246,6 +250,15 @@ class Page:
         verb = request.path.removeprefix("/api/srv/")
         told = await self._calls.call(request[WHO], verb, given, robot)
         return reply(told, 200 if told.success else 409)
+
+    async def picture(self, request: web.Request) -> web.StreamResponse:
+        """Return the newest picture of the camera, once the client has not seen it."""
+        seen = request.headers.get("If-None-Match", "").strip('"')
+        picture = await self._camera.after(int(seen) if seen.isdecimal() and len(seen) < 16 else 0)
+        if picture is None:
+            return web.Response(status=304)
+        told = {"ETag": f'"{picture.number}"', "Age-Ms": str(picture.age_ms)}
+        return web.Response(body=picture.body, content_type="image/jpeg", headers=told)
 
     async def recordings(self, request: web.Request) -> web.StreamResponse:
         return reply(await self._box.rows())
@@ -336,6 +349,11 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/api/guide", Begin.least, Page.guide,
         "the values that `begin` on the WebSocket accepts: methods of calibration, ports to check",
         gives={200: Body("The choices.", Choices)}),
+    Route("GET", "/api/camera", "viewer", Page.picture,
+        "the newest picture of the camera, and its age in ms as the header `Age-Ms`; with the "
+        "`ETag` of the last one as `If-None-Match` it waits up to a second for a newer one",
+        gives={200: Body("A picture.", str, "image/jpeg"),
+               304: Body("There is no newer picture.", media="")}),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
         gives={200: Body("A list.", list[Recording])}),

@@ -39,6 +39,8 @@ class Greeting(Struct, frozen=True):
     barred: Mapping[str, str]
     """The actions that this viewer's role does not allow, each with the reason: services, and
     "drive", "recordings" and "begin"."""
+    camera: bool
+    """Whether `GET /api/camera` has pictures."""
 
 
 class Hello(Struct, frozen=True):

@@ -80,8 +80,10 @@ class Viewer:
         fleet: Fleet,
         guide: Guide,
         counts: Counts,
+        *,
+        camera: bool,
     ) -> None:
-        self.who = who
+        self.who, self._camera = who, camera
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, robots.certificate)
@@ -280,6 +282,7 @@ class Viewer:
                 for what, least in ACTIONS.items()
                 if not self.who.may(least)
             },
+            self._camera,
         )
         self._out.say(socket_messages.Hello(greeting))
 

@@ -26,7 +26,7 @@ from tests import pictures
 from tests.pictures import VIEWS
 from tests.system.browser import NAME, Hands, Page, answer, hands, run
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
-from tests.system.harness import Bus, Daemon, Program, until
+from tests.system.harness import Bus, Daemon, Peer, Program, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -98,7 +98,8 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     browser.tap("stop")
     until(lambda: bus.state()["mode"] == "stopped", 5.0, "it stops")
     page.shows("mode", "STOPPED")
-    page.shows("reason", "press Clear")
+    page.shows("reason", "press Release")
+    assert "stopped by a page at the robot at" in browser.text("reason")
     # A person who still holds the stick does not drive when another person clears.
     browser.touch("End")
     browser.tap("clear")
@@ -125,7 +126,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     page.hold()
     bus.get("srv/stop")  # by another client
     page.shows("told", "the reason is shown above")
-    assert browser.js("document.body.innerText").count("press Clear") == 1
+    assert browser.js("document.body.innerText").count("press Release") == 1
     bus.get("srv/clear")
     page.shows("mode", "READY")
     # The finger is still down.
@@ -478,7 +479,27 @@ def test_a_page_that_comes_when_nothing_is_heard_waits_and_shows_nothing_as_meas
         page.daemon.signal(signal.SIGCONT)
     page.shows("age", "live")
     page.shows("mode", "READY")
-    page.shows("speed", "0.00 of 0.00 m/s")
+    page.shows("speed", "0.00 m/s")
+    page.shows("speed-wish", "wish 0.00")
+
+
+BAD, BLUE = "rgb(179, 22, 11)", "rgb(11, 92, 173)"
+"""The colours of trouble and of the stick that drives, in the light style."""
+
+HELD = "document.getElementById('stick').matches('.held')"
+
+HEX = r"[0-9a-f]{16}"
+"""The digits of a public name, which tell a person nothing."""
+
+
+def colour(browser: Browser, name: str) -> str:
+    """Return the colour of an element's words."""
+    return str(browser.js(f"getComputedStyle(document.getElementById({name!r})).color"))
+
+
+def greyed(browser: Browser) -> bool:
+    """Return whether the stick looks as if it does not drive."""
+    return bool(browser.js("document.getElementById('stick').ariaDisabled === 'true'"))
 
 
 def test_a_robot_without_its_board_has_no_speed(tmp_path: Path, browser: Browser) -> None:
@@ -489,10 +510,45 @@ def test_a_robot_without_its_board_has_no_speed(tmp_path: Path, browser: Browser
     ):
         page = Phone(daemon, bus, server, browser)
         browser.open(server.here)
+        page.shows("mode", "NO BOARD")
+        page.shows("age", "no board")
+        page.shows("doubt", "Nobody can stop the motors from here")
+        page.shows("speed", "– m/s")
+        page.shows("hint", "No board")
+        assert browser.text("turn") == "– rad/s"
+        assert colour(browser, "mode") == colour(browser, "age") == BAD
+        assert greyed(browser)
+
+
+def test_a_pulled_cable_is_red_and_greys_the_pose_until_it_is_back(
+    tmp_path: Path, peer: Peer, browser: Browser
+) -> None:
+    with (
+        Daemon(tmp_path, peer.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, tmp_path) as server,
+    ):
+        bus.linked()
+        page = Phone(daemon, bus, server, browser)
+        browser.size(*PHONE)
+        browser.open(server.here)
+        page.shows("mode", "READY")
+        before, pose = drawing(browser), colour(browser, "where")
+        peer.unplug()
+        page.shows("mode", "NO BOARD")
+        page.shows("age", "no board")
+        page.shows("doubt", "Nobody can stop the motors from here")
+        assert colour(browser, "mode") == colour(browser, "doubt") == BAD
+        grey = "getComputedStyle(document.getElementById('where')).fontStyle"
+        assert browser.js(grey) == "italic"
+        until(lambda: browser.js(DRAWN) != before, 5.0, "the robot on the map is grey")
+        peer.plug()
+        page.shows("mode", "READY")
         page.shows("age", "live")
-        page.shows("mode", "WAITING")
-        page.shows("speed", "– of ")
-        assert "– of " in browser.text("turn")
+        assert browser.js(grey) == "normal"
+        assert colour(browser, "where") == pose
+        until(lambda: browser.js(DRAWN) == before, 5.0, "the robot on the map is back")
+        browser.open("about:blank")
 
 
 def row(page: Phone, source: str) -> str:
@@ -530,10 +586,11 @@ STEADY = 5
 """Number of looks, one every 100 ms, at which nothing has changed any more."""
 
 
-def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
-    """Each button changes the drawing, and the reverse button restores it."""
-    browser = page.browser
-    # Messages at the beginning (the robot's place, a banner that goes) change the drawing, too.
+def drawing(browser: Browser) -> str:
+    """Return the map once nothing changes it any more.
+
+    Messages at the beginning (the robot's place, a banner that goes) change it, too.
+    """
     looks = [str(n) for n in range(STEADY)]
 
     def stands() -> bool:
@@ -541,7 +598,13 @@ def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) 
         return len({*looks[-STEADY:]}) == 1
 
     until(stands, 5.0, "it stands")
-    begun = looks[-1]
+    return looks[-1]
+
+
+def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
+    """Each button changes the drawing, and the reverse button restores it."""
+    browser = page.browser
+    begun = drawing(browser)
 
     def drawn(anew: bool, what: str) -> None:
         until(lambda: (browser.js(DRAWN) != begun) is anew, 5.0, what)
@@ -559,18 +622,162 @@ def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) 
     drawn(False, "as before again")
 
 
+def test_the_map_turns_with_the_robot_and_back(page: Phone) -> None:
+    browser = page.browser
+    page.bus.get("srv/set_pose", {"x": 0.0, "y": 0.0, "yaw": 1.0})
+    page.shows("where", "57°")
+    before = drawing(browser)
+    browser.js("document.getElementById('turns').click()")
+    until(lambda: browser.js(DRAWN) != before, 5.0, "it is turned")
+    assert browser.js("document.getElementById('turns').ariaPressed") == "true"
+    browser.js("document.getElementById('turns').click()")
+    until(lambda: browser.js(DRAWN) == before, 5.0, "as before")
+
+
+def test_the_dials_say_wish_and_measurement_in_one_line_and_offer_degrees(page: Phone) -> None:
+    browser = page.browser
+    page.browser.push(0, 0, "Start")
+    page.browser.push(-80, 0)
+    page.shows("turn-wish", "wish 0.")
+    lines = (
+        "[...document.querySelectorAll('#speed, #turn')].map(one => one.getClientRects().length)"
+    )
+    wide = (
+        "[...document.querySelectorAll('.dials > *')].map(one => one.scrollWidth - one.clientWidth)"
+    )
+    assert browser.js(lines) == [1, 1]
+    assert max(browser.js(wide)) <= 0
+    browser.touch("End")
+    page.bus.at_rest()
+    assert browser.text("turn").endswith(" rad/s")
+    browser.js("document.getElementById('unit').click()")
+    assert browser.text("turn") == "0 °/s"
+    browser.js("document.getElementById('unit').click()")
+    assert browser.text("turn") == "0.00 rad/s"
+
+
+FOLDED = """import('/page/views.js').then(({folded}) => folded([
+    {name: 'refused', level: 'warning', text: 'a', by: ''},
+    {name: 'refused', level: 'warning', text: 'a', by: ''},
+    {name: 'refused', level: 'warning', text: 'b', by: ''},
+    {name: 'refused', level: 'warning', text: 'a', by: ''},
+]).map(one => [one.text, one.equal]))"""
+
+
+def test_equal_events_in_a_row_are_one_with_a_count(page: Phone) -> None:
+    assert page.browser.js(FOLDED) == [["a", 2], ["b", 1], ["a", 1]]
+
+
+PERSON = """import('/page/words.js').then(({person}) => [
+    person('here/0123456789abcdef', 'here/0123456789abcdef'),
+    person('here/0123456789abcdef', 'here/fedcba9876543210'),
+    person('phone/0123456789abcdef [robot]', 'here/fedcba9876543210'),
+    person('phone/0123456789abcdef [robot]', 'phone/fedcba9876543210 [robot]'),
+    person('0123456789abcdef'), person('0123456789abcdef [laptop]'), person('0b5d (rmw)')])"""
+
+
+def test_a_sender_has_the_name_that_a_person_knows(page: Phone) -> None:
+    assert page.browser.js(PERSON) == [
+        "you",
+        "another page at the robot",
+        "phone",
+        "another page of phone",
+        "a program without a name",
+        "laptop",
+        "0b5d (rmw)",
+    ]
+
+
+def test_a_refusal_of_a_button_disappears_when_the_mode_changes(page: Phone) -> None:
+    page.bus.get("srv/stop")
+    page.shows("mode", "STOPPED")
+    page.browser.js("document.getElementById('activate').click()")
+    page.shows("alarm", "Release")
+    page.bus.get("srv/clear")
+    page.shows("mode", "READY")
+    until(lambda: page.browser.text("alarm") == "", 5.0, "the refusal is gone")
+
+
 def test_somebody_else_who_drives_is_named(page: Phone) -> None:
     with page.bus.commanding(0.1, source="teleop"):
         page.browser.tap("tab-status")
         until(lambda: "drives" in row(page, "teleop"), 5.0, "who drives is in the table")
         assert row(page, "app").endswith("a command")  # the command for which it waits
         page.browser.tap("tab-drive")
-        page.shows("who", "teleop")
-        assert page.browser.text("who") != "you"
+        until(lambda: page.browser.text("who") not in ("–", "nobody", "you"), 5.0, "who drives")
+        assert re.search(HEX, page.browser.text("who")) is None
         page.browser.push(0, 0, "Start")
         page.browser.push(0, 90)
-        page.shows("told", "another client drives")
+        page.shows("told", "drives")
         page.browser.touch("End")
+    page.shows("reason", "Nobody drives.")
+    page.shows("told", "")
+    until(lambda: page.browser.text("told") == "", 5.0, "the old message is gone")
+
+
+def test_a_second_driver_is_told_at_once_who_drives_and_the_ring_is_not_blue(page: Phone) -> None:
+    async def story() -> None:
+        async with hands(page.server) as other:
+            await other.say(subscribe="state", rate=10)
+            await other.until_driving(0.1)
+            driving = asyncio.create_task(other.hold(0.1, 30.0))
+            await asyncio.to_thread(look)
+            driving.cancel()
+
+    def look() -> None:
+        browser = page.browser
+        page.shows("reason", "Driven by another page at the robot.")
+        page.shows("who", "another page at the robot")
+        page.shows("hint", "another page at the robot drives: you can when they release.")
+        browser.push(0, 0, "Start")
+        browser.push(0, 90)
+        ring = "getComputedStyle(document.getElementById('stick')).borderColor"
+        looks = [(browser.js(ring), browser.js(HELD)) for _ in range(20)]
+        browser.touch("End")
+        assert any(held for _, held in looks)
+        assert BLUE not in {colour for colour, _ in looks}
+
+    run(story)
+
+
+def test_the_stick_is_grey_and_says_why_in_each_mode_in_which_it_does_not_drive(
+    page: Phone,
+) -> None:
+    browser, bus = page.browser, page.bus
+    assert not greyed(browser)
+    page.shows("reason", "Nobody drives.")
+    page.shows("stop", "STOP")
+    bus.get("srv/stop")
+    page.shows("hint", "Stopped. Press Release first.")
+    assert greyed(browser)
+    page.shows("stop", "STOPPED")
+    assert browser.text("clear") == "Release STOP"
+    commands = bus.count("commands")
+    browser.push(0, 0, "Start")
+    browser.push(0, 90)
+    browser.touch("End")
+    assert browser.js(HELD) is False
+    assert bus.count("commands") == commands
+    browser.js("document.getElementById('clear').click()")
+    page.shows("hint", "Hold and push to drive")
+    until(lambda: browser.text("stop").strip() == "STOP", 5.0, "STOP is released")
+    bus.get("srv/deactivate")
+    page.shows("hint", "Switched off.")
+    assert greyed(browser)
+    bus.get("srv/activate")
+    page.shows("hint", "Hold and push to drive")
+    assert not greyed(browser)
+    page.daemon.signal(signal.SIGSTOP)
+    try:
+        page.shows("hint", "Nothing is received from the robot.")
+        assert greyed(browser)
+    finally:
+        page.daemon.signal(signal.SIGCONT)
+    page.shows("hint", "Hold and push to drive")
+    page.server.process.kill()
+    page.shows("hint", "No connection.")
+    assert greyed(browser)
+    assert browser.js("document.title").startswith("NO CONNECTION · ")
 
 
 SMALL, SMALL_SIDEWAYS = (375, 667), (667, 375)
@@ -606,6 +813,12 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
     # Nothing is hidden behind an edge that would need scrolling.
     more = "(one => one.scrollHeight - one.clientHeight)(document.querySelector('main'))"
     assert page.browser.js(more) <= 0
+    page.bus.get("srv/deactivate")  # more words above and below the stick
+    page.shows("hint", "Switched off")
+    assert page.browser.js(more) <= 0
+    page.bus.get("srv/stop")
+    page.shows("hint", "Stopped")
+    assert page.browser.js(more) <= 0
     for view in VIEWS:
         page.browser.js(f"document.getElementById('tab-{view}').click()")
         assert page.browser.js("document.documentElement.scrollWidth") <= size[0], view
@@ -613,7 +826,7 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
 
 def test_what_is_pressed_is_large_enough_for_a_finger(page: Phone) -> None:
     page.bus.get("srv/stop")
-    page.shows("mode", "STOPPED")  # together with Clear
+    page.shows("mode", "STOPPED")  # together with Release
     for size, view in itertools.product((PHONE, SIDEWAYS, SMALL_SIDEWAYS), VIEWS):
         page.browser.size(*size)
         pictures.show(page.browser, view)
@@ -776,7 +989,7 @@ def by_hand(page: Phone, script: str) -> list[Any]:
     return list(page.browser.js(HAND.replace("SCRIPT", script)))
 
 
-STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
+STOPPING = """(async () => {
     const out = [], now = Date.now;
     let ok = false, lost = true;
     const send = async () => (out.push("sent"), {ok, lost, text: "no answer"});
@@ -788,7 +1001,7 @@ STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
     Date.now = now;
     delete performance.now;
     return out;
-})"""
+})()"""
 
 FAILS = ["sent", "STOP: no answer; this page sends it again"]
 """The expected trace of a first attempt that gets no answer."""
@@ -874,7 +1087,7 @@ def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Ph
             "hand.press(-1); look(0, driving);"
             "for (let now = 100; now <= 600; now += 100)"
             " look(now, {...driving, sender: 'other'})",
-            "another client drives",
+            "other drives",
         ),
     ],
 )
@@ -925,7 +1138,7 @@ def test_what_strangers_write_is_text(page: Phone) -> None:
     page.browser.tap("tab-events")
     page.shows("happened", "refused")
     assert page.browser.js("document.querySelectorAll('#happened img').length") == 0
-    assert page.browser.js("document.title") == "acsar"
+    assert page.browser.js("document.title") == "READY · acsar"
 
 
 WORDS = """one => one.getAttribute('aria-describedby')?.split(' ')
@@ -953,6 +1166,7 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             assert all("for operators; you are viewer" in one for one in described)
             page.shows("barred", "for operators; you are viewer")
             page.shows("hint", "You may watch and stop, but not drive")
+            assert browser.js("document.getElementById('tab-set').checkVisibility()") is False
             browser.tap("tab-events")
             page.shows("recordings", "download and report are for operators")
             assert (
@@ -961,7 +1175,7 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             )
             browser.tap("stop")
             until(lambda: bus.state()["mode"] == "stopped", 5.0, "a viewer stops")
-            page.shows("reason", "an operator clears it")
+            page.shows("reason", "an operator releases it")
 
 
 REPORT = """(() => {
@@ -1085,9 +1299,9 @@ SEEN = """(() => {
 @pytest.mark.parametrize("size", [PHONE, DESKTOP])
 def test_the_signs_of_the_map_are_explained(page: Phone, size: tuple[int, int]) -> None:
     page.browser.size(*size, touch=size == PHONE)
-    for name, word in (("recentre", "Follow"), ("erase", "Erase")):
+    for name, word in (("recentre", "Follow"), ("turns", "Turn"), ("erase", "Erase")):
         button = f"document.getElementById({name!r})"
         label = page.browser.js(f"{button}.getAttribute('aria-label')")
         assert label == page.browser.js(f"{button}.title")
         assert label.startswith(word)
-        assert (word in page.browser.js(f"{button}.innerText")) is (size == DESKTOP)
+        assert word in page.browser.js(f"{button}.innerText")

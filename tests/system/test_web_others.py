@@ -153,13 +153,13 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         browser.tap("stop")
         until(lambda: two.theirs.state()["mode"] == "stopped", 5.0, "it stops")
         shows("mode", "STOPPED")
-        # There is no Clear button here, and no text mentions one.
-        shows("reason", f"Clear is on the own page of {THEIRS}")
+        # There is no Release button here, and no text mentions one.
+        shows("reason", f"Release is on the own page of {THEIRS}")
         assert browser.js("document.getElementById('clear').hidden") is True
         browser.tap("tab-robots")
-        shows("cards", f"Clear is on the own page of {THEIRS}")
+        shows("cards", f"Release is on the own page of {THEIRS}")
         browser.tap("tab-drive")
-        assert "press Clear" not in browser.js("document.body.textContent")
+        assert "press Release" not in browser.js("document.body.textContent")
         assert two.ours.state()["mode"] == "ready"
         assert before == (two.theirs.count("commands"), two.ours.count("commands"))
         two.theirs.ask("srv/clear")

@@ -82,6 +82,19 @@ WebOrigin = Annotated[
         },
     ),
 ]
+WebCamera = Annotated[
+    str,
+    Meta(
+        pattern=(
+            r"^(|https?://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9.-]{1,253})(:[0-9]{1,5})?"
+            r"(/[!-~]{0,200})?)\Z"
+        ),
+        extra={
+            "unit": "the http(s):// address of an MJPEG stream, or empty",
+            "example": "http://127.0.0.1:8081/stream",
+        },
+    ),
+]
 FaultName = Annotated[
     str,
     Meta(
@@ -337,6 +350,7 @@ class WebConfig(Struct, frozen=True):
     )
     local: Role = "maintainer"
     origins: Annotated[tuple[WebOrigin, ...], Meta(max_length=16)] = ()
+    camera: WebCamera = ""
 
 
 class SimConfig(Struct, frozen=True):

@@ -34,6 +34,7 @@ export class Drive {
   limits = { linear: 0, angular: 0 };
   limit = 0.2;
   allowed = false;
+  barred = "no connection yet"; // why a push would not move the robot, in words
   shown = true; // the view with the stick is visible
 
   constructor(link, stick, knob, told) {
@@ -48,6 +49,11 @@ export class Drive {
     return this.#hand.held;
   }
 
+  /** Whether a gamepad is connected that does not drive. */
+  get strange() {
+    return this.#padStrange;
+  }
+
   /** Release the active input and send a zero command; `why` is shown to the operator. */
   release(why = "") {
     this.#by = this.#pointer = null;
@@ -60,7 +66,7 @@ export class Drive {
   }
 
   #press(by) {
-    if (!this.allowed || !this.shown || this.#hand.held) return;
+    if (!this.allowed || this.barred || !this.shown || this.#hand.held) return;
     clearTimeout(this.#again);
     this.#by = by;
     this.#told("");
@@ -71,7 +77,9 @@ export class Drive {
     this.#look();
   }
 
+  /** Show whether the robot follows this page. While another sender drives, the ring is not blue. */
   #look() {
+    this.stick.classList.toggle("follows", this.#hand.phase === "driving");
     this.#hand.wish(...twist(...this.#push, this.limit, this.limits));
     const { send, ended } = this.#hand.look(performance.now(), this.state, this.heard, SOURCE, this.sender);
     if (send) this.#send(send);
@@ -92,7 +100,7 @@ export class Drive {
     clearTimeout(this.#again);
     const last = performance.now() + 3 * TWICE;
     this.#again = setTimeout(() => !document.hidden && performance.now() < last && this.#send(ZERO), TWICE);
-    this.stick.classList.remove("held");
+    this.stick.classList.remove("held", "follows");
     awake("stick", false);
     this.#told(why);
   }
@@ -190,6 +198,7 @@ export class Drive {
     const pad = pads.find((one) => one.mapping === "standard");
     const strange = !pad && pads.length > 0;
     if (strange && !this.#padStrange && this.allowed) this.#told(STRANGE);
+    if (!strange && this.#padStrange) this.#told("");
     this.#padStrange = strange && this.allowed;
     const held = pad ? SHOULDERS.some((n) => pad.buttons[n]?.pressed) : false;
     if (held && this.#by === "pad") this.#show(farther(pad.axes[0], pad.axes[2]), -farther(pad.axes[1], 0));

@@ -6,6 +6,8 @@
 // zero (`drive.js` repeats it once), then nothing. A hold that ended by itself needs a new press, so a finger
 // that was left on the stick never drives again by accident.
 
+import { person } from "./words.js";
+
 export const PERIOD = 50;
 export const OPENING = 20;
 export const PATIENCE = 2000; // for the robot to follow after a press
@@ -13,8 +15,26 @@ export const GRACE = 500; // for the robot to follow again after an interruption
 export const HICCUP = 250; // between two looks; after a longer gap the robot has braked, so the hold opens again with zeros
 export const FROZEN = 1000; // after a longer gap the page stood still, and the finger may be gone
 
+/** What keeps the robot from driving in a mode, and the remedy. */
+const BARS = {
+  inactive: "Switched off. Press Switch on first.",
+  stopped: "Stopped. Press Release first.",
+  fault: "Fault. Press Release first.",
+  shutdown: "The robot's daemon is ending.",
+};
 const NEVER = ["inactive", "stopped", "fault", "shutdown"];
 export const ZERO = { linear_x: 0, angular_z: 0 };
+
+/** Return whether the link to the board is up. While it is not, nobody can stop the motors from here. */
+export function boarded(state) {
+  return state.link === "up";
+}
+
+/** Return why a push of the stick would not move the robot, in words, or "". */
+export function still(state) {
+  if (!state) return "Nothing is received from the robot.";
+  return BARS[state.mode] ?? (boarded(state) ? "" : "No board: nothing can drive.");
+}
 
 /** Return why the robot does not follow `sender`, in words, or "" if it does. */
 export function objection(state, source, sender) {
@@ -24,7 +44,7 @@ export function objection(state, source, sender) {
   if (!ours) return `${source} is not one of the robot's sources`;
   if (state.source !== source) return ours.waits_for === "a command" ? "the robot has not received a command yet" : ours.waits_for || state.reason || "the robot does not follow this source";
   if (state.mode !== "driving") return state.reason;
-  if (state.sender && state.sender !== sender) return `another client drives as ${source}: ${state.sender}`;
+  if (state.sender && state.sender !== sender) return `${person(state.sender, sender)} drives`;
   return "";
 }
 

@@ -1,32 +1,38 @@
 // The page: one link, one drive control, and the views.
 
-import { invited, refusal } from "./access.js";
+import { barred, hint, invited, permit, refusal } from "./access.js";
+import { Camera } from "./camera.js";
 import { Drive, SOURCE } from "./drive.js";
 import { Guide } from "./guide.js";
-import { objection } from "./hand.js";
+import { boarded, objection, still } from "./hand.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
-import { Minute } from "./minute.js";
+import { Minute } from "./plots.js";
 import { Recordings } from "./recordings.js";
-import { barred, hint, permit } from "./roles.js";
 import { Settings } from "./settings.js";
-import { Stopping } from "./stopping.js";
 import * as views from "./views.js";
-import { figure, milliseconds, said as clickable, signed, yaw } from "./words.js";
+import { figure, milliseconds, named, person, said as clickable, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
+const { stopping, alarm } = window; // of stop.js, which has run before
+if (!stopping) {
+  $("alarm").hidden = false;
+  views.text("alarm", "STOP does not work here, because a part of this page did not load. Reload the page.");
+  throw new Error("stop.js did not load, and a page without STOP does not drive");
+}
 /** Id of another robot that this page shows. It can be watched and stopped here; its own page drives and
  *  configures it. */
 const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
-const VIEWS = ["drive", "status", "events", "set", "robots"].filter((name) => !(OTHER && name === "set"));
-const words = (told) => clickable(told, OTHER);
+const VIEWS = ["drive", "status", "events", "set", "robots"];
+const words = (told) => clickable(named(told), OTHER);
+const READ = 8000; // ms in which a message can be read
 const LATCHED = ["stopped", "fault"];
 
 const link = new Link(refused);
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), told);
+const camera = new Camera($("camera"));
 const guide = new Guide(link);
-const stopping = new Stopping(() => (link.open ? link.call("stop", undefined, OTHER) : posted()), views.alarm);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
 const plots = new Minute();
@@ -39,10 +45,18 @@ let tried = false; // a connection was attempted
 let seen = false; // a state was received at some time
 let silent = ""; // why the robot is silent, as reported by the page's server
 let uninvited = ""; // why the invitation was rejected
+let degrees = false; // turn rates are shown in degrees per second
+let note = { why: "", at: 0 }; // the message at the stick and its time, by performance.now()
+let complains = false; // the alarm says why a button failed
 let period = 0; // seconds between two states of another robot
 
+/** Whether this page has a view of settings: another robot has it on its own page, and a viewer may do nothing there. */
+function settable() {
+  return !OTHER && (!hello || !barred(hello, "activate"));
+}
+
 function open(name) {
-  view = VIEWS.includes(name) ? name : "drive";
+  view = name;
   for (const one of VIEWS) {
     $(one).hidden = one !== view;
     $(`tab-${one}`).setAttribute("aria-selected", String(one === view));
@@ -63,27 +77,10 @@ function followed(key, rate, wanted) {
   else link.unsubscribe(key);
 }
 
-function stop() {
-  drive.release();
-  guide.leave();
-  stopping.press();
-}
-
-/** Send STOP by HTTP, without the WebSocket: the server may have refused this page's connection. */
-async function posted() {
-  try {
-    const body = JSON.stringify({ robot: OTHER });
-    const answer = await fetch("api/srv/stop", { method: "POST", body, signal: AbortSignal.timeout(3000) });
-    const told = await answer.json();
-    return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
-  } catch {
-    return { ok: false, lost: true, text: "no connection to the robot" };
-  }
-}
-
 async function asked(verb, payload) {
   const told = await link.call(verb, payload);
-  views.alarm(told.ok ? "" : words(told.text)); // the alarm is visible in every view
+  complains = !told.ok;
+  alarm(told.ok ? "" : words(told.text)); // the alarm is visible in every view
   said(told.ok ? told : { ok: true, text: "" });
 }
 
@@ -94,6 +91,7 @@ async function set(payload) {
 
 /** Show a message at the stick. A reason that the banner already shows is not repeated. */
 function told(why) {
+  note = { why, at: performance.now(), objects: Boolean(why) && why === objection(state, SOURCE, hello?.sender) };
   views.text("told", why && why === state?.reason ? "not driving: the reason is shown above" : words(why));
 }
 
@@ -143,12 +141,40 @@ function lasts() {
 function looked() {
   const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
-  views.freshness(old, lasts(), link.way, none, seen);
+  views.freshness(old, lasts(), link.way, none, seen, Boolean(state) && !boarded(state));
   if (state && performance.now() - heard > lasts()) views.unheard(silent);
+  readied();
+  camera.look(performance.now());
   if (old > 2 * lasts()) drive.release("released: nothing is received from the robot");
   if (view !== "status" || document.hidden) return;
   plots.draw(performance.now());
   views.text("unknown", plots.lacks(performance.now()));
+}
+
+/** Drop what a button or a press of the stick was told in the mode before. */
+function outdated() {
+  if (complains) alarm("");
+  complains = false;
+  if (note.why && (note.why === state.reason || LATCHED.includes(state.mode))) told("");
+}
+
+/** Drop a message at the stick whose cause is gone: at once if it is what keeps the robot from following this page,
+ *  otherwise after a time to read it. */
+function forgotten() {
+  if (!note.why || drive.held || drive.strange) return;
+  const why = objection(state, SOURCE, hello?.sender);
+  if (note.objects ? why !== note.why : performance.now() - note.at > READ) told("");
+}
+
+/** Grey the stick while a push would not move the robot, and say why beside it. */
+function readied() {
+  const fresh = link.open && performance.now() - heard <= 2 * lasts();
+  drive.barred = link.open ? still(fresh ? state : null) : "No connection.";
+  const off = !drive.allowed || Boolean(drive.barred);
+  $("stick").setAttribute("aria-disabled", String(off));
+  const taken = state?.mode === "driving" && state.source === SOURCE && state.sender && state.sender !== hello?.sender;
+  const why = drive.barred || (taken ? `${objection(state, SOURCE, hello?.sender)}: you can when they release.` : "");
+  views.text("hint", drive.allowed && why ? why : hint(hello, OTHER));
 }
 
 function stated({ detail }) {
@@ -156,44 +182,66 @@ function stated({ detail }) {
   if (!state && detail.age > 2 * lasts()) return;
   const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
   if (since > 0) period = Math.min(since, 10);
-  // A message about a stop is outdated once the stop is cleared.
-  if (LATCHED.includes(state?.mode) && !LATCHED.includes(detail.value.mode)) views.text("told", "");
+  if (state && state.mode !== detail.value.mode) outdated();
   seen = true;
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
   // The daemon's stop does not end a running check, so it confirms STOP only if none is running.
   if (LATCHED.includes(state.mode) && !guide.going) stopping.heard(heard - link.lag);
-  views.banner(state, Boolean(hello?.barred.clear), OTHER);
+  views.banner(state, Boolean(hello?.barred.clear), OTHER, hello?.sender);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
-  const mine = state.source === SOURCE && state.sender === hello?.sender;
-  views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "no source");
+  readied();
+  map.lose(!boarded(state));
+  const who = state.sender ? person(state.sender, hello?.sender) : state.source;
+  views.text("who", !state.source ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
   const { linear, angular } = state; // null without feedback from the board
-  views.text("speed", `${figure(linear, 2)} of ${figure(wished?.linear, 2)} m/s`);
-  views.text("turn", `${figure(angular, 2)} of ${figure(wished?.angular, 2)} rad/s`);
+  dialled();
+  forgotten();
   const late = state.latencies.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
   plots.speed.add(heard, linear, null);
   plots.turn.add(heard, angular, null);
   if (view !== "status") return;
-  views.sources($("sources"), state);
+  views.sources($("sources"), state, hello?.sender);
   views.counters($("counters"), state);
+}
+
+/** Show the measured speeds and the wished ones, of which only the wish is known without feedback. */
+function dialled() {
+  const [unit, times, decimals] = degrees ? ["°/s", 180 / Math.PI, 0] : ["rad/s", 1, 2];
+  const shown = (value, by = 1) => (value === null || value === undefined ? null : value * by);
+  views.text("speed", `${figure(state.linear, 2)} m/s`);
+  views.text("speed-wish", `wish ${figure(wished?.linear, 2)}`);
+  views.text("turn", `${figure(shown(state.angular, times), decimals)} ${unit}`);
+  views.text("turn-wish", `wish ${figure(shown(wished?.angular, times), decimals)}`);
+}
+
+/** Show turn rates in the other unit. */
+function converted() {
+  degrees = !degrees;
+  $("unit").title = `Show the turn in ${degrees ? "radians" : "degrees"} per second`;
+  if (state) dialled();
 }
 
 function greeted({ detail }) {
   hello = detail.hello;
   if (OTHER === hello.robot) return location.replace("./");
-  $("robot").textContent = document.title = OTHER ?? hello.robot;
+  $("robot").textContent = OTHER ?? hello.robot;
+  // A viewer may do nothing in the settings.
+  $("tab-set").hidden = !settable();
+  if (view === "set" && !settable()) open("drive");
   if (!OTHER) $("simulated").hidden = !hello.simulated;
   $("role").textContent = hello.role;
   drive.sender = hello.sender;
+  camera.show(!OTHER && hello.camera);
   drive.limits = hello.limits;
   drive.allowed = !OTHER && !barred(hello, "drive");
   permit(hello, OTHER ? `only on the own page of ${OTHER}` : "");
   $("limit").max = String(hello.limits.linear);
   limited();
-  views.text("hint", hint(hello, OTHER));
+  readied();
   if (uninvited) views.text("told", uninvited); // an earlier token still gave access
   uninvited = "";
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
@@ -253,6 +301,8 @@ link.addEventListener("gone", ({ detail }) => {
 });
 link.addEventListener("up", () => {
   tried = true;
+  if (complains) alarm("");
+  complains = false;
   views.waiting();
 });
 link.addEventListener("down", ({ detail }) => {
@@ -261,34 +311,30 @@ link.addEventListener("down", ({ detail }) => {
   heard = -Infinity;
   views.lost(detail.reason || (state ? "this page connects again" : "")); // the text shown before is outdated
   state = drive.state = wished = null;
+  for (const name of ["speed-wish", "turn-wish"]) views.text(name, "wish –");
+  readied();
 });
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));
 document.querySelector("nav").addEventListener("keydown", (event) => {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
   if (!step || view === "drive") return; // in this view the arrow keys drive
-  open(VIEWS[(VIEWS.indexOf(view) + step + VIEWS.length) % VIEWS.length]);
+  const there = VIEWS.filter((name) => !$(`tab-${name}`).hidden);
+  open(there[(there.indexOf(view) + step + there.length) % there.length]);
   $(`tab-${view}`).focus();
 });
-$("stop").addEventListener("pointerdown", stop);
-$("stop").addEventListener("click", (event) => event.detail === 0 && stop()); // Enter or Space key
-addEventListener("keydown", (event) => {
-  if (event.code !== "Space") return;
-  event.preventDefault();
-  if (!event.repeat) stop();
-}, true);
-addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
 // The daemon refuses if a stop or a "deactivate" came after the state that this person sees.
 $("clear").addEventListener("click", () => (stopping.over(), asked("clear", { latch: state?.latch })));
-addEventListener("pagehide", () => stopping.over());
 $("activate").addEventListener("click", () => asked("activate", { latch: state?.latch }));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));
 $("nearer").addEventListener("click", () => map.zoom(1.4));
 $("farther").addEventListener("click", () => map.zoom(1 / 1.4));
 $("recentre").addEventListener("click", () => map.recentre());
+$("turns").addEventListener("click", () => $("turns").setAttribute("aria-pressed", String(map.turn())));
 $("erase").addEventListener("click", () => map.erase());
 $("limit").addEventListener("input", limited);
+$("unit").addEventListener("click", converted);
 // After a mouse or a finger has set the slider, the arrow keys drive again. A user who reached it by Tab
 // keeps them.
 for (const name of ["pointerup", "click", "change"])
@@ -297,14 +343,22 @@ $("again").addEventListener("click", () => location.reload());
 
 permit("");
 limited();
-$("tab-set").hidden = Boolean(OTHER);
-if (OTHER) $("stop").firstElementChild.textContent = `STOP ${OTHER}`;
+$("tab-set").hidden = !settable();
+if (OTHER) $("stop").dataset.robot = ` ${OTHER}`;
+if (OTHER) views.text("stop-words", `STOP ${OTHER}`);
 open("drive");
 for (const [key, rate] of [["state", 10], ["odom", 20], ["cmd_vel_out", 10], ["wheel_states", 5], ["events", 5]])
   link.subscribe(key, rate, OTHER);
 setInterval(looked, 100);
 // Refresh the list, because recordings grow and new ones begin while it is visible.
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
+const post = stopping.send;
+stopping.send = () => (link.open ? link.call("stop", undefined, OTHER) : post());
+stopping.before = () => {
+  drive.release();
+  guide.leave();
+};
+stopping.complete();
 // Opening an invitation where this page is already open only changes the part behind the #, so reload.
 addEventListener("hashchange", () => location.reload());
 uninvited = await invited(views.lost);

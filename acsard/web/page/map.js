@@ -1,5 +1,5 @@
-// The map: path, robot, and a grid in metres. Dragging moves it, wheel and pinch zoom it, ◎ follows the robot
-// again.
+// The map: path, robot with the direction that it faces, and a grid with its scale in metres. Dragging moves it,
+// wheel and pinch zoom it, ◎ follows the robot again. It has x to the right, or the robot's front up.
 
 const MOST = 20000;
 
@@ -11,6 +11,8 @@ export class PathMap {
   #zoom = 90; // pixels per metre
   #centre = [0, 0];
   #follow = true;
+  #turns = false; // the robot's front is up
+  #lost = false; // the robot may be somewhere else
   #fingers = new Map();
   #asked = false;
 
@@ -41,10 +43,18 @@ export class PathMap {
     this.#pose = { x, y, yaw };
     if (this.#follow) this.#centre = [x, y];
     const last = this.#trail.at(-1);
-    const way = last ? Math.hypot(x - last[0], y - last[1]) : Infinity;
-    if (last && way > 1) this.#trail.push([NaN, NaN]); // a jump: the pose was set, so break the line
-    if (way > 0.02) this.#trail.push([x, y]);
+    const way = last && !Number.isNaN(last[0]) ? Math.hypot(x - last[0], y - last[1]) : Infinity;
+    if (way > 1) this.#cut(); // a jump: the pose was set
+    if (way > 0.02 && !this.#lost) this.#trail.push([x, y]);
     if (this.#trail.length > MOST) this.#trail.splice(0, MOST / 10);
+    this.redraw();
+  }
+
+  /** Break the path and grey the robot while it may move unseen. */
+  lose(lost) {
+    if (lost === this.#lost) return;
+    this.#lost = lost;
+    this.#cut();
     this.redraw();
   }
 
@@ -56,6 +66,13 @@ export class PathMap {
   zoom(factor) {
     this.#zoom = Math.min(1000, Math.max(2, this.#zoom * factor));
     this.redraw();
+  }
+
+  /** Turn the map with the robot, or no longer. Returns whether it does. */
+  turn() {
+    this.#turns = !this.#turns;
+    this.redraw();
+    return this.#turns;
   }
 
   recentre() {
@@ -79,6 +96,10 @@ export class PathMap {
     });
   }
 
+  #cut() {
+    if (this.#trail.length && !Number.isNaN(this.#trail.at(-1)[0])) this.#trail.push([NaN, NaN]);
+  }
+
   #dragged(event) {
     const before = this.#fingers.get(event.pointerId);
     if (!before) return;
@@ -89,18 +110,27 @@ export class PathMap {
       if (far(before) > 10) this.zoom(far(now) / far(before));
     } else {
       this.#follow = false;
-      this.#centre[0] -= (now[0] - before[0]) / this.#zoom;
-      this.#centre[1] += (now[1] - before[1]) / this.#zoom;
+      const [x, y] = rotated(now[0] - before[0], before[1] - now[1], -this.#angle);
+      this.#centre = [this.#centre[0] - x / this.#zoom, this.#centre[1] - y / this.#zoom];
       this.redraw();
     }
     this.#fingers.set(event.pointerId, now);
+  }
+
+  /** Rotation of the map, rad. */
+  get #angle() {
+    return this.#turns && this.#pose ? Math.PI / 2 - this.#pose.yaw : 0;
   }
 
   #draw() {
     const [paper, width, height] = sized(this.#canvas);
     if (!width) return;
     const look = colours();
-    const at = (x, y) => [width / 2 + (x - this.#centre[0]) * this.#zoom, height / 2 - (y - this.#centre[1]) * this.#zoom];
+    const angle = this.#angle;
+    const at = (x, y) => {
+      const [right, up] = rotated(x - this.#centre[0], y - this.#centre[1], angle);
+      return [width / 2 + right * this.#zoom, height / 2 - up * this.#zoom];
+    };
     this.#grid(paper, width, height, look, at);
     paper.strokeStyle = look("--accent");
     paper.lineWidth = 2;
@@ -120,7 +150,7 @@ export class PathMap {
       paper.arc(...at(...this.#truth), 5, 0, 7);
       paper.stroke();
     }
-    if (this.#pose) robot(paper, at(this.#pose.x, this.#pose.y), this.#pose.yaw, Math.max(9, 0.2 * this.#zoom), look);
+    if (this.#pose) robot(paper, at(this.#pose.x, this.#pose.y), this.#pose.yaw + angle, Math.max(9, 0.2 * this.#zoom), look(this.#lost ? "--quiet" : "--accent"));
   }
 
   #grid(paper, width, height, look, at) {
@@ -128,30 +158,46 @@ export class PathMap {
     paper.strokeStyle = look("--line");
     paper.lineWidth = 1;
     paper.beginPath();
-    const [left, right] = [-1, 1].map((side) => this.#centre[0] + (side * width) / 2 / this.#zoom);
-    const [low, high] = [-1, 1].map((side) => this.#centre[1] + (side * height) / 2 / this.#zoom);
+    const far = Math.hypot(width, height) / 2 / this.#zoom; // from the middle to a corner, m
+    const [[left, right], [low, high]] = this.#centre.map((middle) => [middle - far, middle + far]);
     for (let n = Math.ceil(left / step); n * step <= right; n++) {
-      const [x] = at(n * step, 0);
-      paper.moveTo(x, 0);
-      paper.lineTo(x, height);
+      paper.moveTo(...at(n * step, low));
+      paper.lineTo(...at(n * step, high));
     }
     for (let n = Math.ceil(low / step); n * step <= high; n++) {
-      const [, y] = at(0, n * step);
-      paper.moveTo(0, y);
-      paper.lineTo(width, y);
+      paper.moveTo(...at(left, n * step));
+      paper.lineTo(...at(right, n * step));
     }
     paper.stroke();
-    paper.fillStyle = look("--quiet");
-    paper.font = "12px system-ui, sans-serif";
-    paper.fillText(`grid ${step} m`, 10, 18);
+    scale(paper, height - 34, step, step * this.#zoom, look("--ink"));
   }
 }
 
-function robot(paper, [x, y], yaw, size, look) {
+function rotated(x, y, angle) {
+  const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
+  return [x * cos - y * sin, x * sin + y * cos];
+}
+
+/** Draw a bar of `metres`, which is `wide` px, at the left, above the words of the pose. */
+function scale(paper, low, metres, wide, colour) {
+  paper.strokeStyle = paper.fillStyle = colour;
+  paper.lineWidth = 2;
+  paper.beginPath();
+  paper.moveTo(10, low - 6);
+  paper.lineTo(10, low);
+  paper.lineTo(10 + wide, low);
+  paper.lineTo(10 + wide, low - 6);
+  paper.stroke();
+  paper.font = "12px system-ui, sans-serif";
+  paper.fillText(`${metres} m`, 16, low - 5);
+}
+
+/** Draw the robot, and a dashed ray from its front in the direction that it faces. */
+function robot(paper, [x, y], yaw, size, colour) {
   paper.save();
   paper.translate(x, y);
   paper.rotate(-yaw);
-  paper.fillStyle = look("--accent");
+  paper.fillStyle = colour;
   paper.beginPath();
   paper.moveTo(size, 0);
   paper.lineTo(-size * 0.7, size * 0.7);
@@ -159,6 +205,13 @@ function robot(paper, [x, y], yaw, size, look) {
   paper.lineTo(-size * 0.7, -size * 0.7);
   paper.closePath();
   paper.fill();
+  paper.strokeStyle = colour;
+  paper.lineWidth = 2;
+  paper.setLineDash([6, 5]);
+  paper.beginPath();
+  paper.moveTo(size * 1.3, 0);
+  paper.lineTo(size * 1.3 + 60, 0);
+  paper.stroke();
   paper.restore();
 }
 

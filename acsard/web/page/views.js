@@ -1,6 +1,7 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
-import { age, ago, clock, reason, said, signed } from "./words.js";
+import { boarded } from "./hand.js";
+import { age, ago, clock, named, person, reason, said, signed } from "./words.js";
 
 const LEVELS = ["", "warning", "error", "warning"];
 
@@ -12,11 +13,11 @@ export function made(name, look, ...children) {
   return element;
 }
 
-export function sources(body, state) {
+export function sources(body, state, own) {
   body.replaceChildren(
     ...state.sources.map((one) => {
       const drives = one.name === state.source;
-      const who = drives && state.sender ? `${one.name} (${state.sender})` : one.name;
+      const who = drives && state.sender ? `${one.name} (${person(state.sender, own)})` : one.name;
       const cells = [who, String(one.priority), one.age === null ? "none yet" : ago(one.age)];
       const waits = drives ? "drives" : one.waits_for;
       return made("tr", drives ? "drives" : "", ...[...cells, waits].map((text) => made("td", "", text)));
@@ -41,9 +42,20 @@ export function counters(list, state) {
   );
 }
 
+/** Return the events with equal neighbours made one, which has the time of the first, and their number as `equal`. */
+export function folded(events) {
+  const rows = [];
+  for (const event of events) {
+    const last = rows.at(-1);
+    if (last && ["name", "level", "text", "by"].every((key) => last[key] === event[key])) last.equal++;
+    else rows.push({ ...event, equal: 1 });
+  }
+  return rows;
+}
+
 export function happened(list, told, elsewhere) {
-  const rows = [...told.events].reverse().map((one) => {
-    const by = one.by ? ` — ${one.by}` : "";
+  const rows = folded([...told.events].reverse()).map((one) => {
+    const by = `${one.by ? ` — ${one.by}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
     const head = made("strong", "", one.name.replaceAll("_", " "));
     return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(one.text, elsewhere)}${by}`);
   });
@@ -67,7 +79,7 @@ export function cards(list, robots, own, here) {
     const [, mode, why, what] = card.children;
     card.className = bad;
     mode.textContent = one.mode ?? "silent";
-    why.textContent = said(one.reason ?? "", one.robot === here ? "" : one.robot);
+    why.textContent = said(named(one.reason ?? ""), one.robot === here ? "" : one.robot);
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
   });
@@ -83,52 +95,62 @@ function empty(robot, own) {
   return card;
 }
 
-/** Show the mode, the reason and any warnings. `locked` is true for a client that may not clear. */
-export function banner(state, locked, elsewhere) {
-  document.body.dataset.mode = state.mode;
-  text("mode", state.mode.toUpperCase());
-  const why = reason(state, elsewhere);
-  text("reason", locked ? why.replace("press Clear", "an operator clears it") : why);
+/** Show the mode, the reason and any warnings. `locked` is true for a client that may not release a stop. `own` is
+ *  the public name of this page. */
+export function banner(state, locked, elsewhere, own) {
+  const alone = !boarded(state);
+  const missing = alone && state.mode === "waiting";
+  mode(missing ? "noboard" : state.mode, missing ? "NO BOARD" : state.mode.toUpperCase());
+  const why = state.mode === "driving" && state.sender ? `Driven by ${person(state.sender, own)}.` : reason(state, elsewhere);
+  text("reason", locked ? why.replace("press Release", "an operator releases it") : why);
   const doubt = document.getElementById("doubt");
-  const warned = [state.wheel_fault, state.recording_error, state.latch_file_error, state.certificate_expiry.startsWith("valid") ? "" : state.certificate_expiry];
+  const warned = [
+    alone ? "Nobody can stop the motors from here." : "",
+    state.wheel_fault, state.recording_error, state.latch_file_error,
+    state.certificate_expiry.startsWith("valid") ? "" : state.certificate_expiry,
+  ];
   doubt.textContent = warned.filter(Boolean).join("; ");
   doubt.hidden = !doubt.textContent;
+  document.body.classList.toggle("boardless", alone);
+}
+
+/** Show a mode in the banner and in the title, which a background tab shows. STOP and its
+ *  release follow the mode. */
+function mode(name, words) {
+  document.body.dataset.mode = name;
+  text("mode", words);
+  const stop = document.getElementById("stop");
+  stop.setAttribute("aria-pressed", String(name === "stopped"));
+  text("stop-words", `${name === "stopped" ? "STOPPED" : "STOP"}${stop.dataset.robot ?? ""}`);
+  text("clear", name === "fault" ? "Release fault" : "Release STOP");
+  document.title = `${words} · ${document.getElementById("robot").textContent}`;
 }
 
 /** Show that the robot's computer answers but has reported nothing about the robot yet. */
 export function waiting() {
-  document.body.dataset.mode = "waiting";
-  text("mode", "WAITING");
+  mode("waiting", "WAITING");
   text("reason", "for the robot: nothing is heard of it yet");
 }
 
 /** Show that the data is old and that the robot may or may not be driving. */
 export function unheard(why) {
-  document.body.dataset.mode = "waiting";
-  text("mode", "NO DATA");
+  mode("waiting", "NO DATA");
   text("reason", why || "nothing is received from the robot; the values below are old");
 }
 
 /** Show that the connection is lost, and blank the values that are no longer known. */
 export function lost(why) {
-  document.body.dataset.mode = "waiting";
-  text("mode", "NO CONNECTION");
+  mode("waiting", "NO CONNECTION");
   if (why) text("reason", why);
   for (const name of ["speed", "turn", "who"]) text(name, "–");
 }
 
 /** Show the age of the data (`old`, ms; stale above `fresh`) and the round trip (`way`, ms). `none` is shown
- *  while there is no data; `seen` means that older data is still on the page. */
-export function freshness(old, fresh, way, none, seen) {
+ *  while there is no data; `seen` means that older data is still on the page, and `alone` that the board is missing. */
+export function freshness(old, fresh, way, none, seen, alone) {
   const stale = old > fresh;
   document.body.classList.toggle("stale", stale && seen);
-  text("age", old === Infinity ? none : stale ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
-}
-
-/** Show a message in every view until `words` is "". */
-export function alarm(words) {
-  text("alarm", words);
-  document.getElementById("alarm").hidden = !words;
+  text("age", old === Infinity ? none : stale ? `STALE ${age(old)}` : alone ? "no board" : way === null ? "live" : `live · ${age(way)}`);
 }
 
 export function text(id, words) {

@@ -52,17 +52,33 @@ export function yaw(q) {
   return 2 * Math.atan2(q.z, q.w);
 }
 
+/** Return a sender's public name, "NAME/DIGITS [CERTIFICATE]", in a person's words. `own` is the public name of
+ *  this page, "" if it is not known. */
+export function person(sender, own = "") {
+  const [, name, certificate] = sender.match(/^(?:(.*)\/)?[0-9a-f]{16}(?: \[(.*)\])?$/) ?? [null, sender];
+  if (own && sender === own) return "you";
+  if (name === "here") return "another page at the robot";
+  if (name && own && name === own.replace(/\/[^/]*$/, "")) return `another page of ${name}`;
+  return name || certificate || "a program without a name";
+}
+
 /** Return the reason without the mode, which the banner shows above it. */
 export function reason(state, elsewhere) {
+  if (state.mode === "ready" && state.reason.startsWith("waiting for a command")) return "Nobody drives.";
   const before = `${state.mode}: `;
-  return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason, elsewhere);
+  return said(named(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason), elsewhere);
+}
+
+/** Return a sentence with senders in a person's words. The log keeps their digits, which tell two of one name apart. */
+export function named(text) {
+  return text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page at the robot");
 }
 
 /** Replace service names by button names: of this page, or of the own page of the robot `elsewhere`. */
 export function said(text, elsewhere = "") {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere
-    ? { "call srv/clear": `Clear is ${there}`, "srv/clear": `Clear ${there}`, "call srv/activate": `Switch on is ${there}` }
-    : { "call srv/clear": "press Clear", "srv/clear": "Clear", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on under Settings" };
+    ? { "call srv/clear": `Release is ${there}`, "srv/clear": `Release ${there}`, "call srv/activate": `Switch on is ${there}` }
+    : { "call srv/clear": "press Release", "srv/clear": "Release", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on under Settings" };
   return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), text);
 }

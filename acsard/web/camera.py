@@ -1,0 +1,169 @@
+"""The newest picture of a camera's MJPEG stream, for the clients of the page.
+
+Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads it while
+clients ask for pictures, and only the newest picture is kept: a client with a slow network gets
+fewer pictures, and no old ones. A picture that equals the one before byte for byte is not new,
+because some servers repeat the last picture when their camera is lost.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from contextlib import suppress
+from email.message import Message
+
+import aiohttp
+from msgspec import Struct
+
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
+from acsard.web.answers import TroubleError
+
+WAIT_S = 1.0
+"""Longest wait for a picture that the client has not seen."""
+
+IDLE_S = 5.0
+"""Time without a client after which the stream is no longer read."""
+
+AGAIN_S = 0.5
+"""Delay before the stream is opened again."""
+
+CONNECT_S, SILENT_S = 3.0, 3.0
+"""Time limits for the connection to the camera's server, and for its next byte."""
+
+MAX_PICTURE, MAX_HEAD = 4_000_000, 4096
+"""Maximum size of a picture and of the header lines before it, bytes."""
+
+_LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
+
+
+class Picture(Struct, frozen=True):
+    """One JPEG picture, its number, and the monotonic time at which it arrived."""
+
+    body: bytes
+    number: int
+    at_ns: int
+
+    @property
+    def age_ms(self) -> int:
+        """Milliseconds since it arrived."""
+        return (clock.mono_ns() - self.at_ns) * 1000 // NS_PER_S
+
+
+class Parts:
+    """Cuts a `multipart/x-mixed-replace` stream into its parts."""
+
+    def __init__(self, boundary: str) -> None:
+        """Start; `boundary` is the parameter of the stream's content type.
+
+        Some servers write the two dashes into it that only precede it in the stream.
+        """
+        self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> bytes | None:
+        """Return the last part that is complete with these bytes, or None.
+
+        Raises:
+            ValueError: A part is too long, or its header lines are.
+        """
+        self._buffer += data
+        newest = None
+        while (part := self._part()) is not None:
+            newest = part
+        return newest
+
+    def _part(self) -> bytes | None:
+        head = self._buffer.find(b"\r\n\r\n", 0, MAX_HEAD)
+        if head < 0:
+            if len(self._buffer) >= MAX_HEAD:
+                raise ValueError("no header lines precede a picture")
+            return None
+        begin = head + 4
+        if found := _LENGTH.search(self._buffer, 0, head):
+            end = begin + int(found[1])
+        else:
+            end = self._buffer.find(self._end, begin)
+        if max(end, len(self._buffer) if end < 0 else 0) - begin > MAX_PICTURE:
+            raise ValueError(f"a picture has more than {MAX_PICTURE} bytes")
+        if end < 0 or end > len(self._buffer):
+            return None
+        part = bytes(self._buffer[begin:end])
+        del self._buffer[:end]
+        return part
+
+
+class Camera:
+    """Reads the stream at `url` while clients ask for pictures."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._newest: Picture | None = None
+        self._number = 0
+        self._trouble = "the camera's stream has no picture yet"
+        self._asked_ns = 0
+        self._changed = asyncio.Event()
+        self._reading: asyncio.Task[None] | None = None
+
+    async def after(self, number: int) -> Picture | None:
+        """Return the newest picture if it has another number, or wait for one; None if none comes.
+
+        Raises `TroubleError` if there is no camera or it shows nothing.
+        """
+        if not self._url:
+            raise TroubleError(404, "this robot has no camera: web.camera names its MJPEG stream")
+        self._asked_ns = clock.mono_ns()
+        if self._reading is None or self._reading.done():
+            self._reading = asyncio.create_task(self._read_again_and_again())
+        with suppress(TimeoutError):
+            async with asyncio.timeout(WAIT_S):
+                while self._newest is None or self._newest.number == number:
+                    await self._changed.wait()
+        newest = self._newest
+        if newest is None:
+            raise TroubleError(503, self._trouble)
+        return None if newest.number == number else newest
+
+    def close(self) -> None:
+        """Stop reading."""
+        if self._reading is not None:
+            self._reading.cancel()
+
+    async def _read_again_and_again(self) -> None:
+        limits = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S, sock_read=SILENT_S)
+        async with aiohttp.ClientSession(timeout=limits) as session:
+            while not self._idle():
+                try:
+                    await self._read(session)
+                except (aiohttp.ClientError, TimeoutError, OSError, ValueError) as error:
+                    self._trouble = f"the camera's stream cannot be read: {error or 'no answer'}"
+                    self._newest = (
+                        None  # clients are told the reason in the place of an old picture
+                    )
+                await asyncio.sleep(AGAIN_S)
+        self._newest = None  # the next client must not see a picture from before
+
+    async def _read(self, session: aiohttp.ClientSession) -> None:
+        async with session.get(self._url, allow_redirects=False) as answer:
+            kind = Message()
+            kind["Content-Type"] = answer.headers.get("Content-Type", "")
+            boundary = kind.get_boundary()
+            if answer.status != 200 or boundary is None:
+                raise ValueError(f"{answer.status} {answer.content_type} is not an MJPEG stream")
+            parts = Parts(boundary)
+            async for data in answer.content.iter_any():
+                if self._idle():
+                    return
+                self._take(parts.feed(data))
+
+    def _take(self, body: bytes | None) -> None:
+        if body is None or (self._newest is not None and body == self._newest.body):
+            return
+        self._number += 1
+        self._newest = Picture(body, self._number, clock.mono_ns())
+        self._changed.set()
+        self._changed.clear()
+
+    def _idle(self) -> bool:
+        return clock.mono_ns() - self._asked_ns > IDLE_S * NS_PER_S

@@ -1,0 +1,73 @@
+// The camera beside the stick: fetches one picture after another, draws it, and says how old it is. A picture that
+// no newer one replaces is marked, because a person would drive by it.
+
+const FROZEN = 800; // ms; the mark appears within 1 s
+const AGAIN = 500; // ms before the next attempt after a failure
+const LEAST = 50; // ms between two requests, so that a page leaves room for the others of its token
+
+export class Camera {
+  #figure;
+  #canvas;
+  #words;
+  #at = -Infinity; // time at which the shown picture reached the robot's computer, by performance.now()
+  #tag = "";
+  #trouble = "";
+  #shows = false;
+  #runs = false;
+
+  constructor(figure) {
+    this.#figure = figure;
+    this.#canvas = figure.querySelector("canvas");
+    this.#words = figure.querySelector("figcaption");
+  }
+
+  /** Show the camera, or hide it. */
+  show(wanted) {
+    this.#shows = wanted;
+    this.#figure.hidden = !wanted;
+    if (wanted && !this.#runs) this.#run();
+  }
+
+  /** Say how old the picture is at `now`, ms. */
+  look(now) {
+    if (!this.#shows) return;
+    const old = now - this.#at;
+    const frozen = old > FROZEN;
+    this.#figure.classList.toggle("frozen", frozen);
+    const age = old === Infinity ? "NO PICTURE" : `${frozen ? "FROZEN " : ""}${old < 1000 ? `${Math.round(old)} ms` : `${(old / 1000).toFixed(1)} s`}`;
+    const words = [age, frozen ? this.#trouble : ""].filter(Boolean).join(": ");
+    if (this.#words.textContent !== words) this.#words.textContent = words;
+  }
+
+  async #run() {
+    this.#runs = true;
+    while (this.#shows) {
+      const begun = performance.now();
+      this.#trouble = document.hidden ? "the page is hidden" : await this.#fetched();
+      const pause = this.#trouble ? AGAIN : LEAST - (performance.now() - begun);
+      if (pause > 0) await new Promise((done) => setTimeout(done, pause));
+    }
+    this.#runs = false;
+  }
+
+  /** Fetch and draw the next picture. Returns why there is none, or "". */
+  async #fetched() {
+    try {
+      const headers = this.#tag ? { "If-None-Match": this.#tag } : {};
+      const answer = await fetch("api/camera", { headers, cache: "no-store", signal: AbortSignal.timeout(5000) });
+      if (answer.status === 304) return "";
+      if (!answer.ok) return (await answer.json()).error ?? `${answer.status}`;
+      const at = performance.now() - Number(answer.headers.get("Age-Ms"));
+      const picture = await createImageBitmap(await answer.blob());
+      this.#tag = answer.headers.get("ETag");
+      this.#at = at;
+      this.#canvas.width = picture.width;
+      this.#canvas.height = picture.height;
+      this.#canvas.getContext("2d").drawImage(picture, 0, 0);
+      picture.close();
+      return "";
+    } catch {
+      return "no answer, or not a picture";
+    }
+  }
+}

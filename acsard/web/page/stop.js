@@ -1,0 +1,121 @@
+// STOP, before everything else. This classic script comes first, needs no other file, and paints STOP red when it
+// runs. It posts the stop until the robot has answered. `main.js` later gives it the WebSocket, which is faster.
+//
+// A stop is repeated because a dead link is not noticed at once. It is not repeated for long: later another person
+// may have released the stop and be driving.
+
+"use strict";
+
+const URGENT = 30000; // ms after the press, by the clock that gets there first: one may be set, the other may sleep
+const PAUSE = 300; // ms between two attempts
+const SLOW = 10000; // ms after which a page that is not complete says so
+const UNSURE = "STOP was not confirmed: look at the robot, and press STOP again";
+const RELOAD = "A part of this page did not load, so only STOP works here. Reload the page.";
+
+class Stopping {
+  #tell;
+  #press = 0;
+  #waits = false; // waiting for the robot's confirmation
+  #since = Infinity; // time of the press, by performance.now()
+  #arrived = false;
+  #whole = false; // the modules of the page run
+  /** Called at each press before the stop is sent. */
+  before = () => {};
+
+  /** `send()` sends one request and resolves to {ok, text, lost}; `lost` means that there was no answer.
+   *  `tell(words)` shows a message to the operator. */
+  constructor(send, tell) {
+    this.send = send;
+    this.#tell = tell;
+  }
+
+  async press() {
+    const press = ++this.#press;
+    const last = Date.now() + URGENT;
+    this.#since = performance.now();
+    this.#waits = true;
+    this.#arrived = false;
+    try {
+      this.before();
+    } catch (error) {
+      console.error(error); // the stop is sent whatever fails beside it
+    }
+    for (;;) {
+      const told = await this.send();
+      if (press !== this.#press) return; // a newer press took over
+      if (this.#ends(told)) return;
+      this.#tell(`STOP: ${told.text}; this page sends it again`);
+      await new Promise((done) => setTimeout(done, PAUSE));
+      if (press !== this.#press || this.#ends(told)) return;
+      if (Date.now() > last || performance.now() > this.#since + URGENT) return this.over();
+    }
+  }
+
+  /** Note that the robot reported itself as stopped at the time `at`. This counts as the answer if the answer
+   *  was lost. */
+  heard(at) {
+    if (at > this.#since) this.#arrived = true;
+  }
+
+  /** Give up the pending STOP, because the operator releases it or leaves the page. */
+  over() {
+    ++this.#press;
+    if (this.#waits) this.#tell(UNSURE);
+    this.#waits = false;
+  }
+
+  /** Note that the modules run and show the robot's state. */
+  complete() {
+    this.#whole = true;
+    if (!this.#waits) this.#tell("");
+  }
+
+  /** Say that a part of the page is missing, unless the modules run. */
+  lacks() {
+    if (!this.#whole && !this.#waits) this.#tell(RELOAD);
+  }
+
+  #ends(told) {
+    if (!told.ok && !(told.lost && this.#arrived)) return false;
+    this.#waits = false;
+    this.#tell(this.#whole ? "" : "STOP: the robot has confirmed it. This page is not complete: reload it.");
+    return true;
+  }
+}
+
+/** Send STOP by HTTP, without the WebSocket: the server may have refused it, or it may not be open yet. */
+async function posted() {
+  try {
+    const body = JSON.stringify({ robot: new URLSearchParams(location.search).get("robot") ?? undefined });
+    const answer = await fetch("api/srv/stop", { method: "POST", body, signal: AbortSignal.timeout(3000) });
+    const told = await answer.json();
+    return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
+  } catch {
+    return { ok: false, lost: true, text: "no connection to the robot" };
+  }
+}
+
+/** Show a message in every view until `words` is "". */
+function alarm(words) {
+  const place = document.getElementById("alarm");
+  if (!place) return;
+  place.textContent = words;
+  place.hidden = !words;
+}
+
+window.stopping = new Stopping(posted, alarm);
+
+// The listeners are the document's, because this script runs before the button exists.
+const onStop = (event) => event.target.closest?.("#stop");
+addEventListener("pointerdown", (event) => onStop(event) && window.stopping.press());
+addEventListener("click", (event) => onStop(event) && event.detail === 0 && window.stopping.press()); // Enter or Space key
+addEventListener("keydown", (event) => {
+  if (event.code !== "Space") return;
+  event.preventDefault();
+  if (!event.repeat) window.stopping.press();
+}, true);
+addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
+addEventListener("pagehide", () => window.stopping.over());
+addEventListener("error", () => window.stopping.lacks(), true); // also of a file that the browser could not load
+setTimeout(() => window.stopping.lacks(), SLOW);
+document.documentElement.classList.add("stops");

@@ -1,0 +1,200 @@
+"""A camera's stream on the page: its picture, its age, and the mark of a frozen one."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from aiohttp import web
+
+from acsard.machine.authority import Authority
+from tests.system.browser import NAME, Page
+from tests.system.chromium import CHROMIUM, PHONE, browsing
+from tests.system.harness import Bus, Daemon, free_endpoint, until
+
+pytestmark = pytest.mark.slow
+
+HZ = 10.0
+
+
+def picture(grey: int) -> bytes:
+    """Return a small PNG. The browser decodes it like a JPEG, and no library draws one here."""
+
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        )
+
+    rows = zlib.compress(b"".join(b"\0" + bytes([grey] * 32) for _ in range(24)))
+    head = struct.pack(">IIBBBBB", 32, 24, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        chunk(name, body) for name, body in ((b"IHDR", head), (b"IDAT", rows), (b"IEND", b""))
+    )
+
+
+class Stream:
+    """A program that serves an MJPEG stream at 10 pictures a second."""
+
+    def __init__(self) -> None:
+        self.port = int(free_endpoint().rpartition(":")[2])
+        self.grey, self.clients = 0, 0
+        self.runs, self.silent, self.ends = True, False, False
+        self._loop = asyncio.new_event_loop()
+        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+        asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(5.0)
+
+    async def _start(self) -> None:
+        app = web.Application()
+        app.add_routes([web.get("/stream", self._serve)])
+        self._runner = web.AppRunner(app, shutdown_timeout=0.1)
+        await self._runner.setup()
+        await web.TCPSite(self._runner, "127.0.0.1", self.port).start()
+
+    async def _serve(self, request: web.Request) -> web.StreamResponse:
+        answer = web.StreamResponse()
+        answer.headers["Content-Type"] = "multipart/x-mixed-replace;boundary=frame"
+        await answer.prepare(request)
+        self.clients += 1
+        try:
+            while not self.ends:
+                if not self.silent:
+                    body = picture(self.grey)
+                    head = f"--frame\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+                    await answer.write(head + body + b"\r\n")
+                self.grey = (self.grey + self.runs) % 256
+                await asyncio.sleep(1 / HZ)
+        finally:
+            self.clients -= 1
+        return answer
+
+    async def _end(self) -> None:
+        self.ends = True
+        await asyncio.sleep(2 / HZ)
+        await self._runner.cleanup()
+
+    def close(self) -> None:
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(5.0)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+
+class Filmed:
+    def __init__(self, stream: Stream, server: Page) -> None:
+        self.stream, self.server = stream, server
+
+
+@pytest.fixture
+def filmed(tmp_path: Path) -> Iterator[Filmed]:
+    stream = Stream()
+    Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
+    seen = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
+    with Daemon(tmp_path, config=seen) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, tmp_path) as server:
+            yield Filmed(stream, server)
+    stream.close()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+@pytest.mark.xdist_group("pages")
+def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_within_a_second(
+    filmed: Filmed,
+) -> None:
+    pixel = (
+        "document.querySelector('#camera canvas').getContext('2d').getImageData(9, 9, 1, 1).data[0]"
+    )
+    marked = "document.getElementById('camera').matches('.frozen')"
+    words = "document.querySelector('#camera figcaption').textContent"
+    with browsing() as browser:
+        browser.size(*PHONE)
+        browser.open(filmed.server.here)
+
+        def lives() -> bool:
+            return browser.js(marked) is False and bool(re.fullmatch(r"\d+ ms", browser.js(words)))
+
+        def freezes(why: str) -> None:
+            begun = time.monotonic()
+            until(lambda: browser.js(marked), 5.0, why)
+            took = time.monotonic() - begun
+            assert took < 1.3, f"{why}: {took:.2f} s"  # a picture may still come at its begin
+            assert browser.js(words).startswith("FROZEN ")
+
+        until(lives, 10.0, "the picture lives")
+        first = browser.js(pixel)
+        until(lambda: browser.js(pixel) != first, 5.0, "the picture changes")
+        filmed.stream.runs = False  # the server repeats the last picture
+        freezes("repeated")
+        filmed.stream.runs = True
+        until(lives, 5.0, "it lives again")
+        filmed.stream.silent = True
+        freezes("silent")
+        filmed.stream.silent = False
+        until(lives, 10.0, "it lives again")
+        wide = "['camera', 'map', 'stick'].map(name => document.getElementById(name).clientWidth)"
+        assert min(browser.js(wide)) > 90
+        browser.open("about:blank")
+        until(lambda: filmed.stream.clients == 0, 15.0, "nobody reads the stream any more")
+
+
+def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None:
+    server = filmed.server
+
+    async def story() -> None:
+        async with server.client() as stranger, stranger.get(f"{server.away}/api/camera") as told:
+            assert told.status == 401
+        async with server.client(server.invite("viewer", "tv")) as viewer:
+            url = f"{server.away}/api/camera"
+            first = await got(viewer, url)
+            assert first.status == 200
+            assert first.content_type == "image/jpeg"
+            assert int(first.headers["Age-Ms"]) < 1000
+            second = await got(viewer, url, first.headers["ETag"])
+            assert second.status == 200
+            assert second.headers["ETag"] != first.headers["ETag"]
+            filmed.stream.silent = True
+            await asyncio.sleep(0.3)
+            last = await got(viewer, url)
+            assert (await got(viewer, url, last.headers["ETag"])).status == 304
+            server.vault.revoke("tv")
+            assert (await got(viewer, url)).status == 401
+
+    asyncio.run(story())
+
+
+async def got(viewer: aiohttp.ClientSession, url: str, tag: str = "") -> Any:
+    async with viewer.get(url, headers={"If-None-Match": tag} if tag else {}) as answer:
+        await answer.read()
+        return answer
+
+
+def test_a_robot_without_a_camera_says_which_setting_names_one(tmp_path: Path) -> None:
+    async def story(url: str) -> None:
+        async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as told:
+            assert told.status == 404
+            assert "web.camera" in (await told.json())["error"]
+
+    with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as server:
+        asyncio.run(story(server.here))
+
+
+def test_a_stream_that_cannot_be_read_is_named_with_the_reason(tmp_path: Path) -> None:
+    port = free_endpoint().rpartition(":")[2]
+
+    async def story(url: str) -> None:
+        async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as told:
+            assert told.status == 503
+            error = (await told.json())["error"]
+            assert "the camera's stream cannot be read" in error
+            assert port in error
+
+    seen = {"web": {"camera": f"http://127.0.0.1:{port}/stream"}}
+    with Daemon(tmp_path, config=seen) as daemon, Page(daemon, tmp_path) as server:
+        asyncio.run(story(server.here))

@@ -1,0 +1,145 @@
+"""STOP works as soon as it is red, whichever file of the page is missing and however slow it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from acsard.web.files import PAGE
+from tests.system.browser import Page
+from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
+from tests.system.harness import Bus, Daemon, until
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.xdist_group("pages"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+]
+
+FILES = sorted(path.name for path in PAGE.iterdir() if path.name != "index.html")
+
+MODULES = [name for name in FILES if name.endswith(".js") and name != "stop.js"]
+
+RED = "rgb(196, 18, 10)"
+"""The colour of STOP in the light style."""
+
+IMPATIENT = f"""(() => {{
+    const look = () => {{
+        const stop = document.getElementById("stop");
+        if (stop && getComputedStyle(stop).backgroundColor === "{RED}") {{
+            window.red = performance.now();
+            window.before = document.getElementById("mode").textContent;
+            stop.dispatchEvent(new PointerEvent("pointerdown", {{bubbles: true}}));
+        }} else requestAnimationFrame(look);
+    }};
+    look();
+}})()"""
+"""Presses STOP in the first frame in which it is red, and notes the time and the mode shown."""
+
+
+class Robot:
+    """A robot that is ready, its page, and a phone that presses STOP at once."""
+
+    def __init__(self, bus: Bus, page: Page, browser: Browser) -> None:
+        self.bus, self.page, self.browser = bus, page, browser
+
+    @property
+    def mode(self) -> str:
+        return str(self.bus.state()["mode"])
+
+    @contextmanager
+    def without(self, *names: str) -> Iterator[None]:
+        """Open the page without these files."""
+        self.bus.ask("srv/clear")
+        until(lambda: self.mode == "ready", 5.0, "it is ready")
+        self.browser.ask("Network.setBlockedURLs", urls=[f"*/page/{name}" for name in names])
+        self.browser.open(self.page.here)
+        yield
+        self.browser.open("about:blank")
+        self.browser.ask("Network.setBlockedURLs", urls=[])
+
+    def alarms(self, words: str) -> None:
+        until(lambda: words in self.browser.text("alarm"), 5.0, f"the page says {words!r}")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    where = tmp_path_factory.mktemp("stop")
+    with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, where) as page, browsing() as browser:
+            browser.size(*PHONE)
+            browser.ask("Network.enable")
+            browser.ask("Network.setCacheDisabled", cacheDisabled=True)
+            yield Robot(bus, page, browser)
+
+
+@pytest.fixture
+def impatient(robot: Robot) -> Iterator[Robot]:
+    added = robot.browser.ask("Page.addScriptToEvaluateOnNewDocument", source=IMPATIENT)
+    yield robot
+    robot.browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name not in ("stop.js", "style.css")])
+def test_stop_latches_as_soon_as_it_is_red_without_this_file(impatient: Robot, name: str) -> None:
+    with impatient.without(name):
+        until(lambda: impatient.mode == "stopped", 5.0, f"stopped without {name}")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_page_without_this_module_says_reload_and_its_stick_is_grey(
+    robot: Robot, name: str
+) -> None:
+    browser = robot.browser
+    with robot.without(name):
+        robot.alarms("did not load, so only STOP works here. Reload the page.")
+        assert browser.js("document.getElementById('stick').ariaDisabled") == "true"
+        browser.key("Down", "Space", " ")
+        browser.key("Up", "Space", " ")
+        until(lambda: robot.mode == "stopped", 5.0, f"stopped without {name}")
+        robot.alarms("STOP: the robot has confirmed it")
+
+
+def test_a_page_without_its_style_stops(robot: Robot) -> None:
+    with robot.without("style.css"):
+        robot.browser.js("document.getElementById('stop').scrollIntoView()")
+        robot.browser.tap("stop")
+        until(lambda: robot.mode == "stopped", 5.0, "stopped")
+
+
+def test_a_page_without_its_stop_has_no_red_stop_does_not_drive_and_says_reload(
+    robot: Robot,
+) -> None:
+    browser = robot.browser
+    with robot.without("stop.js"):
+        robot.alarms("STOP does not work here")
+        colour = browser.js("getComputedStyle(document.getElementById('stop')).backgroundColor")
+        assert colour != RED
+        assert browser.js("document.getElementById('stick').ariaDisabled") == "true"
+
+
+def test_on_a_slow_network_stop_latches_before_the_page_shows_the_robot(impatient: Robot) -> None:
+    browser = impatient.browser
+    slow = {"latency": 300, "downloadThroughput": 50_000, "uploadThroughput": 50_000}
+    browser.ask("Network.emulateNetworkConditions", offline=False, **slow)
+    try:
+        with impatient.without():
+            until(lambda: impatient.mode == "stopped", 5.0, "stopped")
+            until(lambda: browser.text("mode") == "STOPPED", 10.0, "the page shows it")
+            until(lambda: browser.text("age").startswith("live"), 5.0, "the page is complete")
+            assert browser.js("window.before") == "CONNECTING"
+            shown = browser.js("performance.now()")
+            print(f"\nSTOP is red after {browser.js('window.red'):.0f} ms; now {shown:.0f} ms")
+    finally:
+        fast = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        browser.ask("Network.emulateNetworkConditions", offline=False, **fast)
+
+
+def test_every_module_of_the_page_is_preloaded() -> None:
+    """The browser need not read one module to learn of the next one."""
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    loaded = {name for name in MODULES if f'<link rel="modulepreload" href="page/{name}"' in page}
+    assert loaded == set(MODULES) - {"main.js"}

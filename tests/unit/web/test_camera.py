@@ -1,0 +1,49 @@
+"""A camera's stream is cut into its pictures, in whatever pieces its bytes arrive."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.web.camera import MAX_HEAD, MAX_PICTURE, Parts
+from tests.each import each
+
+PICTURES = [bytes([0xFF, 0xD8, n]) * (n + 1) + b"\r\n--\r\n\r\n" for n in range(5)]
+"""Contents that look like the borders between pictures."""
+
+
+def measured(picture: bytes) -> bytes:
+    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+    return head.encode() + picture + b"\r\n"
+
+
+def bare(picture: bytes) -> bytes:
+    return b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + picture + b"\r\n"
+
+
+@each("boundary", ["frame", '"frame"', "--frame"])
+@each("form", [measured, bare])
+@each("size", [1, 7, 1000])
+def test_every_picture_is_found_in_pieces_of_any_size(boundary, form, size) -> None:  # type: ignore[no-untyped-def]
+    stream = b"".join(map(form, [*PICTURES, b"last"]))
+    parts = Parts(boundary)
+    pieces = [stream[n : n + size] for n in range(0, len(stream), size)]
+    found = [part for piece in pieces if (part := parts.feed(piece)) is not None]
+    wanted = [*PICTURES, b"last"] if form is measured else PICTURES
+    if size == 1:
+        assert found == wanted
+    else:
+        assert found[-1] == wanted[-1]  # of several at once only the newest counts
+        assert all(one in wanted for one in found)
+
+
+@each(
+    "stream",
+    [
+        b"x" * MAX_HEAD,
+        b"--frame\r\nContent-Length: 99999999\r\n\r\n",
+        b"--frame\r\n\r\n" + b"x" * (MAX_PICTURE + 1),
+    ],
+)
+def test_a_stream_that_would_fill_the_memory_is_an_error(stream: bytes) -> None:
+    with pytest.raises(ValueError, match=r"no header lines|more than"):
+        Parts("frame").feed(stream)
