@@ -73,8 +73,11 @@ class Report(Struct, frozen=True):
     straight_error_before: float | None
     """Heading error after 10 m straight ahead, deg."""
     straight_error_after: float | None
+    heading_error_before: float | None
+    """Heading error over whole drives, deg rms."""
+    heading_error_after: float | None
     position_error_before: float | None
-    """Position error over a few seconds, m rms."""
+    """Position error over whole drives, m rms."""
     position_error_after: float | None
     time_offsets: dict[str, float]
     """Delay of each sensor behind the wheels, s."""
@@ -119,6 +122,8 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
         turn_error_before=improvement.turn.before, turn_error_after=improvement.turn.after,
         straight_error_before=improvement.straight.before,
         straight_error_after=improvement.straight.after,
+        heading_error_before=improvement.heading.before,
+        heading_error_after=improvement.heading.after,
         position_error_before=improvement.place.before,
         position_error_after=improvement.place.after,
         time_offsets=calibration.delays, gyro_bias=calibration.gyro_bias,
@@ -177,16 +182,16 @@ def _better(report: Report) -> list[str]:
          "error of a turn of 360 deg: {} now, {} with the new values", "deg", 1),
         (report.straight_error_before, report.straight_error_after,
          "heading error after 10 m straight ahead: {} now, {} with the new values", "deg", 1),
+        (report.heading_error_before, report.heading_error_after,
+         "heading error over whole drives: {} now, {} with the new values", "deg", 1),
         (report.position_error_before, report.position_error_after,
-         "position error over a few seconds: {} now, {} with the new values", "cm", 100),
+         "position error over whole drives: {} now, {} with the new values", "cm", 100),
     ):  # fmt: skip
         if before is not None and after is not None:
             sentences.append(
                 words.format(f"{_two(before * factor)} {unit}", f"{_two(after * factor)} {unit}")
             )
-    return (
-        [*sentences, "(measured on parts of the log that the fit did not use)"] if sentences else []
-    )
+    return [*sentences, "(measured on drives that the fit did not use)"] if sentences else []
 
 
 def _two(value: float) -> str:

@@ -71,10 +71,6 @@ class RefusedError(AcsardError):
     """The log cannot be used for a calibration. The text says why and what to do."""
 
 
-class UnlikeError(RefusedError):
-    """The positions do not follow the wheels in blocks of the length that was tried."""
-
-
 def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
     """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
 
@@ -93,9 +89,9 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
 
 
 def positions_follow(begun: StartingPoint) -> None:
-    """Raise `UnlikeError` if the positions do not follow the path of the wheels."""
+    """Raise `RefusedError` if the positions do not follow the path of the wheels."""
     if begun.unexplained > UNLIKE:
-        raise UnlikeError(
+        raise RefusedError(
             "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
             "latitude and longitude), from the same drive, on the same clock within 1 s?"
         )

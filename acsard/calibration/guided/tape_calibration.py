@@ -17,7 +17,7 @@ from acsard.calibration.guided.tape_readings import (
     joined,
     predicted,
 )
-from acsard.calibration.improvement import BeforeAfter, Improvement, with_constant_track
+from acsard.calibration.improvement import NOTHING, BeforeAfter, Improvement, with_constant_track
 from acsard.calibration.log_table import Floats
 from acsard.calibration.plausibility import remarks
 from acsard.calibration.prepared import sure_enough
@@ -95,19 +95,19 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
             sums["place"] += before**2, after**2, 1.0
     return Improvement(
         _per_amount(sums["turn"], 360.0), _per_amount(sums["straight"], float(np.degrees(10.0))),
-        _rms(sums["place"]),
+        NOTHING, _rms(sums["place"]),
     )  # fmt: skip
 
 
 def _per_amount(sums: Floats, unit: float) -> BeforeAfter:
     before, after, amount = sums.tolist()
     if not amount:
-        return BeforeAfter(None, None)
+        return NOTHING
     return BeforeAfter(unit * before / amount, unit * after / amount)
 
 
 def _rms(sums: Floats) -> BeforeAfter:
     before, after, count = sums.tolist()
     if not count:
-        return BeforeAfter(None, None)
+        return NOTHING
     return BeforeAfter(math.sqrt(before / count), math.sqrt(after / count))
