@@ -53,7 +53,10 @@ If the log has no positions, nothing in it shows this error.
 """
 
 HELD = 1e9
-"""Weight that holds the mean radius at its start if no sensor measures it."""
+"""Weight that holds a combination of parameters: the mean radius if no sensor measures it."""
+
+Held = tuple[Floats, float]
+"""Weights of the parameters, shape (COUNT,), and the value at which their weighted sum is held."""
 
 MANY = 16
 """Number of blocks from which on the jackknife also leaves out pairs of neighbouring blocks."""
@@ -135,7 +138,7 @@ class Fit(Struct, frozen=True):
 
 def fit(
     sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
-    bias_std: float = 0.0,
+    bias_std: float = 0.0, held: Sequence[Held] = (),
 ) -> Fit:  # fmt: skip
     """Return the fit of the parameters to the evidence of all sensors.
 
@@ -146,6 +149,7 @@ def fit(
         gyro: whether a gyro is among the sources.
         bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not depend
             on the bias.
+        held: combinations of parameters that the fit does not change.
     """
     active: tuple[int, ...] = (LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH, DELAY, SENSOR_X, SENSOR_Y)[
         : None if places else 4
@@ -155,11 +159,14 @@ def fit(
         active, usual[SCALE_ERROR] = (*active, SCALE_ERROR), GYRO_SCALE
     if bias_std:
         active, usual[BIAS_ERROR] = (*active, BIAS_ERROR), bias_std
-    held = start[LEFT] + start[RIGHT]
+    if not places:
+        both = np.zeros(COUNT)
+        both[[LEFT, RIGHT]] = 1.0
+        held = (*held, (both, float(both @ start)))
     parameters, size = start.copy(), np.inf
     for at in range(MOST_STEPS):
         normal, score = _sum([source(parameters) for source in sources])
-        known, prior = _known(parameters, held, places, usual)
+        known, prior = _known(parameters, held, usual)
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
         # Far from the solution, take only a part of the step: the linearization holds only near its
@@ -172,7 +179,7 @@ def fit(
             break
     evidence = [source(parameters) for source in sources]
     normal, score = _sum(evidence)
-    known, _ = _known(parameters, held, places, usual)
+    known, _ = _known(parameters, held, usual)
     varies = _varies(evidence, parameters)
     return Fit(parameters, normal, score, known, active, varies, size < SETTLED, usual)
 
@@ -205,25 +212,22 @@ def _weight(part: Evidence) -> float:
 
 
 def _known(
-    parameters: Floats, held: float, places: bool, usual: Mapping[int, float]
+    parameters: Floats, held: Sequence[Held], usual: Mapping[int, float]
 ) -> tuple[Floats, Floats]:
     """Return the prior information as normal equations.
 
     Args:
         parameters: the present parameters.
-        held: the sum of both radii to hold if `places` is false.
-        places: whether positions measure the radii.
+        held: the combinations of parameters that do not change.
         usual: the prior standard deviation of each parameter that has one.
     """
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
         score[index] = -parameters[index] * deviation**-2
-    if not places:
-        both = np.zeros(COUNT)
-        both[[LEFT, RIGHT]] = 1.0
-        normal += HELD * np.outer(both, both)
-        score += HELD * both * (held - parameters[LEFT] - parameters[RIGHT])
+    for weights, value in held:
+        normal += HELD * np.outer(weights, weights)
+        score += HELD * weights * (value - weights @ parameters)
     return normal, score
 
 

@@ -74,6 +74,9 @@ class Improvement(Struct, frozen=True):
         return self.gain > self.chance
 
 
+UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
+
+
 class Fold(Struct, frozen=True):
     """A drive that is left out, as a mask of blocks, and the parameters without these blocks."""
 

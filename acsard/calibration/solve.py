@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from acsard.calibration import heading, positions
 from acsard.calibration.evidence import (
     BIAS_ERROR,
+    COUNT,
     DELAY,
     INVERSE_TRACK,
     LEFT,
@@ -27,6 +28,7 @@ from acsard.calibration.fit import (
     RIGHT_RADIUS,
     SEPARATION,
     Fit,
+    Held,
     Multipliers,
     Rates,
     configured,
@@ -36,6 +38,7 @@ from acsard.calibration.fit import (
 )  # fmt: skip
 from acsard.calibration.heading import Headings, Rows
 from acsard.calibration.improvement import (
+    UNMEASURED,
     Improvement,
     drives,
     folds,
@@ -47,11 +50,13 @@ from acsard.calibration.log_table import Floats, noted
 from acsard.calibration.plausibility import RefusedError, in_range, remarks
 from acsard.calibration.prepared import (
     DRIVE,
+    RATIO,
+    TRACK,
     Prepared,
     prepared,
     separates_track,
-    sure_enough,
     turns_enough,
+    unsure,
 )
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.tape_distance import Extent, Follow, Tape, scaled
@@ -116,6 +121,8 @@ class Calibration(Struct, frozen=True):
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
     """Sentences about the log that the user should know."""
+    kept: tuple[str, ...] = ()
+    """Quantities that stay as configured, `TRACK` and `RATIO` of `prepared`."""
 
 
 def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
@@ -148,13 +155,13 @@ class Candidate(Struct, frozen=True):
     """The turns of the log, without the gyro's errors."""
     rate: Rates
     gyro_bias: float
+    result: Multipliers
     improvement: Improvement
+    kept: dict[str, float]
+    """Quantities that stay as configured, `TRACK` and `RATIO`.
 
-    @property
-    def result(self) -> Multipliers:
-        """The multipliers that the fit gives."""
-        fitted = self.fitted
-        return multipliers(fitted.parameters, fitted.covariance(), self.rate, fitted.varies)
+    The value is the relative standard deviation to which the log determines the quantity.
+    """
 
 
 def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
@@ -166,28 +173,77 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
     for length in LENGTHS_S[headings is not None]:
         try:
             made = prepared(log.runs, angles, headings, base, length)
-            candidates.append(_candidate(log.runs, angles, headings, base, made))
+            candidates += _candidates(log.runs, angles, headings, base, made)
         except RefusedError as error:
             refusals.append(error)  # coarse positions may still follow the wheels in longer blocks
     if not candidates:
         raise refusals[0]
     best = max(candidates, key=lambda candidate: candidate.improvement.gain)
     if not best.improvement.sure:
-        raise RefusedError(no_better(best.improvement))
+        if tape is None:
+            raise RefusedError(no_better(best.improvement))
+        # The tape measures the size of the wheels, whatever the log determines.
+        best = replace(
+            best, result=configured(base), kept={TRACK: np.inf, RATIO: np.inf},
+            improvement=UNMEASURED,
+        )  # fmt: skip
     return _calibration(log, angles, headings, base, tape, best)
+
+
+def _candidates(
+    driven: Sequence[Run], angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
+    made: Prepared,
+) -> list[Candidate]:  # fmt: skip
+    """Return the fit of all parameters, or the fits that keep what this one leaves unsure.
+
+    Raises `RefusedError` if every fit leaves something unsure.
+    """
+    found: list[Candidate] = []
+    deviations: dict[str, float] = {}
+    gyro = headings is not None and headings.source == "yaw_rate"
+    bias_std = headings.bias_std if headings is not None else 0.0
+    for kept, held in _held(base).items():
+        if found and not found[0].kept:
+            break
+        fitted = fit(
+            made.sources, made.start, places=bool(made.segments), gyro=gyro, bias_std=bias_std,
+            held=held,
+        )  # fmt: skip
+        if fitted.converged:
+            candidate = _candidate(driven, angles, headings, base, made, fitted)
+            track = float(np.sqrt(fitted.covariance()[INVERSE_TRACK, INVERSE_TRACK]))
+            track /= abs(float(fitted.parameters[INVERSE_TRACK]))
+            too_wide = unsure(candidate.result, track)
+            if not kept:
+                deviations = {TRACK: track, RATIO: candidate.result.ratio_std}
+                if not separates_track(fitted):
+                    too_wide[RATIO] = deviations[RATIO] = np.inf
+            if not too_wide:
+                unsure_by = {kept: deviations.get(kept, np.inf)} if kept else {}
+                found.append(replace(candidate, kept=unsure_by))
+    if not found:
+        shares = " and ".join(f"{name} only to {share:.1%}" for name, share in deviations.items())
+        raise RefusedError(
+            f"this log determines {shares}, which is too inaccurate: {DRIVE}"
+            if shares
+            else f"the search for the parameters does not converge: {DRIVE}"
+        )
+    return found
+
+
+def _held(base: Base) -> dict[str, list[Held]]:
+    """Return the parameters that a fit holds at the configured ones, by the quantity it keeps."""
+    ratio, track, growth = np.zeros((3, COUNT))
+    ratio[[LEFT, RIGHT]] = base.right, -base.left
+    track[INVERSE_TRACK] = growth[TRACK_GROWTH] = 1.0
+    return {"": [], RATIO: [(ratio, 0.0)], TRACK: [(track, 1 / base.track), (growth, 0.0)]}
 
 
 def _candidate(
     driven: Sequence[Run], angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
-    made: Prepared,
+    made: Prepared, fitted: Fit,
 ) -> Candidate:  # fmt: skip
-    """Return the fit to these blocks with its improvement. Raises `RefusedError`."""
-    gyro = headings is not None and headings.source == "yaw_rate"
-    bias_std = headings.bias_std if headings is not None else 0.0
-    fitted = fit(made.sources, made.start, places=bool(made.segments), gyro=gyro, bias_std=bias_std)
-    if not fitted.converged:
-        raise RefusedError(f"the search for the parameters does not converge: {DRIVE}")
-    separates_track(fitted.marginal())
+    """Return a fit to these blocks with its improvement. Raises `RefusedError`."""
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
     gyro_scale = 1 + float(fitted.parameters[SCALE_ERROR])
     bias_error = float(fitted.parameters[BIAS_ERROR])
@@ -198,15 +254,13 @@ def _candidate(
     gyro_bias = (headings.bias if headings is not None else 0.0) + bias_error
     rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
     rate = rates(rows, by_wheels)
-    track_std = float(np.sqrt(fitted.covariance()[INVERSE_TRACK, INVERSE_TRACK]))
-    configured = fitted.parameters.copy()
-    configured[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
+    present = fitted.parameters.copy()
+    present[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
     held = folds(fitted, made.parts, drives(driven), rate)
     places = [positions_of(fold.drive, driven, angles) if made.segments else [] for fold in held]
-    better = improvement(held, configured, base, rows, places, made.steps)
-    candidate = Candidate(made, fitted, rows, rate, gyro_bias, better)
-    sure_enough(candidate.result, track_std / abs(float(fitted.parameters[INVERSE_TRACK])))
-    return candidate
+    better = improvement(held, present, base, rows, places, made.steps)
+    result = multipliers(fitted.parameters, fitted.covariance(), rate, fitted.varies)
+    return Candidate(made, fitted, rows, rate, gyro_bias, result, better, {})
 
 
 def _calibration(
@@ -228,6 +282,7 @@ def _calibration(
         notes.append(f"the distance of {tape.metres:g} m is used for run {name}")
     in_range(result.values)
     totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)
+    notes += [_stays(name, deviation) for name, deviation in best.kept.items()]
     notes += _cuts(log.runs, angles)
     notes += _too_good(headings, made, fitted, base)
     notes += remarks(delays, best.gyro_bias, by_wheels, result.values, base, sized=bool(scale))
@@ -237,7 +292,13 @@ def _calibration(
         growth=float(fitted.parameters[TRACK_GROWTH]),
         growth_std=float(np.sqrt(fitted.covariance()[TRACK_GROWTH, TRACK_GROWTH])),
         improvement=best.improvement, delays=delays, gyro_bias=best.gyro_bias, notes=tuple(notes),
+        kept=tuple(best.kept),
     )  # fmt: skip
+
+
+def _stays(name: str, deviation: float) -> str:
+    known = f" (it is known to {deviation:.1%} by this log)" if deviation < 1.0 else ""
+    return f"{name} stays as configured, because this log does not improve it{known}"
 
 
 def _cuts(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Iterator[str]:

@@ -19,8 +19,8 @@ from acsard.calibration.guided.tape_readings import (
 )
 from acsard.calibration.improvement import NOTHING, BeforeAfter, Improvement, with_constant_track
 from acsard.calibration.log_table import Floats
-from acsard.calibration.plausibility import remarks
-from acsard.calibration.prepared import sure_enough
+from acsard.calibration.plausibility import RefusedError, remarks
+from acsard.calibration.prepared import unsure
 from acsard.calibration.solve import Calibration, Drives
 from acsard.calibration.wheel_angles import angles_of, blocks
 from acsard.core.config.settings import DriveConfig
@@ -56,7 +56,11 @@ def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Ca
     result = multipliers(fit.parameters, fit.covariance, rate, 0.0)
     inverse_track, std = fit.parameters[INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
     chance = float(std[INVERSE_TRACK] / abs(inverse_track))
-    sure_enough(result, chance, WORST, "these readings", ADVICE)
+    for name, deviation in unsure(result, chance, WORST).items():
+        raise RefusedError(
+            f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
+            f"{ADVICE}"
+        )
     drives = Drives.of(rides, rows, by_wheels, base, result, rate)
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
     return Calibration(
