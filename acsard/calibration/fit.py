@@ -5,10 +5,6 @@ over the blocks (Quenouille and Tukey): each block is left out in turn, and the 
 parameters show the effect of chance. This is right even if the errors within a block are
 correlated. The change is computed by one linear step. If there are few blocks, the standard
 deviation is widened to that of Student's t.
-
-The effective track of a skidding robot is not constant. The standard deviation of its multiplier
-therefore also includes the larger of two terms: half of its change from slow to fast turns, and its
-variation from block to block.
 """
 
 from __future__ import annotations
@@ -80,8 +76,6 @@ class Fit(Struct, frozen=True):
     """Prior information as normal equations, shape (COUNT, COUNT)."""
     active: tuple[int, ...]
     """Indices of the parameters that were fitted."""
-    varies: float
-    """Fraction by which the effective track differs from block to block."""
     converged: bool
     usual: Mapping[int, float]
     """Prior standard deviation of each parameter that has one."""
@@ -177,11 +171,9 @@ def fit(
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
             break
-    evidence = [source(parameters) for source in sources]
-    normal, score = _sum(evidence)
+    normal, score = _sum([source(parameters) for source in sources])
     known, _ = _known(parameters, held, usual)
-    varies = _varies(evidence, parameters)
-    return Fit(parameters, normal, score, known, active, varies, size < SETTLED, usual)
+    return Fit(parameters, normal, score, known, active, size < SETTLED, usual)
 
 
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
@@ -235,31 +227,6 @@ def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
     """Solve for the active parameters. All others keep their value."""
     part = normal[np.ix_(active, active)]
     return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])
-
-
-def _varies(evidence: Sequence[Evidence], parameters: Floats) -> float:
-    """Return the fraction by which the track differs between blocks, beyond the noise within them.
-
-    This is the moment estimator for random effects (DerSimonian & Laird 1986).
-    """
-    spread = weight = 0.0
-    for part in evidence:
-        share = _weight(part)
-        size, score = (
-            share * part.normal[:, INVERSE_TRACK, INVERSE_TRACK],
-            share * part.score[:, INVERSE_TRACK],
-        )
-        used = size > 0.0
-        own = score[used] ** 2 / size[used]
-        free = max(1.0, float(part.counts[used].sum() - used.sum()))
-        noise = max(0.0, float(share * part.squares[used].sum() - own.sum())) / free
-        spread += float(own.sum()) - noise * int(used.sum())
-        weight += float(size.sum())
-    return (
-        float(np.sqrt(max(0.0, spread) / weight)) / abs(parameters[INVERSE_TRACK])
-        if weight
-        else 0.0
-    )
 
 
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
@@ -336,17 +303,16 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
     return Rates(mean, float(fastest))
 
 
-def multipliers(parameters: Floats, covariance: Floats, rate: Rates, varies: float) -> Multipliers:
+def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that serve best at the turn rates of the log.
 
-    The variance of the track includes the difference between the true track and this constant: that
-    at the slowest or fastest turn rate, or the variation from block to block if it is larger.
+    The variance of the track is that of the constant track which serves best there. The turns that
+    skid more or less than usual belong to the noise of the odometry.
 
     Args:
         parameters: the parameters of a fit.
         covariance: the covariance of the parameters.
         rate: the turn rates of the log.
-        varies: the variation of the track from block to block, as a fraction.
     """
     inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -355,9 +321,4 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates, varies: flo
     jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
     jacobian[SEPARATION, INVERSE_TRACK] = -values[SEPARATION] / inverse
     jacobian[SEPARATION, TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
-    made = jacobian @ covariance @ jacobian.T
-    growth_std = min(USUAL[TRACK_GROWTH], np.sqrt(covariance[TRACK_GROWTH, TRACK_GROWTH]))
-    largest_growth = float(np.hypot(growth, growth_std))
-    share = max(largest_growth * max(rate.mean, rate.fastest - rate.mean), varies)
-    made[SEPARATION, SEPARATION] += (values[SEPARATION] * share) ** 2
-    return Multipliers(values, made)
+    return Multipliers(values, jacobian @ covariance @ jacobian.T)

@@ -259,7 +259,7 @@ def _candidate(
     held = folds(fitted, made.parts, drives(driven), rate)
     places = [positions_of(fold.drive, driven, angles) if made.segments else [] for fold in held]
     better = improvement(held, present, base, rows, places, made.steps)
-    result = multipliers(fitted.parameters, fitted.covariance(), rate, fitted.varies)
+    result = multipliers(fitted.parameters, fitted.covariance(), rate)
     return Candidate(made, fitted, rows, rate, gyro_bias, result, better, {})
 
 

@@ -53,7 +53,7 @@ def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Ca
     rows = heading.rows(None, rides, angles, blocks(rides, angles, 4.0))
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)
-    result = multipliers(fit.parameters, fit.covariance, rate, 0.0)
+    result = multipliers(fit.parameters, fit.covariance, rate)
     inverse_track, std = fit.parameters[INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
     chance = float(std[INVERSE_TRACK] / abs(inverse_track))
     for name, deviation in unsure(result, chance, WORST).items():

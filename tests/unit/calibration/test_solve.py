@@ -35,6 +35,10 @@ from tests.unit.calibration.robots import (
 
 WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
 
+SQUARE: Plan = [
+    (1, 0, 0), *[(3, 0.4, 0), (0.5, 0, 0), (2.5, 0, np.pi / 2 / 2.5 * 1.2), (0.5, 0, 0)] * 4,
+]  # fmt: skip
+
 FEW, MANY = 4, 20
 
 each_way = pytest.mark.parametrize("way", WAYS)
@@ -76,18 +80,57 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
     assert min(better) >= 10
 
 
-@so_many
-@each_way
-def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
-    """Check the track from slow to fast turns, and both radii; a gyro gives only their ratio."""
-    found = [c.multipliers for c, _ in robots(way, count)]
-    z = [(f.values[0] - 1.6 * (1 + 0.08 * rate)) / f.std[0] for f in found for rate in (0, 0.5, 1)]
-    for index, true in ((1, 0.998), (2, 1.002)):
-        z += [(f.values[index] - true) / f.std[index] for f in found]
-    rms = np.sqrt(np.mean(np.square(z)))
-    print(f"{way}: {np.mean(np.abs(z) < 2):.1%} of z within 2, rms {rms:.2f}")
-    # In a small sample, chance alone may put more than one in twenty outside.
-    assert np.mean(np.abs(z) < 2) >= (0.95 if count == MANY else 0.85)
+SETS: dict[str, tuple[float, float, float, Plan | None]] = {
+    "constant track": (1.5, 0.0, 0.02, None),
+    "growing track": (1.5, 0.08, 0.02, None),
+    "no skidding": (1.0, 0.0, 0.003, None),
+    "squares": (1.2, 0.0, 0.01, SQUARE),
+}
+"""Sets of drives: `chi`, `rate` and `slip` of the robot, and the plan, or None for 90 s at random.
+
+The squares are six runs, three of them to each side.
+"""
+
+SUBSETS = 20
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("kind", "way"),
+    [("constant track", "gyro"), ("growing track", "gyro"), ("no skidding", "gyro"),
+     ("squares", "gyro"), *(pytest.param(kind, "positions", marks=pytest.mark.soak)
+                            for kind in ("constant track", "squares"))],
+)  # fmt: skip
+def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> None:
+    """The truth of a track that grows is the one that serves best at the drive's turn rates.
+
+    Each run of a set of squares has its own ratio of left to right, because it slips differently.
+    """
+    chi, rate, slip, plan = SETS[kind]
+    gyro, places = WAYS[way]
+    tracks, ratios = [], []
+    for seed in range(SUBSETS):
+        rng = np.random.default_rng(seed)
+        robot = Robot(chi=chi, rate=rate, slip=slip, left=0.99, right=1.01, rng=rng, outliers=0.0)
+        scale = 1.0 + rng.normal(0.0, 0.005)  # of the gyro
+        seen = [drive(robot, wander(rng, 90.0))] if plan is None else []
+        for side in (1, -1) * 3 if plan else ():
+            apart = rng.normal(0.0, 0.004, 2)
+            other = replace(robot, left=0.99 + apart[0], right=1.01 + apart[1])
+            seen.append(drive(other, [(s, v, side * w) for s, v, w in plan or ()]))
+        seen = [replace(one, gyro=one.gyro * scale) for one in seen]
+        found = calibrated(log_of_runs(seen, gyro=gyro, places=places))
+        turns = np.abs(np.concatenate([np.diff(one.yaw) for one in seen])) / 0.01
+        true = chi * (1 + rate * float(turns @ turns / turns.sum()))
+        tracks.append((found.multipliers.values[0] - true) / found.multipliers.std[0])
+        if RATIO not in found.kept:
+            off = np.log(found.multipliers.values[2] / found.multipliers.values[1] * 0.99 / 1.01)
+            ratios.append(off / found.multipliers.ratio_std)
+    track, ratio = (float(np.sqrt(np.mean(np.square(z)))) for z in (tracks, ratios))
+    print(f"{kind}, {way}: rms z {track:.2f} of the track, {ratio:.2f} of left to right")
+    assert 0.5 < track < 1.4
+    assert 0.5 < ratio < 1.4
 
 
 @so_many
