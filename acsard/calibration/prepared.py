@@ -24,6 +24,7 @@ from acsard.calibration.plausibility import (
     positions_follow,
     turn_rates,
     turn_units,
+    turns_like_the_wheels,
     turns_the_right_way,
 )  # fmt: skip
 from acsard.calibration.positions import Segment, WheelSteps
@@ -177,6 +178,7 @@ def prepared(
     sources: list[Source] = []
     sides = by_positions = None
     if headings is not None and len(rows.turned):
+        turns_like_the_wheels(headings.source, rows.turned, rows, base)
         turns_enough(rows.turned)
         sides = heading.first(rows, base)
         heading_follows(headings.source, rows.turned, heading.by_sides(rows, base, sides))
@@ -212,4 +214,4 @@ def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bo
         distance_units(size, base)
     bare = size * float(start[INVERSE_TRACK])
     turn = bare / float(configured[[LEFT, RIGHT]].mean() * configured[INVERSE_TRACK])
-    turn_units(headings.source if headings else "the positions' yaw", turn, bare, base)
+    turn_units(headings.source if headings else "", turn, bare, base)
