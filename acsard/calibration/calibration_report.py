@@ -184,9 +184,11 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
     yield from _better(report)
     yield ""
     yield from _remains(report, calibration)
-    yield from (f"note: {note}" for note in report.notes)
     yield from ("", f"{where}: written" if report.written else "for acsard.toml (or --write):")
     yield from excerpt(keys(calibration))
+    if report.notes:
+        yield ""
+    yield from (f"note: {note}" for note in report.notes)
 
 
 def _better(report: Report) -> list[str]:
