@@ -15,7 +15,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.evidence import INVERSE_TRACK, TRACK_GROWTH, Base
-from acsard.calibration.fit import TURNING, Fit, Rates
+from acsard.calibration.fit import LEAST_FREE, TURNING, Fit, Rates
 from acsard.calibration.heading import Rows, turned
 from acsard.calibration.log_table import Floats
 from acsard.calibration.positions import Segment, WheelSteps, path, segments, spread
@@ -38,6 +38,15 @@ class BeforeAfter(Struct, frozen=True):
 
 
 NOTHING = BeforeAfter(None, None)
+
+SURE = 2.0
+"""Number of standard deviations by which a gain must exceed 0, as for a confidence of 95 %."""
+
+HALVED = float(np.log(2.0))
+"""Gain that is sure whatever its standard deviation is.
+
+In a guided drive, a single leg may show nearly all of the error.
+"""
 
 LEAST_SQUARE = 1e-9
 """Sum of squares, m2 or deg2, that is added to both errors so that neither is 0."""
@@ -66,12 +75,15 @@ class Improvement(Struct, frozen=True):
     Heading and position are added.
     """
     chance: float = 0.0
-    """Standard deviation of `gain`, from the differences between the drives."""
+    """Standard deviation of `gain`, from the differences between the drives.
+
+    It is that of Student's t, because the drives are few.
+    """
 
     @property
     def sure(self) -> bool:
         """Whether the new multipliers are better by more than chance explains."""
-        return self.gain > self.chance
+        return self.gain > min(SURE * self.chance, HALVED)
 
 
 UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
@@ -197,7 +209,10 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 
     count = int(drives.sum())
     alone = [gain(drives & (np.arange(len(drives)) != at)) for at in np.flatnonzero(drives)]
-    chance = float(np.sqrt(count - 1) * np.std(alone)) if count > 1 else np.inf
+    if count == 1:
+        return gain(drives), np.inf
+    free = max(LEAST_FREE, count - 1.0)
+    chance = float(np.sqrt((count - 1) * free / (free - 2)) * np.std(alone))
     return gain(drives), chance
 
 

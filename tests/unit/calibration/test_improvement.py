@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from acsard.calibration.fit import Rates, fit
 from acsard.calibration.improvement import (
+    UNMEASURED,
     Fold,
     Improvement,
     drives,
@@ -85,3 +86,13 @@ def test_a_slow_curve_is_no_straight() -> None:
 def test_one_track_for_all_rates_turns_as_far_at_the_mean_rate() -> None:
     fixed = with_constant_track(np.array([1, 1, 0.6, 0.1, 0, 0, 0]), RATE)
     assert fixed.tolist() == pytest.approx([1, 1, 0.6 * 0.95, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("gain", "chance", "sure"),
+    [(0.3, 0.1, True), (0.15, 0.1, False), (0.8, 1.0, True), (0.6, 1.0, False), (-0.1, 0.0, False)],
+)
+def test_a_gain_is_sure_beyond_two_deviations_or_if_the_error_is_halved(
+    gain: float, chance: float, sure: bool
+) -> None:
+    assert replace(UNMEASURED, gain=gain, chance=chance).sure == sure
