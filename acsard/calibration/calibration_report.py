@@ -8,6 +8,7 @@ from msgspec import Struct
 from rich.console import RenderableType
 
 from acsard.calibration.fit import SEPARATION
+from acsard.calibration.prepared import RATIO, TRACK
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt
@@ -51,16 +52,17 @@ class Report(Struct, frozen=True):
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
-    wheel_separation_multiplier_std: float
-    left_wheel_radius_multiplier_std: float
-    right_wheel_radius_multiplier_std: float
+    wheel_separation_multiplier_std: float | None
+    """Standard deviation; None, like the next two, for a quantity that stays as configured."""
+    left_wheel_radius_multiplier_std: float | None
+    right_wheel_radius_multiplier_std: float | None
     covariance: Sequence[Sequence[float]]
     """Covariance of the three multipliers, in the order of the fields above."""
     odometry: dict[str, float]
     """Standard deviations for `[odometry]`, by the name of the setting (`Multipliers.own`)."""
     effective_track: float
     """Effective track, m."""
-    effective_track_std: float
+    effective_track_std: float | None
     effective_track_growth: float
     """Fraction by which the track grows with each rad/s of turn rate."""
     effective_track_growth_std: float
@@ -73,8 +75,11 @@ class Report(Struct, frozen=True):
     straight_error_before: float | None
     """Heading error after 10 m straight ahead, deg."""
     straight_error_after: float | None
+    heading_error_before: float | None
+    """Heading error over whole drives, deg rms."""
+    heading_error_after: float | None
     position_error_before: float | None
-    """Position error over a few seconds, m rms."""
+    """Position error over whole drives, m rms."""
     position_error_after: float | None
     time_offsets: dict[str, float]
     """Delay of each sensor behind the wheels, s."""
@@ -86,6 +91,8 @@ class Report(Struct, frozen=True):
     """Distance rolled ahead and back, m."""
     turns: float
     """Number of turns of 360 deg to both sides."""
+    kept: Sequence[str]
+    """Quantities that stay as configured, because the log does not improve them, in words."""
     notes: Sequence[str]
     written: str | None
     """File that contains the multipliers now, or None."""
@@ -103,7 +110,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()
-    track_std, left_std, right_std = multipliers.std.tolist()
+    track_std, left_std, right_std = _deviations(calibration)
     improvement, drives = calibration.improvement, calibration.drives
     return Report(
         log=log, reference=calibration.reference, scale=calibration.scale,
@@ -112,19 +119,28 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
         right_wheel_radius_multiplier=right, right_wheel_radius_multiplier_std=right_std,
         covariance=multipliers.covariance.tolist(), odometry=deviations(calibration),
         effective_track=track * drive.wheel_separation,
-        effective_track_std=track_std * drive.wheel_separation,
+        effective_track_std=None if track_std is None else track_std * drive.wheel_separation,
         effective_track_growth=calibration.growth,
         effective_track_growth_std=calibration.growth_std,
         left_wheel_radius=left * drive.wheel_radius, right_wheel_radius=right * drive.wheel_radius,
         turn_error_before=improvement.turn.before, turn_error_after=improvement.turn.after,
         straight_error_before=improvement.straight.before,
         straight_error_after=improvement.straight.after,
+        heading_error_before=improvement.heading.before,
+        heading_error_after=improvement.heading.after,
         position_error_before=improvement.place.before,
         position_error_after=improvement.place.after,
         time_offsets=calibration.delays, gyro_bias=calibration.gyro_bias,
         runs=drives.runs, seconds=drives.seconds, distance=drives.metres, turns=drives.turns,
-        notes=calibration.notes, written=written or None,
+        kept=calibration.kept, notes=calibration.notes, written=written or None,
     )  # fmt: skip
+
+
+def _deviations(calibration: Calibration) -> list[float | None]:
+    """Return the standard deviation of each multiplier, or None for one that stays."""
+    kept = TRACK in calibration.kept, RATIO in calibration.kept, RATIO in calibration.kept
+    deviations = calibration.multipliers.std.tolist()
+    return [None if stays else std for stays, std in zip(kept, deviations, strict=True)]
 
 
 def keys(calibration: Calibration) -> dict[str, object]:
@@ -139,7 +155,8 @@ def keys(calibration: Calibration) -> dict[str, object]:
 def deviations(calibration: Calibration) -> dict[str, float]:
     """Return the settings of `[odometry]`; the scale is included only if it was measured."""
     own, scale = calibration.multipliers.own()
-    given = {f"{name}_std": float(value) for name, value in zip(NAMES, own, strict=True)}
+    stds = zip(NAMES, own, _deviations(calibration), strict=True)
+    given = {f"{name}_std": float(value) for name, value, known in stds if known is not None}
     if calibration.scale:
         given["distance_scale_std"] = scale
     return {name: round(min(value, MOST_STD), DIGITS) for name, value in given.items()}
@@ -156,17 +173,22 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
     now, new = calibration.configured, calibration.multipliers
     was = report.effective_track / new.values[SEPARATION] * now.values[SEPARATION]
     figures = [
-        *zip(NAMES, now.values, new.values, new.std, strict=True),
+        *zip(NAMES, now.values, new.values, _deviations(calibration), strict=True),
         ("effective track, m", was, report.effective_track, report.effective_track_std),
     ]
-    rows = [(name, *(f"{value:.4f}" for value in values)) for name, *values in figures]
+    rows = [
+        (name, f"{old:.4f}", f"{found:.4f}", "as configured" if std is None else f"{std:.4f}")
+        for name, old, found, std in figures
+    ]
     yield from ("", table(rows, ("", "now", "found", "standard deviation"), right={1, 2}), "")
     yield from _better(report)
     yield ""
     yield from _remains(report, calibration)
-    yield from (f"note: {note}" for note in report.notes)
     yield from ("", f"{where}: written" if report.written else "for acsard.toml (or --write):")
     yield from excerpt(keys(calibration))
+    if report.notes:
+        yield ""
+    yield from (f"note: {note}" for note in report.notes)
 
 
 def _better(report: Report) -> list[str]:
@@ -177,16 +199,16 @@ def _better(report: Report) -> list[str]:
          "error of a turn of 360 deg: {} now, {} with the new values", "deg", 1),
         (report.straight_error_before, report.straight_error_after,
          "heading error after 10 m straight ahead: {} now, {} with the new values", "deg", 1),
+        (report.heading_error_before, report.heading_error_after,
+         "heading error over whole drives: {} now, {} with the new values", "deg", 1),
         (report.position_error_before, report.position_error_after,
-         "position error over a few seconds: {} now, {} with the new values", "cm", 100),
+         "position error over whole drives: {} now, {} with the new values", "cm", 100),
     ):  # fmt: skip
         if before is not None and after is not None:
             sentences.append(
                 words.format(f"{_two(before * factor)} {unit}", f"{_two(after * factor)} {unit}")
             )
-    return (
-        [*sentences, "(measured on parts of the log that the fit did not use)"] if sentences else []
-    )
+    return [*sentences, "(measured on drives that the fit did not use)"] if sentences else []
 
 
 def _two(value: float) -> str:
@@ -199,9 +221,10 @@ def _remains(report: Report, calibration: Calibration) -> list[str]:
     fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
+    known = "" if TRACK in report.kept else f"here it is known to {share:.1%}, and "
     sentences = [
-        "what remains: on wheels that skid the effective track is not constant; here it is known "
-        f"to {share:.1%}, and changes by {report.effective_track_growth * fastest:+.1%} (+- "
+        f"what remains: on wheels that skid the effective track is not constant; {known}"
+        f"{'it ' * (not known)}changes by {report.effective_track_growth * fastest:+.1%} (+- "
         f"{report.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. It "
         "differs on other ground, so calibrate where you drive"
     ]

@@ -5,10 +5,6 @@ over the blocks (Quenouille and Tukey): each block is left out in turn, and the 
 parameters show the effect of chance. This is right even if the errors within a block are
 correlated. The change is computed by one linear step. If there are few blocks, the standard
 deviation is widened to that of Student's t.
-
-The effective track of a skidding robot is not constant. The standard deviation of its multiplier
-therefore also includes the larger of two terms: half of its change from slow to fast turns, and its
-variation from block to block.
 """
 
 from __future__ import annotations
@@ -53,7 +49,10 @@ If the log has no positions, nothing in it shows this error.
 """
 
 HELD = 1e9
-"""Weight that holds the mean radius at its start if no sensor measures it."""
+"""Weight that holds a combination of parameters: the mean radius if no sensor measures it."""
+
+Held = tuple[Floats, float]
+"""Weights of the parameters, shape (COUNT,), and the value at which their weighted sum is held."""
 
 MANY = 16
 """Number of blocks from which on the jackknife also leaves out pairs of neighbouring blocks."""
@@ -77,8 +76,6 @@ class Fit(Struct, frozen=True):
     """Prior information as normal equations, shape (COUNT, COUNT)."""
     active: tuple[int, ...]
     """Indices of the parameters that were fitted."""
-    varies: float
-    """Fraction by which the effective track differs from block to block."""
     converged: bool
     usual: Mapping[int, float]
     """Prior standard deviation of each parameter that has one."""
@@ -135,7 +132,7 @@ class Fit(Struct, frozen=True):
 
 def fit(
     sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
-    bias_std: float = 0.0,
+    bias_std: float = 0.0, held: Sequence[Held] = (),
 ) -> Fit:  # fmt: skip
     """Return the fit of the parameters to the evidence of all sensors.
 
@@ -146,6 +143,7 @@ def fit(
         gyro: whether a gyro is among the sources.
         bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not depend
             on the bias.
+        held: combinations of parameters that the fit does not change.
     """
     active: tuple[int, ...] = (LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH, DELAY, SENSOR_X, SENSOR_Y)[
         : None if places else 4
@@ -155,11 +153,14 @@ def fit(
         active, usual[SCALE_ERROR] = (*active, SCALE_ERROR), GYRO_SCALE
     if bias_std:
         active, usual[BIAS_ERROR] = (*active, BIAS_ERROR), bias_std
-    held = start[LEFT] + start[RIGHT]
+    if not places:
+        both = np.zeros(COUNT)
+        both[[LEFT, RIGHT]] = 1.0
+        held = (*held, (both, float(both @ start)))
     parameters, size = start.copy(), np.inf
     for at in range(MOST_STEPS):
         normal, score = _sum([source(parameters) for source in sources])
-        known, prior = _known(parameters, held, places, usual)
+        known, prior = _known(parameters, held, usual)
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
         # Far from the solution, take only a part of the step: the linearization holds only near its
@@ -170,11 +171,9 @@ def fit(
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
             break
-    evidence = [source(parameters) for source in sources]
-    normal, score = _sum(evidence)
-    known, _ = _known(parameters, held, places, usual)
-    varies = _varies(evidence, parameters)
-    return Fit(parameters, normal, score, known, active, varies, size < SETTLED, usual)
+    normal, score = _sum([source(parameters) for source in sources])
+    known, _ = _known(parameters, held, usual)
+    return Fit(parameters, normal, score, known, active, size < SETTLED, usual)
 
 
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
@@ -205,25 +204,22 @@ def _weight(part: Evidence) -> float:
 
 
 def _known(
-    parameters: Floats, held: float, places: bool, usual: Mapping[int, float]
+    parameters: Floats, held: Sequence[Held], usual: Mapping[int, float]
 ) -> tuple[Floats, Floats]:
     """Return the prior information as normal equations.
 
     Args:
         parameters: the present parameters.
-        held: the sum of both radii to hold if `places` is false.
-        places: whether positions measure the radii.
+        held: the combinations of parameters that do not change.
         usual: the prior standard deviation of each parameter that has one.
     """
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
         score[index] = -parameters[index] * deviation**-2
-    if not places:
-        both = np.zeros(COUNT)
-        both[[LEFT, RIGHT]] = 1.0
-        normal += HELD * np.outer(both, both)
-        score += HELD * both * (held - parameters[LEFT] - parameters[RIGHT])
+    for weights, value in held:
+        normal += HELD * np.outer(weights, weights)
+        score += HELD * weights * (value - weights @ parameters)
     return normal, score
 
 
@@ -231,31 +227,6 @@ def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
     """Solve for the active parameters. All others keep their value."""
     part = normal[np.ix_(active, active)]
     return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])
-
-
-def _varies(evidence: Sequence[Evidence], parameters: Floats) -> float:
-    """Return the fraction by which the track differs between blocks, beyond the noise within them.
-
-    This is the moment estimator for random effects (DerSimonian & Laird 1986).
-    """
-    spread = weight = 0.0
-    for part in evidence:
-        share = _weight(part)
-        size, score = (
-            share * part.normal[:, INVERSE_TRACK, INVERSE_TRACK],
-            share * part.score[:, INVERSE_TRACK],
-        )
-        used = size > 0.0
-        own = score[used] ** 2 / size[used]
-        free = max(1.0, float(part.counts[used].sum() - used.sum()))
-        noise = max(0.0, float(share * part.squares[used].sum() - own.sum())) / free
-        spread += float(own.sum()) - noise * int(used.sum())
-        weight += float(size.sum())
-    return (
-        float(np.sqrt(max(0.0, spread) / weight)) / abs(parameters[INVERSE_TRACK])
-        if weight
-        else 0.0
-    )
 
 
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
@@ -332,17 +303,16 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
     return Rates(mean, float(fastest))
 
 
-def multipliers(parameters: Floats, covariance: Floats, rate: Rates, varies: float) -> Multipliers:
+def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that serve best at the turn rates of the log.
 
-    The variance of the track includes the difference between the true track and this constant: that
-    at the slowest or fastest turn rate, or the variation from block to block if it is larger.
+    The variance of the track is that of the constant track which serves best there. The turns that
+    skid more or less than usual belong to the noise of the odometry.
 
     Args:
         parameters: the parameters of a fit.
         covariance: the covariance of the parameters.
         rate: the turn rates of the log.
-        varies: the variation of the track from block to block, as a fraction.
     """
     inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -351,9 +321,4 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates, varies: flo
     jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
     jacobian[SEPARATION, INVERSE_TRACK] = -values[SEPARATION] / inverse
     jacobian[SEPARATION, TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
-    made = jacobian @ covariance @ jacobian.T
-    growth_std = min(USUAL[TRACK_GROWTH], np.sqrt(covariance[TRACK_GROWTH, TRACK_GROWTH]))
-    largest_growth = float(np.hypot(growth, growth_std))
-    share = max(largest_growth * max(rate.mean, rate.fastest - rate.mean), varies)
-    made[SEPARATION, SEPARATION] += (values[SEPARATION] * share) ** 2
-    return Multipliers(values, made)
+    return Multipliers(values, jacobian @ covariance @ jacobian.T)

@@ -1,23 +1,26 @@
-"""The improvement that a calibration brings, by cross-validation.
+"""The improvement that a calibration brings, judged by whole drives that the fit did not use.
 
 Each run is left out in turn, and the parameters that were found without it are tested on it. If the
-log has fewer than three runs, fifths of the log are left out instead.
+log has fewer than three runs, each fifth of the log counts as a run. The tool chooses between
+several fits by this error, and gives no values that are worse than the configured ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.evidence import INVERSE_TRACK, TRACK_GROWTH, Base
-from acsard.calibration.fit import TURNING, Fit, Rates
+from acsard.calibration.fit import LEAST_FREE, TURNING, Fit, Rates
 from acsard.calibration.heading import Rows, turned
 from acsard.calibration.log_table import Floats
-from acsard.calibration.positions import Segment, WheelSteps, path, spread
-from acsard.calibration.wheel_angles import Block
+from acsard.calibration.positions import Segment, WheelSteps, path, segments, spread
+from acsard.calibration.runs import Run
+from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative
 
 FOLDS = 5
 LEAST_RUNS = 3
@@ -26,18 +29,27 @@ LEAST_RUNS = 3
 STRAIGHT = 0.1
 """Largest curvature of a straight drive by the wheels, rad/m."""
 
-PRECISE = 0.1
-"""Largest standard deviation of the track of one block that is used, as a fraction.
-
-The track of one block is that which suits the positions of this block best.
-"""
-
 
 class BeforeAfter(Struct, frozen=True):
     """An error with the configured and with the new multipliers; None if nothing measures it."""
 
     before: float | None
     after: float | None
+
+
+NOTHING = BeforeAfter(None, None)
+
+SURE = 2.0
+"""Number of standard deviations by which a gain must exceed 0, as for a confidence of 95 %."""
+
+HALVED = float(np.log(2.0))
+"""Gain that is sure whatever its standard deviation is.
+
+In a guided drive, a single leg may show nearly all of the error.
+"""
+
+LEAST_SQUARE = 1e-9
+"""Sum of squares, m2 or deg2, that is added to both errors so that neither is 0."""
 
 
 class Improvement(Struct, frozen=True):
@@ -53,26 +65,74 @@ class Improvement(Struct, frozen=True):
 
     It comes from turns that the wheels do not show.
     """
+    heading: BeforeAfter
+    """RMS error of the heading over whole drives, deg. Each drive is rotated to fit best."""
     place: BeforeAfter
-    """RMS distance of the positions from the path of the wheels within a block, m."""
+    """RMS error of the position over whole drives, m. Each drive is shifted and rotated to fit."""
+    gain: float = np.inf
+    """Logarithm of the error before divided by the error after, over whole drives.
+
+    Heading and position are added.
+    """
+    chance: float = 0.0
+    """Standard deviation of `gain`, from the differences between the drives.
+
+    It is that of Student's t, because the drives are few.
+    """
+
+    @property
+    def sure(self) -> bool:
+        """Whether the new multipliers are better by more than chance explains."""
+        return self.gain > min(SURE * self.chance, HALVED)
+
+
+UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
 
 
 class Fold(Struct, frozen=True):
-    """A mask of blocks that are left out, and the parameters that the other blocks give."""
+    """A drive that is left out, as a mask of blocks, and the parameters without these blocks."""
 
+    drive: Block
     blocks: npt.NDArray[np.bool_]
     parameters: Floats
 
 
-def folds(fit: Fit, parts: Sequence[Block], rate: Rates) -> Iterator[Fold]:
-    """Yield the folds of the cross-validation. Each block is left out in exactly one of them."""
-    runs = np.array([part.run for part in parts])
-    group = runs
-    if len(set(runs.tolist())) < LEAST_RUNS:
-        group = np.arange(len(parts)) * FOLDS // len(parts)
-    for number in sorted(set(group.tolist())):
-        out = np.asarray(group == number)
-        yield Fold(out, with_constant_track(fit.without(out), rate))
+def drives(driven: Sequence[Run]) -> list[Block]:
+    """Return the drives that are left out in turn: the whole runs, or fifths of the log."""
+    longest = np.inf
+    if len(driven) < LEAST_RUNS:
+        longest = sum(float(run.t[-1]) for run in driven) / FOLDS
+    found = []
+    for number, run in enumerate(driven):
+        edges = np.linspace(0.0, run.t[-1], max(1, round(float(run.t[-1]) / longest)) + 1)
+        found += [Block(number, float(a), float(b)) for a, b in pairwise(edges)]
+    return found
+
+
+def positions_of(
+    drive: Block, driven: Sequence[Run], angles: Sequence[WheelAngles]
+) -> list[Segment]:
+    """Return the positions of a drive, split at jumps and at gaps of the wheels."""
+    gaps = angles[drive.run].gaps
+    edges = np.concatenate(([drive.begin], gaps.ravel(), [drive.end])).clip(drive.begin, drive.end)
+    pieces = [Block(drive.run, float(a), float(b)) for a, b in edges.reshape(-1, 2)]
+    return segments(driven, angles, [piece for piece in pieces if piece.end > piece.begin])
+
+
+def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
+    """Return the folds of the cross-validation, one for each drive that has blocks.
+
+    A block is left out with each drive that it overlaps.
+    """
+    run, begin, end = (
+        np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
+    )
+    found = []
+    for drive in left_out:
+        out = (run == drive.run) & (begin < drive.end - 1e-6) & (end > drive.begin + 1e-6)
+        if out.any() and not out.all():
+            found.append(Fold(drive, out, with_constant_track(fit.without(out), rate)))
+    return found
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
@@ -87,40 +147,73 @@ def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
 
 
 def improvement(
-    fit: Fit, base: Base, parts: Sequence[Block], rate: Rates, rows: Rows, truth: Floats,
-    segments: Sequence[Segment], steps: Sequence[WheelSteps],
+    held: Sequence[Fold], configured: Floats, base: Base, rows: Rows,
+    places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Improvement:  # fmt: skip
     """Return the errors before and after the calibration.
 
     Args:
-        fit: the fit to the whole log.
+        held: the folds of the fit.
+        configured: the parameters with the configured multipliers.
         base: the configured geometry.
-        parts: the blocks of the log.
-        rate: the turn rates of the log.
-        rows: the turns of the log.
-        truth: the robot's turn in each row, rad, as the sensors show it; 0 if they do not.
-        segments: the positions of the log.
+        rows: the turns of the log by the heading sensor; all 0 without one.
+        places: the positions of each fold's drive.
         steps: the wheel steps of each run.
     """
-    held = list(folds(fit, parts, rate))
-    configured = fit.parameters.copy()
-    configured[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
     by_wheels = turned(rows, base, configured)
-    before = truth - by_wheels
-    after = np.zeros_like(truth)
+    before = rows.turned - by_wheels
+    after = before.copy()
     for fold in held:
         out = fold.blocks[rows.block]
-        after[out] = (truth - turned(rows, base, fold.parameters))[out]
-    turning = np.abs(truth) > TURNING * rows.seconds
+        after[out] = (rows.turned - turned(rows, base, fold.parameters))[out]
+    measured = rows.turned != 0.0
+    turning = np.abs(rows.turned) > TURNING * rows.seconds
     distance = base.radius * np.abs(rows.left + rows.right) / 2
-    straight = ~turning & (truth != 0.0) & (np.abs(by_wheels) < STRAIGHT * distance)
-    block_and_side = 2 * rows.block + (truth > 0.0)
-    angle, metres = float(np.abs(truth[turning]).sum()), float(distance[straight].sum())
+    straight = ~turning & measured & (np.abs(by_wheels) < STRAIGHT * distance)
+    block_and_side = 2 * rows.block + (rows.turned > 0.0)
+    angle, metres = float(np.abs(rows.turned[turning]).sum()), float(distance[straight].sum())
+    squares = [_of_headings(held, before, after, rows)] if measured.any() else []
+    squares += [_of_positions(held, configured, base, places, steps)] if steps else []
+    gain, chance = _gain(squares)
+    of_heading, of_place = (
+        _rms(squares[0]) if measured.any() else NOTHING,
+        _rms(squares[-1]) if steps else NOTHING,
+    )
     return Improvement(
         _per_amount(before, after, block_and_side, turning, 360.0, angle),
         _per_amount(before, after, rows.block, straight, np.degrees(10.0), metres),
-        _of_positions(held, configured, base, segments, steps),
-    )
+        of_heading, of_place, gain, chance,
+    )  # fmt: skip
+
+
+def _rms(squares: Floats) -> BeforeAfter:
+    before, after, count = squares.sum(axis=0).tolist()
+    if not count:
+        return NOTHING
+    return BeforeAfter(float(np.sqrt(before / count)), float(np.sqrt(after / count)))
+
+
+def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
+    """Return `Improvement.gain` and `Improvement.chance`.
+
+    Each kind of error has the sums of squares before and after and the number of samples, one row
+    for each drive. The deviation is that of the jackknife over the drives.
+    """
+    drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
+    if not np.any(drives):
+        return 0.0, np.inf
+
+    def gain(left: npt.NDArray[np.bool_]) -> float:
+        sums = [squares[left].sum(axis=0) + LEAST_SQUARE for squares in kinds]
+        return float(sum(np.log(before / after) for before, after, _ in sums) / 2)
+
+    count = int(drives.sum())
+    alone = [gain(drives & (np.arange(len(drives)) != at)) for at in np.flatnonzero(drives)]
+    if count == 1:
+        return gain(drives), np.inf
+    free = max(LEAST_FREE, count - 1.0)
+    chance = float(np.sqrt((count - 1) * free / (free - 2)) * np.std(alone))
+    return gain(drives), chance
 
 
 def _per_amount(
@@ -134,29 +227,45 @@ def _per_amount(
     return BeforeAfter(*(float(unit * total / amount) for total in sums))
 
 
+def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
+    """Return the sums of squared errors before and after, deg2, and their number, by drive."""
+    found = np.zeros((len(held), 3))
+    for number, fold in enumerate(held):
+        out = fold.blocks[rows.block]
+        for index, errors in enumerate((before[out], after[out])):
+            heading = np.degrees(cumulative(errors))
+            found[number, index] = float(np.sum((heading - heading.mean()) ** 2))
+        found[number, 2] = len(heading) if out.any() else 0
+    return found
+
+
 def _of_positions(
-    held: Sequence[Fold], configured: Floats, base: Base, segments: Sequence[Segment],
-    steps: Sequence[WheelSteps],
-) -> BeforeAfter:  # fmt: skip
-    if not segments:
-        return BeforeAfter(None, None)
-    squares, count = 0.0, 0
-    for fold in held:
-        out = [segment for segment in segments if fold.blocks[segment.block]]
-        paths = [path(run, base, fold.parameters) for run in steps]
-        points = sum(len(segment.t) for segment in out)
-        squares, count = squares + spread(out, paths, fold.parameters) ** 2 * points, count + points
-    before = spread(segments, [path(run, base, configured) for run in steps], configured)
-    return BeforeAfter(before, float(np.sqrt(squares / max(1, count))))
+    held: Sequence[Fold], configured: Floats, base: Base,
+    places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
+) -> Floats:  # fmt: skip
+    """Return the sums of squared errors before and after, m2, and their number, by drive."""
+    found = np.zeros((len(held), 3))
+    present = [path(run, base, configured) for run in steps]
+    for number, (fold, out) in enumerate(zip(held, places, strict=True)):
+        if points := sum(len(segment.t) for segment in out):
+            run = fold.drive.run
+            new = {run: path(steps[run], base, fold.parameters)}
+            errors = spread(out, present, configured), spread(out, new, fold.parameters)
+            found[number] = [*(points * error**2 for error in errors), points]
+    return found
 
 
-def turns_by_positions(fit: Fit, rows: Rows, base: Base) -> Floats:
-    """Return the robot's turn in each row, rad, as the positions alone show it.
-
-    The turn is that of the wheels with the track that suits the positions of its block best. It is
-    0 if this track is too uncertain.
-    """
-    size = np.maximum(fit.normal[:, INVERSE_TRACK, INVERSE_TRACK], 1e-300)
-    ratio = 1.0 + fit.score[:, INVERSE_TRACK] / size / fit.parameters[INVERSE_TRACK]
-    ratio[1 / np.sqrt(size) > PRECISE * abs(fit.parameters[INVERSE_TRACK])] = 0.0
-    return np.asarray(turned(rows, base, fit.parameters) * ratio[rows.block])
+def no_better(found: Improvement) -> str:
+    """Return the reason to keep the configured multipliers, with the errors over whole drives."""
+    errors = ", ".join(
+        f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} then"
+        for name, error, unit, factor in (
+            ("heading", found.heading, "deg", 1.0), ("position", found.place, "cm", 100.0)
+        )
+        if error.before is not None and error.after is not None
+    )  # fmt: skip
+    return (
+        "the multipliers of this log are not surely better than the configured ones over whole "
+        f"drives that the fit did not use ({errors or 'no drive could be left out'}): keep the "
+        "configured ones"
+    )

@@ -137,6 +137,9 @@ COLUMNS = (*NUMBERS, "run")
 MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
 """Contents of a cell without a value, in lower case."""
 
+COUNTS = re.compile(r"tick|count|(?:^|_)enc")
+"""Pattern of the names of columns with encoder counts, which no renaming makes speeds."""
+
 COMMENTS = ("#", "%")
 """First characters of the comment lines above the table."""
 
@@ -283,6 +286,11 @@ def _near(names: Sequence[str], header: Sequence[str]) -> str:
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (is {times[0][:40]} it? rename it t, in s)"
+    if counts := [name for name in others if COUNTS.search(name)]:
+        return (
+            f" ({counts[0][:40]} has counts, not speeds: write the counts of each row as rad/s, "
+            "2 pi counts / (counts per turn x seconds))"
+        )
     near = [other for name in names for other in nearest(name, others)]
     return f" (is {near[0]} it? rename it)" if near else ""
 

@@ -10,7 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from acsard.calibration import heading
 from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats
 from acsard.calibration.search import StartingPoint
 from acsard.core.values import AcsardError
@@ -71,10 +73,6 @@ class RefusedError(AcsardError):
     """The log cannot be used for a calibration. The text says why and what to do."""
 
 
-class UnlikeError(RefusedError):
-    """The positions do not follow the wheels in blocks of the length that was tried."""
-
-
 def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
     """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
 
@@ -93,9 +91,9 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
 
 
 def positions_follow(begun: StartingPoint) -> None:
-    """Raise `UnlikeError` if the positions do not follow the path of the wheels."""
+    """Raise `RefusedError` if the positions do not follow the path of the wheels."""
     if begun.unexplained > UNLIKE:
-        raise UnlikeError(
+        raise RefusedError(
             "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
             "latitude and longitude), from the same drive, on the same clock within 1 s?"
         )
@@ -152,6 +150,20 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
         )
 
 
+def turns_like_the_wheels(source: str, turned: Floats, rows: Rows, base: Base) -> None:
+    """Raise `RefusedError` if the sensor shows nearly no turns while the wheels turn the robot."""
+    shown = float(np.abs(turned).sum())
+    by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
+    if shown < LEAST_TURN * by_wheels:
+        raise RefusedError(
+            f"{source} shows turns of {np.degrees(shown):.0f} deg in all, but the wheels would "
+            f"turn the robot by up to {np.degrees(by_wheels):.0f} deg: is {source} the rate about "
+            "the upright axis? If the IMU lies on its side, another of its axes points up: write "
+            "that one into the column, positive to the left. Are the wheel speeds in rad/s, not "
+            "counts, deg/s or rpm?"
+        )
+
+
 def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
     """Raise `RefusedError` if the turns are in degrees, because no robot turns this fast.
 
@@ -175,16 +187,17 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
     """Raise `RefusedError` if the turns are so far from the wheels' that a unit must be wrong.
 
     Args:
-        source: the name of the sensor of turns.
+        source: the name of the heading sensor, or "" if positions show the turns.
         turn: the ratio of the measured turn to the turn by the configured multipliers.
         bare: the ratio of the measured turn to the turn by wheel radius and separation alone.
         base: the configured geometry.
     """
     if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
         return
+    degrees = f"{source} is in degrees (multiply by pi / 180), or " * bool(source)
     may = (
-        f"{source} is in degrees (multiply by pi / 180), or the wheel speeds are in m/s (divide "
-        "by the wheel radius) or turns/s (multiply by 2 pi)"
+        f"{degrees}the wheel speeds are in m/s (divide by the wheel radius) or turns/s (multiply "
+        "by 2 pi)"
         if turn > 1
         else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
     )

@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from acsard.calibration import heading, positions
 from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT, Base, condition
-from acsard.calibration.fit import LEAST_BLOCKS, Multipliers, Source
+from acsard.calibration.fit import LEAST_BLOCKS, Fit, Multipliers, Source
 from acsard.calibration.heading import Headings, Rows
 from acsard.calibration.log_table import Floats
 from acsard.calibration.plausibility import (
@@ -24,6 +24,7 @@ from acsard.calibration.plausibility import (
     positions_follow,
     turn_rates,
     turn_units,
+    turns_like_the_wheels,
     turns_the_right_way,
 )  # fmt: skip
 from acsard.calibration.positions import Segment, WheelSteps
@@ -65,25 +66,27 @@ def drives_enough(parts: Sequence[Block]) -> None:
         raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
 
 
-def rolls_enough(rows: Rows) -> None:
+def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the wheels lack a movement that the fit needs.
 
-    Both sides must roll in the same direction and in opposite directions, and the proportion of the
-    two movements must vary.
+    Both sides must roll in opposite directions and in the same direction, and the proportion of the
+    two movements must vary. If `spins` is true, turns on the spot are enough.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "against each other")):
         if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
+            if spins and what == "ahead or back":
+                continue
             raise RefusedError(
                 f"the wheels roll {turns:.1f} turns {what} in all, which is too little to measure "
                 f"their size, the ratio of left to right and the effective track: {DRIVE}"
             )
-    cross = float(together @ against) ** 2
-    if cross > ALIKE * float(together @ together) * float(against @ against):
-        raise RefusedError(
-            f"the robot always drives the same curve, which does not separate the wheels from the "
-            f"track: {DRIVE}"
-        )
+        cross = float(together @ against) ** 2
+        if cross > ALIKE * float(together @ together) * float(against @ against):
+            raise RefusedError(
+                f"the robot always drives the same curve, which does not separate the wheels from "
+                f"the track: {DRIVE}"
+            )
 
 
 def turns_enough(turned: Floats) -> None:
@@ -95,39 +98,32 @@ def turns_enough(turned: Floats) -> None:
         )
 
 
-def sure_enough(
-    found: Multipliers, track_std: float, worst: tuple[float, float] = WORST,
-    log: str = "this log", advice: str = DRIVE,
-) -> None:  # fmt: skip
-    """Raise `RefusedError` if the result is too uncertain to be useful.
+TRACK, RATIO = "the effective track", "the ratio of left to right"
+"""Names of the two quantities that a log may leave unsure."""
+
+
+def unsure(
+    found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
+) -> dict[str, float]:
+    """Return the relative standard deviations that are too large to be useful, by `TRACK`, `RATIO`.
 
     Args:
         found: the multipliers.
         track_std: the standard deviation of the track as a fraction. It leaves out that the track
             itself varies with the turn rate and from block to block.
         worst: the largest useful standard deviations of the track and of the ratio of the radii.
-        log: the name of the data in the message.
-        advice: what to do, in the words of the message.
     """
-    deviations = {"the effective track": track_std, "the ratio of left to right": found.ratio_std}
-    for (name, deviation), most in zip(deviations.items(), worst, strict=True):
-        if not deviation <= most:
-            raise RefusedError(
-                f"{log} determines {name} only to {deviation:.1%}, which is too inaccurate: "
-                f"{advice}"
-            )
+    deviations = {TRACK: track_std, RATIO: found.ratio_std}
+    return {
+        name: deviation
+        for (name, deviation), most in zip(deviations.items(), worst, strict=True)
+        if not deviation <= most
+    }
 
 
-def separates_track(normal: Floats) -> None:
-    """Raise `RefusedError` if the log cannot separate the radii from the track.
-
-    `normal` has the normal equations of both, as `Fit.marginal` returns them.
-    """
-    if condition(normal) > WORST_CONDITION:
-        raise RefusedError(
-            f"in the log the robot turns only while it drives ahead, so the track and the wheels "
-            f"cannot be separated (condition number over {WORST_CONDITION:g}): {DRIVE}"
-        )
+def separates_track(fitted: Fit) -> bool:
+    """Return whether the log separates the radii from the track."""
+    return condition(fitted.marginal()) <= WORST_CONDITION
 
 
 class Prepared(Struct, frozen=True):
@@ -172,8 +168,8 @@ def prepared(
             f"{headings.source} has no samples while the wheels turn: record both at the same "
             "time, with times of one clock"
         )
-    rolls_enough(rows)
     segments = positions.segments(driven, angles, parts)
+    rolls_enough(rows, spins=headings is not None and not segments)
     steps = (
         [positions.wheel_steps(*pair) for pair in zip(driven, angles, strict=True)]
         if segments
@@ -182,6 +178,7 @@ def prepared(
     sources: list[Source] = []
     sides = by_positions = None
     if headings is not None and len(rows.turned):
+        turns_like_the_wheels(headings.source, rows.turned, rows, base)
         turns_enough(rows.turned)
         sides = heading.first(rows, base)
         heading_follows(headings.source, rows.turned, heading.by_sides(rows, base, sides))
@@ -217,4 +214,4 @@ def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bo
         distance_units(size, base)
     bare = size * float(start[INVERSE_TRACK])
     turn = bare / float(configured[[LEFT, RIGHT]].mean() * configured[INVERSE_TRACK])
-    turn_units(headings.source if headings else "the positions' yaw", turn, bare, base)
+    turn_units(headings.source if headings else "", turn, bare, base)

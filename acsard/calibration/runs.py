@@ -14,7 +14,6 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table
-from acsard.core.formatting import many
 
 Complexes = npt.NDArray[np.complex128]
 Rows = npt.NDArray[np.int64]
@@ -37,12 +36,20 @@ PAUSE_S = 60.0
 ROUNDED_S, REPEATED = 0.2, 4.0
 """Period of the times, s, and mean number of rows per time. If both are exceeded, t was rounded."""
 
-ROLLING, AGAIN = 0.2, 0.5
+ROLLING, AGAIN = 0.2, 0.4
 """Evidence for a logger that repeats a position until the next one arrives.
 
 Above a speed of `ROLLING` rad/s, both sides together, a true position does not stay the same. The
-logger repeats positions if it does stay the same in more than the fraction `AGAIN` of these rows.
+logger repeats positions if it does stay the same in more than the fraction `AGAIN` of these rows of
+the file. Positions of 10 Hz in rows of 20 Hz stay the same in about half of them.
 """
+
+WHEELS = "left right"
+STREAMS = (WHEELS, "yaw_rate", "yaw", "x y")
+"""The columns of each sensor."""
+
+Streams = dict[str, tuple[Floats, ...]]
+"""The times and values of each sensor, by the names in `STREAMS`."""
 
 MOST_RUNS = 1000
 """Largest number of runs in a log. With more of them, the column run does not name drives."""
@@ -79,6 +86,29 @@ class Run(Struct, frozen=True):
     """Positions x + iy in m, relative to the first one."""
 
 
+class Notes:
+    """Sentences about a log. What happens in many runs is one sentence with the sum of its counts.
+
+    A sentence with a count has "{}" in place of it.
+    """
+
+    def __init__(self, sentences: Iterable[str]) -> None:
+        self._sentences = {sentence: [0, 0] for sentence in sentences}
+
+    def add(self, sentence: str, count: int = 0) -> None:
+        """Add a sentence. `count` is the count of one run; 0 adds nothing to a counted sentence."""
+        if count or "{}" not in sentence:
+            sums = self._sentences.setdefault(sentence, [0, 0])
+            sums[0], sums[1] = sums[0] + count, sums[1] + 1
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return each sentence once, in the order in which they were added."""
+        return tuple(
+            sentence.replace("{}", str(count)) + (f" (in {runs} runs)" if 1 < runs < count else "")
+            for sentence, (count, runs) in self._sentences.items()
+        )
+
+
 class Log(Struct, frozen=True):
     """The runs of a log, and sentences about data that was left out or changed."""
 
@@ -88,7 +118,7 @@ class Log(Struct, frozen=True):
 
 def runs(table: Table) -> Log:
     """Return the runs in a table. Raises `LogError` if it has no run that can be used."""
-    notes = list(table.notes)
+    notes = Notes(table.notes)
     columns = dict(table.columns)
     t = columns["t"]
     columns["left"], columns["right"] = _sides(columns, notes)
@@ -97,28 +127,25 @@ def runs(table: Table) -> Log:
             f"column run has {len(table.names)} different names: it must name drives, not rows"
         )
     timed = np.isfinite(t)
-    if lost := int((~timed).sum()):
-        notes.append(f"{lost} of {len(t)} rows have no time and are left out")
-    found: list[Run] = []
+    notes.add(f"{{}} of {len(t)} rows have no time and are left out", int((~timed).sum()))
+    drives: list[tuple[str, Streams]] = []
     for number, name in enumerate(table.names):
         rows = np.flatnonzero(timed & (table.runs == number))
-        of = f"run {name}: " if name else ""
         parts = _restarts(t, rows, columns)
-        if len(parts) > 1:
-            again = many(len(parts) - 1, "time")
-            notes.append(f"{of}the time restarts {again}: each restart begins a new run")
+        notes.add("each restart of the time begins a new run: {} of them", len(parts) - 1)
         _in_seconds(name, t, parts, columns)
         whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
-        if len(parts) > whole:
-            notes.append(
-                f"{of}the wheels are silent for over {PAUSE_S:g} s "
-                f"{many(len(parts) - whole, 'time')}: each pause begins a new run"
-            )
+        notes.add(
+            f"each silence of the wheels of over {PAUSE_S:g} s begins a new run: {{}} of them",
+            len(parts) - whole,
+        )
         for at, part in enumerate(parts):
-            label = name or str(len(found) + 1)
-            made = _run(label if at == 0 or not name else f"{name}.{at + 1}", columns, part, notes)
-            if made is not None:
-                found.append(made)
+            label = name or str(len(drives) + 1)
+            streams = _streams(columns, part, notes)
+            if streams is not None:
+                drives.append((label if at == 0 or not name else f"{name}.{at + 1}", streams))
+    _remove_repeats(drives, notes)
+    found = [_run(name, streams) for name, streams in drives]
     if not found:
         empty = [
             name for name in ("t", *FOUR, *TWO)
@@ -130,16 +157,16 @@ def runs(table: Table) -> Log:
             else f"no run has {LEAST_ROWS} rows with a time and both sides' wheel speeds: "
             "record the wheels at 5 Hz or more while the robot drives"
         )
-    return Log(tuple(found), tuple(dict.fromkeys(notes)))
+    return Log(tuple(found), notes.sentences())
 
 
-def _sides(columns: dict[str, Floats], notes: list[str]) -> tuple[Floats, Floats]:
+def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
     if set(TWO) <= set(columns):
         return columns["left"], columns["right"]
     for front, rear in (("fl", "rl"), ("fr", "rr")):
         apart = _apart(columns, front, rear)
         if apart > NOTED:
-            notes.append(
+            notes.add(
                 f"{front} and {rear} differ by {apart:.0%} of their distance: the tool uses their "
                 "mean"
             )
@@ -230,20 +257,20 @@ def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     return list(np.split(rows[order], begins))
 
 
-def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) -> Run | None:
-    names = ("left", "right"), ("yaw_rate",), ("yaw",), ("x", "y")
-    wheels, gyro, yaw, place = (_stream(columns, rows, n, name, notes) for n in names)
-    if len(wheels[0]) < LEAST_ROWS:
-        if len(rows):
-            notes.append(
-                f"run {name} has {len(wheels[0])} rows of wheel speeds, which is too few, and is "
-                "left out"
-            )
-        return None
-    yaw, place = (
-        _without_repeats(yaw, wheels, f"run {name}: yaw", notes),
-        _without_repeats(place, wheels, f"run {name}: x y", notes),
+def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | None:
+    """Return the sensors of a drive, or None if it has too few rows of wheel speeds."""
+    streams = {name: _stream(columns, rows, name.split(), notes) for name in STREAMS}
+    if len(streams[WHEELS][0]) >= LEAST_ROWS:
+        return streams
+    notes.add(
+        f"runs with fewer than {LEAST_ROWS} rows of wheel speeds are left out: {{}} of them",
+        int(len(rows) > 0),
     )
+    return None
+
+
+def _run(name: str, streams: Streams) -> Run:
+    wheels, gyro, yaw, place = (streams[stream] for stream in STREAMS)
     start = float(wheels[0][0])
     x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
     points = (x - x[:1]) + 1j * (y - y[:1])
@@ -253,29 +280,42 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
     )  # fmt: skip
 
 
-def _without_repeats(
-    stream: tuple[Floats, ...], wheels: tuple[Floats, ...], what: str, notes: list[str]
-) -> tuple[Floats, ...]:
-    """Return a stream without the values that a logger repeats until the next sample arrives."""
-    t, *values = stream
-    if len(t) < LEAST_ROWS:
-        return stream
+def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
+    """Remove the values that a logger repeats until the next sample arrives, in place.
+
+    The rows of all drives together show whether the logger repeats, because a short drive may not.
+    """
+    for what in ("yaw", "x y"):
+        found = [(streams, *_repeats(streams, what)) for _, streams in drives]
+        rolling = sum(int((again & rolls).sum()) for _, again, rolls in found)
+        if rolling <= AGAIN * sum(int(rolls.sum()) for *_, rolls in found):
+            continue
+        notes.add(
+            f"{what} repeat their value between samples: {{}} such rows while the wheels turn are "
+            "left out",
+            rolling,
+        )
+        for streams, again, _ in found:
+            # Remove the repetitions at rest as well: a repeated value may be older than the time
+            # of its row.
+            streams[what] = tuple(column[~again] for column in streams[what])
+
+
+Mask = npt.NDArray[np.bool_]
+
+
+def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
+    """Return masks of the rows that repeat the value above, and of those while the wheels turn."""
+    t, *values = streams[what]
+    if not len(t):
+        return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
     again = np.concatenate([[False], np.all(np.diff(values) == 0.0, axis=0)])
-    rolls = np.interp(t, wheels[0], np.abs(wheels[1]) + np.abs(wheels[2])) > ROLLING
-    rolling = int((again & rolls).sum())
-    if rolling <= AGAIN * rolls.sum():
-        return stream
-    # Remove the repetitions at rest as well: a repeated value may be older than the time of its
-    # row.
-    notes.append(
-        f"{what} repeat their value between samples: {rolling} such rows while the wheels turn "
-        "are left out"
-    )
-    return tuple(column[~again] for column in stream)
+    wheels = streams[WHEELS]
+    return again, np.interp(t, wheels[0], np.abs(wheels[1]) + np.abs(wheels[2])) > ROLLING
 
 
 def _stream(
-    columns: dict[str, Floats], rows: Rows, names: Iterable[str], run: str, notes: list[str]
+    columns: dict[str, Floats], rows: Rows, names: Iterable[str], notes: Notes
 ) -> tuple[Floats, ...]:
     """Return the times and values of a sensor, sorted, with one row for each time.
 
@@ -286,20 +326,19 @@ def _stream(
         return (np.zeros(0),) * (1 + len(held))
     stream = [columns["t"][rows], *(values[rows] for values in held if values is not None)]
     whole = np.all(np.isfinite(stream), axis=0)
-    return tuple(_ordered([values[whole] for values in stream], " ".join(names), run, notes))
+    return tuple(_ordered([values[whole] for values in stream], " ".join(names), notes))
 
 
-def _ordered(stream: list[Floats], what: str, run: str, notes: list[str]) -> Iterator[Floats]:
+def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
     """Sort a stream by time. Of several samples with the same time, keep the first."""
     t = stream[0]
-    if count := int((np.diff(t) < 0).sum()):
-        notes.append(f"run {run}: {count} rows of {what} are out of order and were sorted")
+    notes.add(f"{{}} rows of {what} are out of order and were sorted", int((np.diff(t) < 0).sum()))
     order = np.argsort(t, kind="stable")
     times, first = np.unique(t[order], return_index=True)
-    if count := len(t) - len(times):
-        notes.append(
-            f"run {run}: {count} rows of {what} repeat a time: the first row of each time is used"
-        )
+    notes.add(
+        f"{{}} rows of {what} repeat a time: the first row of each time is used",
+        len(t) - len(times),
+    )
     yield times
     for values in stream[1:]:
         yield values[order][first]

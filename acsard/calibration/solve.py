@@ -11,10 +11,10 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration import fit as fitting
 from acsard.calibration import heading, positions
 from acsard.calibration.evidence import (
     BIAS_ERROR,
+    COUNT,
     DELAY,
     INVERSE_TRACK,
     LEFT,
@@ -28,6 +28,7 @@ from acsard.calibration.fit import (
     RIGHT_RADIUS,
     SEPARATION,
     Fit,
+    Held,
     Multipliers,
     Rates,
     configured,
@@ -36,16 +37,26 @@ from acsard.calibration.fit import (
     rates,
 )  # fmt: skip
 from acsard.calibration.heading import Headings, Rows
-from acsard.calibration.improvement import Improvement, improvement, turns_by_positions
+from acsard.calibration.improvement import (
+    UNMEASURED,
+    Improvement,
+    drives,
+    folds,
+    improvement,
+    no_better,
+    positions_of,
+)
 from acsard.calibration.log_table import Floats, noted
-from acsard.calibration.plausibility import RefusedError, UnlikeError, in_range, remarks
+from acsard.calibration.plausibility import RefusedError, in_range, remarks
 from acsard.calibration.prepared import (
     DRIVE,
+    RATIO,
+    TRACK,
     Prepared,
     prepared,
     separates_track,
-    sure_enough,
     turns_enough,
+    unsure,
 )
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.tape_distance import Extent, Follow, Tape, scaled
@@ -53,17 +64,24 @@ from acsard.calibration.wheel_angles import WheelAngles, angles_of
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import AcsardError
 
-LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
+LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0, 64.0)}
 """Lengths of blocks that are tried, s, by whether the log has a heading sensor.
 
-Long blocks are better for coarse positions, and many blocks for fine ones.
+Many short blocks are better for fine positions. Long blocks are better for coarse ones, and for
+wheels whose errors hide the small turns of a short block. Drives that were left out decide.
 """
 
-PERFECT = 1e-3
-"""Fraction of the motion by which every true sensor differs from the wheels."""
+ENOUGH_BLOCKS = 8
+"""Smallest number of blocks for which longer blocks are tried.
 
-PLENTY = 100
-"""Number of blocks above which no longer blocks are tried, to save time."""
+With six blocks, the standard deviation of left to right was up to three times too small.
+"""
+
+PERFECT = 1e-4
+"""Fraction of the motion by which every true sensor differs from the wheels.
+
+Motion capture differs by less than 1e-3 on a good floor.
+"""
 
 
 class Drives(Struct, frozen=True):
@@ -112,6 +130,8 @@ class Calibration(Struct, frozen=True):
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
     """Sentences about the log that the user should know."""
+    kept: tuple[str, ...] = ()
+    """Quantities that stay as configured, `TRACK` and `RATIO` of `prepared`."""
 
 
 def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
@@ -135,80 +155,161 @@ def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibra
         raise
 
 
+class Candidate(Struct, frozen=True):
+    """A fit to blocks of one length, and its improvement over drives that the fit did not use."""
+
+    made: Prepared
+    fitted: Fit
+    rows: Rows
+    """The turns of the log, without the gyro's errors."""
+    rate: Rates
+    gyro_bias: float
+    result: Multipliers
+    improvement: Improvement
+    kept: dict[str, float]
+    """Quantities that stay as configured, `TRACK` and `RATIO`.
+
+    The value is the relative standard deviation to which the log determines the quantity.
+    """
+
+
 def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
     base = Base.of(drive)
     angles = [angles_of(run) for run in log.runs]
     headings = heading.of_gyro(log.runs, angles) or heading.of_yaw(log.runs, angles, base.gain)
-    tries: list[tuple[float, int, Prepared, Fit]] = []
-    unlike: UnlikeError | None = None
+    candidates: list[Candidate] = []
+    refusals: list[RefusedError] = []
     for length in LENGTHS_S[headings is not None]:
         try:
             made = prepared(log.runs, angles, headings, base, length)
-        except UnlikeError as error:
-            unlike = unlike or error
-            continue  # coarse positions may still follow the wheels in longer blocks
+            if candidates and len(made.parts) < ENOUGH_BLOCKS:
+                break
+            candidates += _candidates(log.runs, angles, headings, base, made)
         except RefusedError as error:
-            raise unlike or error from None
-        gyro = headings is not None and headings.source == "yaw_rate"
-        bias_std = headings.bias_std if headings is not None else 0.0
+            refusals.append(error)  # coarse positions may still follow the wheels in longer blocks
+    if not candidates:
+        raise refusals[0]
+    best = max(candidates, key=lambda candidate: candidate.improvement.gain)
+    if not best.improvement.sure:
+        if tape is None:
+            raise RefusedError(no_better(best.improvement))
+        # The tape measures the size of the wheels, whatever the log determines.
+        best = replace(
+            best, result=configured(base), kept={TRACK: np.inf, RATIO: np.inf},
+            improvement=UNMEASURED,
+        )  # fmt: skip
+    return _calibration(log, angles, headings, base, tape, best)
+
+
+def _candidates(
+    driven: Sequence[Run], angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
+    made: Prepared,
+) -> list[Candidate]:  # fmt: skip
+    """Return the fit of all parameters, or the fits that keep what this one leaves unsure.
+
+    Raises `RefusedError` if every fit leaves something unsure.
+    """
+    found: list[Candidate] = []
+    deviations: dict[str, float] = {}
+    gyro = headings is not None and headings.source == "yaw_rate"
+    bias_std = headings.bias_std if headings is not None else 0.0
+    for kept, held in _held(base).items():
+        if found and not found[0].kept:
+            break
         fitted = fit(
-            made.sources, made.start, places=bool(made.segments), gyro=gyro, bias_std=bias_std
+            made.sources, made.start, places=bool(made.segments), gyro=gyro, bias_std=bias_std,
+            held=held,
+        )  # fmt: skip
+        if fitted.converged:
+            candidate = _candidate(driven, angles, headings, base, made, fitted)
+            track = float(np.sqrt(fitted.covariance()[INVERSE_TRACK, INVERSE_TRACK]))
+            track /= abs(float(fitted.parameters[INVERSE_TRACK]))
+            too_wide = unsure(candidate.result, track)
+            if not kept:
+                deviations = {TRACK: track, RATIO: candidate.result.ratio_std}
+                if not separates_track(fitted):
+                    too_wide[RATIO] = deviations[RATIO] = np.inf
+            if not too_wide:
+                unsure_by = {kept: deviations.get(kept, np.inf)} if kept else {}
+                found.append(replace(candidate, kept=unsure_by))
+    if not found:
+        shares = " and ".join(f"{name} only to {share:.1%}" for name, share in deviations.items())
+        raise RefusedError(
+            f"this log determines {shares}, which is too inaccurate: {DRIVE}"
+            if shares
+            else f"the search for the parameters does not converge: {DRIVE}"
         )
-        variance = float(np.trace(fitted.covariance()[: INVERSE_TRACK + 1, : INVERSE_TRACK + 1]))
-        tries.append((variance, len(tries), made, fitted))
-        if not 3 * fitting.LEAST_BLOCKS <= len(made.parts) <= PLENTY:
-            break  # twice the length would give too few blocks, or there are plenty already
-    if unlike is not None and not tries:
-        raise unlike
-    _, _, made, fitted = min(tries)
-    return _calibration(log, angles, headings, base, tape, made, fitted)
+    return found
+
+
+def _held(base: Base) -> dict[str, list[Held]]:
+    """Return the parameters that a fit holds at the configured ones, by the quantity it keeps."""
+    ratio, track, growth = np.zeros((3, COUNT))
+    ratio[[LEFT, RIGHT]] = base.right, -base.left
+    track[INVERSE_TRACK] = growth[TRACK_GROWTH] = 1.0
+    return {"": [], RATIO: [(ratio, 0.0)], TRACK: [(track, 1 / base.track), (growth, 0.0)]}
+
+
+def _candidate(
+    driven: Sequence[Run], angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
+    made: Prepared, fitted: Fit,
+) -> Candidate:  # fmt: skip
+    """Return a fit to these blocks with its improvement. Raises `RefusedError`."""
+    rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
+    gyro_scale = 1 + float(fitted.parameters[SCALE_ERROR])
+    bias_error = float(fitted.parameters[BIAS_ERROR])
+    if headings is None:
+        turns_enough(by_wheels)
+    elif headings.bias_unknown:
+        bias_error = heading.bias(rows, by_wheels * gyro_scale)
+    gyro_bias = (headings.bias if headings is not None else 0.0) + bias_error
+    rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
+    rate = rates(rows, by_wheels)
+    present = fitted.parameters.copy()
+    present[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
+    held = folds(fitted, made.parts, drives(driven), rate)
+    places = [positions_of(fold.drive, driven, angles) if made.segments else [] for fold in held]
+    better = improvement(held, present, base, rows, places, made.steps)
+    result = multipliers(fitted.parameters, fitted.covariance(), rate)
+    return Candidate(made, fitted, rows, rate, gyro_bias, result, better, {})
 
 
 def _calibration(
     log: Log, angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
-    tape: Tape | None, made: Prepared, fitted: Fit,
+    tape: Tape | None, best: Candidate,
 ) -> Calibration:  # fmt: skip
-    """Return the calibration that a fit gives, after checks of the result."""
-    rows, segments, covariance = made.rows, made.segments, fitted.covariance()
-    std = np.sqrt(np.diag(covariance))
-    if not fitted.converged:
-        raise RefusedError(f"the search for the parameters does not converge: {DRIVE}")
-    separates_track(fitted.marginal())
-    by_wheels = heading.turned(rows, base, fitted.parameters)
-    gyro_scale = 1 + float(fitted.parameters[SCALE_ERROR])
-    bias_error = float(fitted.parameters[BIAS_ERROR])
-    if headings is not None and headings.bias_unknown:
-        bias_error = heading.bias(rows, by_wheels * gyro_scale)
-    gyro_bias = (headings.bias if headings is not None else 0.0) + bias_error
-    rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
-    rate, truth = rates(rows, by_wheels), rows.turned
-    if headings is None:
-        turns_enough(by_wheels)
-        truth = turns_by_positions(fitted, rows, base)
-    result = multipliers(fitted.parameters, covariance, rate, fitted.varies)
-    sure_enough(result, float(std[INVERSE_TRACK]) / abs(fitted.parameters[INVERSE_TRACK]))
-    better = improvement(fitted, base, made.parts, rate, rows, truth, segments, made.steps)
+    """Return the calibration that the best fit gives, after checks of the result."""
+    made, fitted, rows, rate = best.made, best.fitted, best.rows, best.rate
+    by_wheels, result = heading.turned(rows, base, fitted.parameters), best.result
     delays = {headings.source: headings.delay} if headings is not None else {}
-    if segments:
+    if made.segments:
         delays["positions"] = float(fitted.parameters[DELAY])
-    scale, notes = ["positions"] if segments else [], list(log.notes)
+    scale, notes = ["positions"] if made.segments else [], list(log.notes)
     if tape is not None:
         follow = _follow(log.runs, angles, base, fitted, rate)
         names = [run.name for run in log.runs]
-        result, name = scaled(result, tape, names, follow, known=bool(segments))
+        result, name = scaled(result, tape, names, follow, known=bool(made.segments))
         scale.append("distance")
         notes.append(f"the distance of {tape.metres:g} m is used for run {name}")
     in_range(result.values)
-    drives = Drives.of(log.runs, rows, by_wheels, base, result, rate)
+    totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)
+    notes += [_stays(name, deviation) for name, deviation in best.kept.items()]
     notes += _cuts(log.runs, angles)
     notes += _too_good(headings, made, fitted, base)
-    notes += remarks(delays, gyro_bias, by_wheels, result.values, base, sized=bool(scale))
+    notes += remarks(delays, best.gyro_bias, by_wheels, result.values, base, sized=bool(scale))
     return Calibration(
-        reference=" and ".join(delays), drives=drives, configured=configured(base),
+        reference=" and ".join(delays), drives=totals, configured=configured(base),
         multipliers=result, scale=" and ".join(scale),
-        growth=float(fitted.parameters[TRACK_GROWTH]), growth_std=float(std[TRACK_GROWTH]),
-        improvement=better, delays=delays, gyro_bias=gyro_bias, notes=tuple(notes),
+        growth=float(fitted.parameters[TRACK_GROWTH]),
+        growth_std=float(np.sqrt(fitted.covariance()[TRACK_GROWTH, TRACK_GROWTH])),
+        improvement=best.improvement, delays=delays, gyro_bias=best.gyro_bias, notes=tuple(notes),
+        kept=tuple(best.kept),
     )  # fmt: skip
+
+
+def _stays(name: str, deviation: float) -> str:
+    known = f" (it is known to {deviation:.1%} by this log)" if deviation < 1.0 else ""
+    return f"{name} stays as configured, because this log does not improve it{known}"
 
 
 def _cuts(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Iterator[str]:

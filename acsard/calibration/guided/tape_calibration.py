@@ -17,10 +17,10 @@ from acsard.calibration.guided.tape_readings import (
     joined,
     predicted,
 )
-from acsard.calibration.improvement import BeforeAfter, Improvement, with_constant_track
+from acsard.calibration.improvement import NOTHING, BeforeAfter, Improvement, with_constant_track
 from acsard.calibration.log_table import Floats
-from acsard.calibration.plausibility import remarks
-from acsard.calibration.prepared import sure_enough
+from acsard.calibration.plausibility import RefusedError, remarks
+from acsard.calibration.prepared import unsure
 from acsard.calibration.solve import Calibration, Drives
 from acsard.calibration.wheel_angles import angles_of, blocks
 from acsard.core.config.settings import DriveConfig
@@ -53,10 +53,14 @@ def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Ca
     rows = heading.rows(None, rides, angles, blocks(rides, angles, 4.0))
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)
-    result = multipliers(fit.parameters, fit.covariance, rate, 0.0)
+    result = multipliers(fit.parameters, fit.covariance, rate)
     inverse_track, std = fit.parameters[INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
     chance = float(std[INVERSE_TRACK] / abs(inverse_track))
-    sure_enough(result, chance, WORST, "these readings", ADVICE)
+    for name, deviation in unsure(result, chance, WORST).items():
+        raise RefusedError(
+            f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
+            f"{ADVICE}"
+        )
     drives = Drives.of(rides, rows, by_wheels, base, result, rate)
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
     return Calibration(
@@ -95,19 +99,19 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
             sums["place"] += before**2, after**2, 1.0
     return Improvement(
         _per_amount(sums["turn"], 360.0), _per_amount(sums["straight"], float(np.degrees(10.0))),
-        _rms(sums["place"]),
+        NOTHING, _rms(sums["place"]),
     )  # fmt: skip
 
 
 def _per_amount(sums: Floats, unit: float) -> BeforeAfter:
     before, after, amount = sums.tolist()
     if not amount:
-        return BeforeAfter(None, None)
+        return NOTHING
     return BeforeAfter(unit * before / amount, unit * after / amount)
 
 
 def _rms(sums: Floats) -> BeforeAfter:
     before, after, count = sums.tolist()
     if not count:
-        return BeforeAfter(None, None)
+        return NOTHING
     return BeforeAfter(math.sqrt(before / count), math.sqrt(after / count))

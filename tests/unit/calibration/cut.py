@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
 
 from acsard.calibration import prepared, solve, wheel_angles
 from acsard.calibration import runs as reading
@@ -61,11 +63,19 @@ def log_of(log: str | Table) -> reading.Log:
     return reading.runs(read(log.encode()) if isinstance(log, str) else log)
 
 
+def log_of_runs(drives: Iterable[Drive], *, gyro: bool = True, places: bool = True) -> reading.Log:
+    """Return a log in which each drive is a run."""
+    runs = [log_of(table(seen, gyro=gyro, places=places)).runs[0] for seen in drives]
+    named = [structs.replace(run, name=str(at + 1)) for at, run in enumerate(runs)]
+    return reading.Log(tuple(named), ())
+
+
 def ready(log: str | Table) -> Prepared:
     runs = log_of(log).runs
     angles = [wheel_angles.angles_of(run) for run in runs]
     return prepared.prepared(runs, angles, of_gyro(runs, angles), BASE, 4.0)
 
 
-def calibrated(log: str | Table, tape: Tape | None = None) -> solve.Calibration:
-    return solve.calibrate(log_of(log), DriveConfig(), tape)
+def calibrated(log: str | Table | reading.Log, tape: Tape | None = None) -> solve.Calibration:
+    found = log if isinstance(log, reading.Log) else log_of(log)
+    return solve.calibrate(found, DriveConfig(), tape)

@@ -27,6 +27,16 @@ GUIDED: Plan = [
 """The drive that the guide would ask a person for; it lasts 83 s."""
 
 
+def slow_squares(side: float = 1.0, turn: float = 0.3, laps: int = 1) -> Plan:
+    """Return squares at 0.1 m/s with turns on the spot. `turn` is in rad/s; negative to the right.
+
+    One lap with sides of 1 m lasts 74 s.
+    """
+    corner = (np.pi / 2 / abs(turn), 0.0, turn)
+    edge: Plan = [(side / 0.1, 0.1, 0.0), (1.0, 0.0, 0.0), corner, (1.0, 0.0, 0.0)]
+    return [(3.0, 0.0, 0.0), *edge * (4 * laps), (2.0, 0.0, 0.0)]
+
+
 def wander(rng: np.random.Generator, seconds: float) -> Plan:
     """Return a random drive with stops."""
     plan: Plan = [(2.0, 0.0, 0.0)]
@@ -59,6 +69,11 @@ class Robot:
     """Standard deviation of the share of motion that each side loses to slip.
 
     The share varies over about a second.
+    """
+    wheel_noise: float = 0.0
+    """Standard deviation of the error of a moving wheel's speed, rad/s.
+
+    The error varies over about a second.
     """
     decimals: int = 2
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
@@ -110,6 +125,10 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
     ahead = np.exp(1j * (yaw[:-1] + turn * STEP / 2))
     where = np.concatenate(([0.0 + 0.0j], np.cumsum((fast + quick) / 2 * ahead) * STEP))
     times = np.arange(count + 1) * STEP
+    if robot.wheel_noise:
+        moves = (left != 0.0) | (right != 0.0)
+        left = left + moves * _slow_noise(rng, count, robot.wheel_noise)
+        right = right + moves * _slow_noise(rng, count, robot.wheel_noise)
     every = 2
     ends = np.arange(every, count + 1, every)
     shown_left, shown_right = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+from msgspec import structs
 
 from acsard.calibration.calibration_report import NAMES, keys, parts, report
 from acsard.core.config.parsing import parse
@@ -43,3 +44,9 @@ def test_people_are_told_what_it_improves_and_what_remains() -> None:
     assert f"error of a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
     assert "what remains" in told
     assert "--distance METRES" in told
+
+
+def test_the_notes_come_after_the_result() -> None:
+    told = plain(*parts(structs.replace(REPORT, notes=["one"]), FOUND, "acsard.toml"), width=99)
+    assert told.rstrip().endswith("note: one")
+    assert told.index("wheel_separation_multiplier =") < told.index("note: one")

@@ -1,71 +1,98 @@
-"""The improvement is measured on data that the fit did not use."""
+"""The improvement is measured on whole drives that the fit did not use."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from acsard.calibration.fit import Rates, fit
 from acsard.calibration.improvement import (
+    UNMEASURED,
+    Fold,
+    Improvement,
+    drives,
     folds,
     improvement,
-    turns_by_positions,
+    no_better,
+    positions_of,
     with_constant_track,
 )
-from tests.unit.calibration.cut import BASE, ideal, ready, table
-from tests.unit.calibration.robots import GUIDED
+from acsard.calibration.wheel_angles import Block, angles_of
+from tests.unit.calibration.cut import BASE, ideal, log_of, ready, table
+from tests.unit.calibration.robots import GUIDED, Drive
 
 RATE = Rates(0.5, 1.0)
 
 
-def test_every_block_is_left_out_once() -> None:
-    made = ready(table(ideal(), places=False))
-    fitted = fit(made.sources, made.start, places=False)
-    held = [one.blocks for one in folds(fitted, made.parts, RATE)]
-    assert len(held) == 5
-    assert np.sum(held, axis=0).tolist() == [1] * len(made.parts)
+def held(seen: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
+    """Return the folds of a fit to this drive, and its improvement."""
+    log = table(seen, places=places)
+    made, runs = ready(log), log_of(log).runs
+    fitted = fit(made.sources, made.start, places=places)
+    found = folds(fitted, made.parts, drives(runs), RATE)
+    angles = [angles_of(run) for run in runs]
+    segments = [positions_of(fold.drive, runs, angles) for fold in found]
+    return found, improvement(found, BASE.start(), BASE, made.rows, segments, made.steps)
+
+
+def test_every_part_of_one_run_is_left_out() -> None:
+    found, _ = held(ideal(), places=False)
+    assert len(found) == 5
+    assert np.all(np.sum([fold.blocks for fold in found], axis=0) >= 1)
+
+
+def test_of_three_runs_whole_ones_are_left_out() -> None:
+    run = log_of(table(ideal())).runs[0]
+    assert drives([run] * 3) == [Block(at, 0.0, float(run.t[-1])) for at in range(3)]
+
+
+def test_positions_of_a_drive_are_cut_at_gaps_of_the_wheels() -> None:
+    run = log_of(table(ideal())).runs[0]
+    kept = (run.t < 20.0) | (run.t > 40.0)
+    torn = replace(run, t=run.t[kept], left=run.left[kept], right=run.right[kept])
+    begin, end = positions_of(drives([torn] * 3)[0], [torn], [angles_of(torn)])
+    assert begin.t[-1] < 20.0 < 40.0 < end.t[0]
 
 
 def test_an_ideal_robot_is_off_by_its_track_now_and_by_nothing_then() -> None:
-    made = ready(table(ideal()))
-    fitted = fit(made.sources, made.start, places=True)
-    better = improvement(
-        fitted, BASE, made.parts, RATE, made.rows, made.rows.turned, made.segments, made.steps
-    )
+    _, better = held(ideal())
     assert better.turn.before == pytest.approx(0.6 * 360, rel=0.02)
     assert better.turn.after is not None
     assert better.turn.after < 1.0
-    assert better.place.before is not None
-    assert better.place.after is not None
-    assert better.place.after < better.place.before / 10
+    for error in (better.heading, better.place):
+        assert error.before is not None
+        assert error.after is not None
+        assert error.after < error.before / 10
+    assert better.sure
 
 
-def test_without_anything_to_tell_an_error_by_there_is_none() -> None:
+def test_without_anything_to_tell_an_error_by_nothing_is_sure() -> None:
     made = ready(table(ideal(), places=False))
-    fitted = fit(made.sources, made.start, places=False)
-    better = improvement(
-        fitted, BASE, made.parts, RATE, made.rows, np.zeros_like(made.rows.turned), [], []
-    )
-    assert (better.turn.before, better.place.after) == (None, None)
+    rows = replace(made.rows, turned=np.zeros_like(made.rows.turned))
+    better = improvement([], BASE.start(), BASE, rows, [], [])
+    assert (better.turn.before, better.heading.before, better.place.after) == (None, None, None)
+    assert not better.sure
+    assert "no drive could be left out" in no_better(better)
 
 
 def test_a_slow_curve_is_no_straight() -> None:
     """The robot turns as slowly as a straight drive may, but turns much more in each metre."""
-    slow = (60.0, 0.04, 0.06)
-    made = ready(table(ideal([*GUIDED, slow]), places=False))
-    fitted = fit(made.sources, made.start, places=False)
-    better = improvement(fitted, BASE, made.parts, RATE, made.rows, made.rows.turned, [], [])
+    _, better = held(ideal([*GUIDED, (60.0, 0.04, 0.06)]), places=False)
     assert better.straight.before is not None
     assert better.straight.before < 5.0
-
-
-def test_positions_tell_how_far_it_turned() -> None:
-    made = ready(table(ideal(), gyro=False))
-    fitted = fit(made.sources, made.start, places=True)
-    seen, true = turns_by_positions(fitted, made.rows, BASE), ready(table(ideal())).rows.turned
-    assert np.abs(seen).sum() == pytest.approx(np.abs(true).sum(), rel=0.1)
 
 
 def test_one_track_for_all_rates_turns_as_far_at_the_mean_rate() -> None:
     fixed = with_constant_track(np.array([1, 1, 0.6, 0.1, 0, 0, 0]), RATE)
     assert fixed.tolist() == pytest.approx([1, 1, 0.6 * 0.95, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("gain", "chance", "sure"),
+    [(0.3, 0.1, True), (0.15, 0.1, False), (0.8, 1.0, True), (0.6, 1.0, False), (-0.1, 0.0, False)],
+)
+def test_a_gain_is_sure_beyond_two_deviations_or_if_the_error_is_halved(
+    gain: float, chance: float, sure: bool
+) -> None:
+    assert replace(UNMEASURED, gain=gain, chance=chance).sure == sure

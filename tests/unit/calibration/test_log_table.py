@@ -376,3 +376,9 @@ def test_a_table_is_that_of_the_written_log() -> None:
         assert list(direct.columns) == list(written.columns)
         for name, values in direct.columns.items():
             assert np.allclose(values, written.columns[name], rtol=0, atol=1e-12, equal_nan=True)
+
+
+def test_counts_are_not_proposed_as_speeds() -> None:
+    with pytest.raises(LogError, match="ticks_left has counts, not speeds") as refused:
+        read(b"t,ticks_left,ticks_right,yaw_rate\n0,1,1,0\n")
+    assert "rename" not in str(refused.value)

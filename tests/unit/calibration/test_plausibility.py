@@ -9,7 +9,7 @@ import pytest
 
 from acsard.calibration.plausibility import RefusedError, in_range, remarks, turn_units
 from tests.unit.calibration.cut import BASE, calibrated, table, usual
-from tests.unit.calibration.robots import Drive
+from tests.unit.calibration.robots import GUIDED, Drive, Robot, drive
 
 DRIVE = usual()
 WRONG = {
@@ -105,6 +105,31 @@ def test_what_was_made_of_the_same_wheels_is_told(gyro: bool, places: bool) -> N
     assert any("computed from the same wheels" in note for note in calibrated(log).notes)
     usual_log = table(DRIVE, gyro=gyro, places=places)
     assert not any("same wheels" in note for note in calibrated(usual_log).notes)
+
+
+def test_an_imu_that_lies_on_its_side_is_asked_for_its_upright_axis() -> None:
+    """The noise of its wrong axis adds up to less than a turn, although the robot turned."""
+    rng = np.random.default_rng(0)
+    lying = replace(DRIVE, gyro=rng.normal(0.0, 0.05, len(DRIVE.gyro)))
+    with pytest.raises(RefusedError, match=r"but the wheels would turn.*IMU lies on its side"):
+        calibrated(table(lying, places=False))
+
+
+def test_positions_alone_are_not_called_a_yaw_in_degrees() -> None:
+    with pytest.raises(RefusedError) as refused:
+        turn_units("", 10.0, 10.0, BASE)
+    assert "degrees" not in str(refused.value)
+    assert "yaw" not in str(refused.value)
+
+
+def test_motion_capture_on_a_good_floor_is_believed() -> None:
+    """It differs from the wheels of a robot that hardly slips by a millimetre."""
+    robot = Robot(
+        chi=1.0, rate=0.0, slip=0.0005, place_noise=0.0005, outliers=0.0, place_hz=20.0,
+        rng=np.random.default_rng(1),
+    )  # fmt: skip
+    notes = calibrated(table(drive(robot, GUIDED), gyro=False)).notes
+    assert not any("same wheels" in note for note in notes)
 
 
 def test_positions_of_another_drive_are_refused() -> None:

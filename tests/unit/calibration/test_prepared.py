@@ -6,18 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_fit
 
 from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT
-from acsard.calibration.fit import Multipliers
+from acsard.calibration.fit import Multipliers, fit
 from acsard.calibration.heading import Rows
 from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.prepared import (
     DRIVE,
+    RATIO,
+    TRACK,
     drives_enough,
     rolls_enough,
     separates_track,
-    sure_enough,
     turns_enough,
+    unsure,
 )  # fmt: skip
 from acsard.calibration.wheel_angles import Block
 from tests.unit.calibration.cut import ready, table, usual
@@ -47,8 +50,7 @@ def test_turns_and_straight_drives_are_enough() -> None:
     rolls_enough(rows([9, -9, 9, -9], [9, -9, -9, 9]))
     turns_enough(np.full(10, 1.0))
     drives_enough([Block(0, 0, 4)] * 5)
-    separates_track(np.eye(3))
-    sure_enough(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-5), 0.01)
+    assert not unsure(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-5), 0.01)
 
 
 @pytest.mark.parametrize(
@@ -70,11 +72,23 @@ def test_little_of_it_is_refused() -> None:
         drives_enough([Block(0, 0, 4)] * 2)
 
 
-def test_what_comes_out_of_no_use_is_refused() -> None:
-    unsure = Multipliers(np.array([1.6, 1, 1]), np.diag([0, 1e-3, 1e-3]))
-    with pytest.raises(RefusedError, match="left to right"):
-        sure_enough(unsure, 0.01)
-    with pytest.raises(RefusedError, match="effective track"):
-        sure_enough(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
-    with pytest.raises(RefusedError, match="cannot be separated"):
-        separates_track(np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]]))
+def test_turns_on_the_spot_are_enough_for_a_heading_sensor() -> None:
+    spins = rows([-9, 9, -9], [9, -9, 9])
+    rolls_enough(spins, spins=True)
+    with pytest.raises(RefusedError, match="ahead or back"):
+        rolls_enough(spins)
+
+
+def test_what_is_unsure_is_named_with_its_deviation() -> None:
+    apart = Multipliers(np.array([1.6, 1, 1]), np.diag([0, 1e-3, 1e-3]))
+    assert unsure(apart, 0.01) == {RATIO: pytest.approx(0.0447, abs=1e-4)}
+    assert TRACK in unsure(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
+
+
+def test_turns_while_driving_ahead_only_do_not_separate_the_wheels() -> None:
+    made = ready(table(usual(), places=False))
+    fitted = fit(made.sources, made.start, places=False)
+    assert separates_track(fitted)
+    alike = np.zeros_like(fitted.normal)
+    alike[:, :3, :3] = 1.0
+    assert not separates_track(replace_fit(fitted, normal=alike))

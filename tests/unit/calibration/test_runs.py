@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration.log_table import LogError, read
-from acsard.calibration.runs import runs
+from acsard.calibration.runs import Notes, runs
 
 HEADER = "t,left,right,yaw_rate,run\n"
 
@@ -37,7 +37,7 @@ def test_repeated_times_are_taken_once_and_told() -> None:
 def test_a_time_that_begins_anew_begins_a_run() -> None:
     names, ends, notes = of(rows(0, 500) + rows(0, 300))
     assert (names, len(ends)) == (["1", "2"], 2)
-    assert any("time restarts" in note for note in notes)
+    assert any("restart of the time begins a new run: 1 of them" in note for note in notes)
 
 
 def test_halves_of_a_drive_in_the_wrong_order_stay_one_run() -> None:
@@ -51,7 +51,7 @@ def test_runs_are_told_apart_by_their_column() -> None:
 def test_a_run_with_too_few_rows_is_left_out_and_told() -> None:
     names, _, notes = of(rows(0, run="a") + rows(0, 3, run="b"))
     assert names == ["a"]
-    assert any("run b has 3 rows" in note for note in notes)
+    assert any("fewer than 20 rows of wheel speeds are left out: 1 of" in note for note in notes)
 
 
 def test_rows_without_a_time_are_told() -> None:
@@ -82,14 +82,14 @@ def test_a_stamp_of_1970_makes_no_drive_of_fifty_years() -> None:
     names, ends, notes = of(["0,0,0,0,", *rows(1.7e9, 500)])
     assert names == ["1"]
     assert ends == pytest.approx([4.99])
-    assert any("1 rows of wheel speeds" in note for note in notes)
+    assert any("fewer than 20 rows of wheel speeds" in note for note in notes)
 
 
 def test_a_pause_of_a_day_parts_two_drives() -> None:
     names, ends, notes = of(rows(0, 500) + rows(86_400, 300))
     assert names == ["1", "2"]
     assert ends == pytest.approx([4.99, 2.99])
-    assert any("silent for over 60 s 1 time:" in note for note in notes)
+    assert any("over 60 s begins a new run: 1 of" in note for note in notes)
 
 
 def test_a_column_without_any_number_is_named() -> None:
@@ -161,6 +161,32 @@ def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() 
     assert np.diff(run.place_t[moving]) == pytest.approx(0.2)
     assert (run.place_t < 3.0).sum() == 1, "many of one sample would outweigh those on the way"
     assert any("x y repeat their value between samples" in note for note in log.notes)
+
+
+def test_positions_of_half_the_rate_are_recognized_in_one_note_for_all_runs() -> None:
+    """Positions of 10 Hz stand in rows of 20 Hz; in some of the runs fewer than half repeat."""
+    rows = []
+    for run in range(12):
+        early = run % 2  # so many more positions are new
+        rows += [
+            f"{i / 20},4,4,{0.02 * (i if i < 10 * early else i // 2 * 2):.3f},0,{run}"
+            for i in range(100)
+        ]
+    log = runs(read(("t,left,right,x,y,run\n" + "\n".join(rows)).encode()))
+    assert [len(run.place) for run in log.runs] == [50, 55] * 6
+    (note,) = log.notes
+    assert note.startswith("x y repeat their value between samples: 570 such rows")
+
+
+def test_what_happens_in_many_runs_is_one_note_with_its_sum() -> None:
+    notes = Notes(["columns not used: a"])
+    for count in (3, 0, 4):
+        notes.add("{} rows of yaw are out of order", count)
+    notes.add("short runs are left out: {} of them", 1)
+    assert notes.sentences() == (
+        "columns not used: a", "7 rows of yaw are out of order (in 2 runs)",
+        "short runs are left out: 1 of them",
+    )  # fmt: skip
 
 
 def test_a_position_of_the_way_is_none_of_the_rest_after_it() -> None:

@@ -54,12 +54,10 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
         key = f"{name}_multiplier"
         assert getattr(config.drive, key) == pytest.approx(found[key], abs=1e-5)
         assert getattr(config.odometry, f"{key}_std") == found["odometry"][f"{key}_std"]
-    assert called(tmp_path, GOOD, "--json", text=text) == 0
-    again = json.loads(capsys.readouterr().out)
-    assert again["turn_error_before"] < 12
-    assert again["wheel_separation_multiplier"] == pytest.approx(
-        found["wheel_separation_multiplier"], rel=1e-3
-    )
+    with pytest.raises(MendableError, match="not surely better") as end:
+        called(tmp_path, GOOD, "--json", "--write", text=text)
+    assert end.value.code == Exit.FAILURE
+    assert (tmp_path / "acsard.toml").read_text() == text
 
 
 def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
