@@ -23,6 +23,7 @@ from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
 from acsard.core.values import Role
+from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import in_thread
 from acsard.web import metrics, openapi
@@ -254,10 +255,16 @@ class Page:
     async def picture(self, request: web.Request) -> web.StreamResponse:
         """Return the newest picture of the camera, once the client has not seen it."""
         seen = request.headers.get("If-None-Match", "").strip('"')
+        begun_ns = clock.mono_ns()
         picture = await self._camera.after(int(seen) if seen.isdecimal() and len(seen) < 16 else 0)
         if picture is None:
             return web.Response(status=304)
-        told = {"ETag": f'"{picture.number}"', "Age-Ms": str(picture.age_ms)}
+        now_ns = clock.mono_ns()
+        told = {
+            "ETag": f'"{picture.number}"',
+            "Age-Ms": str((now_ns - picture.at_ns) // 1_000_000),
+            "Waited-Ms": str((now_ns - begun_ns) // 1_000_000),
+        }
         return web.Response(body=picture.body, content_type="image/jpeg", headers=told)
 
     async def recordings(self, request: web.Request) -> web.StreamResponse:
@@ -350,8 +357,9 @@ ROUTES: tuple[Route, ...] = (
         "the values that `begin` on the WebSocket accepts: methods of calibration, ports to check",
         gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/camera", "viewer", Page.picture,
-        "the newest picture of the camera, and its age in ms as the header `Age-Ms`; with the "
-        "`ETag` of the last one as `If-None-Match` it waits up to a second for a newer one",
+        "the newest picture of the camera, with its age (`Age-Ms`) and the time for which the "
+        "request waited here (`Waited-Ms`), ms, as headers; with the `ETag` of the last one as "
+        "`If-None-Match` it waits up to a second for a newer one",
         gives={200: Body("A picture.", str, "image/jpeg"),
                304: Body("There is no newer picture.", media="")}),
     Route("GET", "/api/recordings", "viewer", Page.recordings,

@@ -45,11 +45,6 @@ class Picture(Struct, frozen=True):
     number: int
     at_ns: int
 
-    @property
-    def age_ms(self) -> int:
-        """Milliseconds since it arrived."""
-        return (clock.mono_ns() - self.at_ns) * 1000 // NS_PER_S
-
 
 class Parts:
     """Cuts a `multipart/x-mixed-replace` stream into its parts."""

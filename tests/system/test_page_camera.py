@@ -138,6 +138,14 @@ def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_withi
         freezes("silent")
         filmed.stream.silent = False
         until(lives, 10.0, "it lives again")
+        browser.ask("Network.enable")
+        slow = {"latency": 1500, "downloadThroughput": -1, "uploadThroughput": -1}
+        browser.ask("Network.emulateNetworkConditions", offline=False, **slow)
+        freezes("each picture is 1.5 s old when a slow network has delivered it")
+        time.sleep(4.0)  # two pictures have come since
+        assert browser.js(marked)
+        browser.ask("Network.emulateNetworkConditions", offline=False, **slow | {"latency": 0})
+        until(lives, 10.0, "it lives again")
         wide = "['camera', 'map', 'stick'].map(name => document.getElementById(name).clientWidth)"
         assert min(browser.js(wide)) > 90
         browser.open("about:blank")

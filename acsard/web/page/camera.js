@@ -52,15 +52,17 @@ export class Camera {
 
   /** Fetch and draw the next picture. Returns why there is none, or "". */
   async #fetched() {
+    const asked = performance.now();
     try {
       const headers = this.#tag ? { "If-None-Match": this.#tag } : {};
       const answer = await fetch("api/camera", { headers, cache: "no-store", signal: AbortSignal.timeout(5000) });
       if (answer.status === 304) return "";
       if (!answer.ok) return (await answer.json()).error ?? `${answer.status}`;
-      const at = performance.now() - Number(answer.headers.get("Age-Ms"));
+      // The picture counts as old as if the way of the request had taken no time: a slow network ages pictures.
+      const held = Number(answer.headers.get("Waited-Ms")) - Number(answer.headers.get("Age-Ms"));
       const picture = await createImageBitmap(await answer.blob());
       this.#tag = answer.headers.get("ETag");
-      this.#at = at;
+      this.#at = asked + held;
       this.#canvas.width = picture.width;
       this.#canvas.height = picture.height;
       this.#canvas.getContext("2d").drawImage(picture, 0, 0);
