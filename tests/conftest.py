@@ -63,16 +63,18 @@ One worker runs all of them and `bench`, one after the other: they would disturb
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Use three processes for the suites that `.ci/run` runs, and one for any other call.
+    """Use three processes for the README's command, two for the marked tests, and one otherwise.
 
-    Tests of real processes mostly wait, so two workers leave two cores half idle. A single process
-    shows the output that tests print.
+    Tests of real processes mostly wait, so two workers leave two cores half idle. Most marked tests
+    run several daemons each: three of them at once take all the time of two cores, and then the
+    tests of real time fail. A single process shows the output that tests print.
     """
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
-    other = (
-        config.option.capture == "no" or "soak" not in config.option.markexpr.partition("not")[2]
-    )
-    return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 3
+    marked, _, left_out = config.option.markexpr.partition("not")
+    other = config.option.capture == "no" or "soak" not in left_out
+    if part or other or len(os.sched_getaffinity(0)) < 2:
+        return 0
+    return 2 if marked.strip() else 3
 
 
 def _unit(nodeid: str) -> str:
