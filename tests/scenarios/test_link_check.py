@@ -622,6 +622,21 @@ def test_a_plain_link_that_echoes_is_found_out_when_the_speed_changes(
     assert world.state.mode == "driving"
 
 
+@pytest.mark.parametrize("check", ["auto", "require"])
+@pytest.mark.parametrize("counts", [0, 3200])
+def test_a_checked_link_that_begins_to_echo_while_it_drives_is_found_out(
+    check: str, counts: int
+) -> None:
+    world = World(config(check, counts))
+    world.run(0.5)
+    world.drive(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+    world.mcu.__class__ = Echo  # TX now touches RX
+    world.drive(-0.5, seconds=2.0)
+    assert world.state.link != "up"
+    assert "the daemon's own lines come back" in world.state.reason
+
+
 @pytest.mark.parametrize("speeds", [4, pytest.param(40, marks=pytest.mark.slow)])
 @each("period", [0.0, 0.05])
 @each(

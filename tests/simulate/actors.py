@@ -448,7 +448,8 @@ class Run:
         witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
-            self.echo.line(at_ns + offset, witness.last)
+            if seen.link == "up":  # without a link the daemon believes no line, and only ramps down
+                self.echo.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
         self.liveness.look(true_ns)

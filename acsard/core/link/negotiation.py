@@ -14,7 +14,7 @@ because noise must not end the check.
 
 The module also recognizes lines that only come back, because TX and RX are joined or the far end
 echoes. A question that comes back shows it at once, because no reply carries the letters of a
-question. For plain lines `EchoDetector` shows it.
+question. For plain lines, and for checked lines that ask for no sample, `EchoDetector` shows it.
 """
 
 from __future__ import annotations
@@ -145,12 +145,13 @@ class Throttle:
 
 
 class EchoDetector:
-    """Recognizes a run of plain reports that only repeat sent lines.
+    """Recognizes a run of reports that only repeat sent lines.
 
-    A plain reply has the same form as a command, so an echo looks like a board that reports exactly
-    the speeds it was sent. An echo is a run of `REPORTS` reports, each equal byte for byte to one
-    of the last `LINES` lines, always the same number of lines before. The changes of speed in the
-    run add up to `CHANGE`. At rest every board looks like an echo, and nothing is decided.
+    A reply without a sample has the same form as a command, so an echo looks like a board that
+    reports exactly the speeds it was sent. An echo is a run of `REPORTS` reports, each equal byte
+    for byte to one of the last `LINES` lines, always the same number of lines before. The changes
+    of speed in the run add up to `CHANGE`. At rest every board looks like an echo, and nothing is
+    decided.
 
     A board that measures is not taken for an echo, because its wheels lag behind the lines in
     another way than by a whole number of lines. In simulated drives with accelerations of 0.1 to
@@ -320,7 +321,7 @@ class Negotiation:
         return self.trouble == "echo"
 
     def repeated(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Take a plain report; return whether it and the reports before it are an echo."""
+        """Take a report without a sample; return whether it and those before it are an echo."""
         if self._echo.report(line, speeds):
             self.trouble = "echo"
         return self.echoes

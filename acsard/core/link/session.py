@@ -326,10 +326,10 @@ class McuSession:
                 asked_ns = check.answered(reply, read_at.mono_ns)
             else:
                 speeds = self.codec.decode(line)
-                if not asking and check.repeated(line, speeds):
-                    self._link.sign("echo")
-                    self._reject("echo")
-                    return None
+            if not asking and reading is None and check.repeated(line, speeds):
+                self._link.sign("echo")
+                self._reject("echo")
+                return None
         except FrameError as error:
             self._reject(error.reason, line)
             self._bad()
