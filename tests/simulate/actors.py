@@ -379,6 +379,7 @@ class Run:
         product, witness = self.product, self.witness
         product.end(event["way"])
         self._take_answers()
+        before_ns = max(witness.stops, default=None)
         for call, arrived_ns, _ in self._calls.values():
             witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
         self._calls.clear()
@@ -388,7 +389,8 @@ class Run:
         def start() -> None:
             self.resumed_ns = product.now_ns
             if product.disk.full and not witness.stops:
-                witness.stops.append(self.true_ns)
+                # It stands until a clear, perhaps by the stop from before that is in doubt.
+                witness.stops.append(self.true_ns if before_ns is None else before_ns)
             product.start()
             self.liveness.event()
             self._linked = False

@@ -19,6 +19,9 @@ MARGIN_NS = 30_000_000
 EARLY_NS = 60_000_000
 """A delay that falls by more than this is a backlog that pours in."""
 
+BURST_NS = 1_000_000
+"""Messages within this time count as one, with the lowest of their delays."""
+
 
 class Wish:
     """A command that arrived, and what the omniscient view thinks of it."""
@@ -102,7 +105,11 @@ class Ages:
             fresh = False
         else:
             fresh = age <= least + allowed
-        recent.append((arrived_ns, age))
+        if recent and arrived_ns - recent[-1][0] < BURST_NS:
+            at_ns, before = recent.pop()
+            recent.append((at_ns, min(before, age)))
+        else:
+            recent.append((arrived_ns, age))
         return fresh
 
     def _falls(self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int) -> bool:
