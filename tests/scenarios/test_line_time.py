@@ -77,6 +77,22 @@ def test_stalls_of_the_host_cost_no_distance(stall: float, reports: bool) -> Non
     assert Drive(World(Config(sim=FINE)), reports).error(stall) < 0.005
 
 
+@pytest.mark.parametrize(("after", "every"), [(0.8, 3), (2.0, 2)])
+def test_a_board_that_answered_late_before_loses_no_distance_with_its_replies(
+    after: float, every: int
+) -> None:
+    """The change from late to prompt looks like jitter, in which lost replies could hide."""
+    world = World(Config())
+    with world.mcu.slow_reply(0.03):
+        world.run(1.0)
+        world.drive(0.3, seconds=2.0)
+    world.drive(0.3, seconds=after)
+    begun = world.state.x
+    with world.mcu.lost_replies(every):
+        world.drive(0.3, seconds=4.0)
+        assert world.state.x - begun == pytest.approx(1.2, abs=0.008)
+
+
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(("every", "stall"), [(0.7, 0.05), (2.0, 0.09), (0.7, 0.15)])
 def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(

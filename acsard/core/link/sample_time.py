@@ -346,6 +346,9 @@ SLOW = 0.0125
 LEAST = 0.002
 """Gain per reply with which the least delay is forgotten: a time constant of 500 replies."""
 
+CREEP = 0.05
+"""Rise of the soonest delay per reply, in distances of two lines, by which it is forgotten."""
+
 RARE = 0.002
 """Share of lost replies. Below it, a line that another one follows closely does not count as
 lost."""
@@ -403,6 +406,8 @@ class PromptedTimes:
         self._delay: float | None = None
         self._spread = self._least = 0.0
         """Mean deviation of the usual delay, and the least delay; both ns."""
+        self._soon = 0.0
+        """Least delay of the last replies, ns."""
         self._made: int | None = None
         self._apart = self._missing = 0.0
         """Time at which the last line was made, usual distance of two lines, share of lost
@@ -459,6 +464,7 @@ class PromptedTimes:
         varies = THOUGHT_NS < self._spread < BATCH_NS and not self._batched
         self._thinking += SLOW * (varies - self._thinking)
         if self._batched:
+            self._soon = 0.0
             self._weigh(lines, since)
         elif self._delay is not None:
             self._base, self._losses = self._delay, 0.0
@@ -552,7 +558,14 @@ class PromptedTimes:
         self._missing -= LOSING * self._missing
         # No reply comes sooner than the least delay. One that seems to is a late reply to the line
         # before.
-        soonest = max(self._soonest, self._least)
+        soonest = max(float(self._soonest), self._least)
+        if left:
+            self._soon = min(self._soon + CREEP * self._apart, at - left[0])
+            if self._soon - soonest > self._apart:
+                # Each of the last replies is late by more than a line, so replies were lost that
+                # the spread had hidden.
+                delay = self._delay = self._soon = soonest
+                wide = self._spread = 0.0
         while len(left) > 1:
             apart = left[1] - left[0]
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
