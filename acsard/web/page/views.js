@@ -1,7 +1,7 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./hand.js";
-import { age, ago, clock, named, person, reason, said, signed } from "./words.js";
+import { age, ago, clock, person, reason, said, signed } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here.";
 const LEVELS = ["", "warning", "error", "warning"];
@@ -80,7 +80,7 @@ export function cards(list, robots, own, here) {
     const [, mode, why, what] = card.children;
     card.className = bad;
     mode.textContent = one.mode ?? "silent";
-    why.textContent = said(named(one.reason ?? ""), one.robot === here ? "" : one.robot);
+    why.textContent = reason({ mode: one.mode, reason: one.reason ?? "" }, one.robot === here ? "" : one.robot);
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
   });
