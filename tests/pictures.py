@@ -12,7 +12,7 @@ import random
 import signal
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from acsard.core.config.settings import Config
@@ -20,7 +20,7 @@ from tests.scenarios.taped import Tape, drive_through_faults, happenings
 from tests.scenarios.world import World
 from tests.system.browser import Page
 from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
-from tests.system.harness import Bus, Daemon, acsard, finish, until
+from tests.system.harness import PLAIN, Bus, Daemon, Peer, acsard, finish, until
 from tests.unit.report.driven import two_drivers
 
 VIEWS = ("drive", "status", "events", "set", "robots")
@@ -87,44 +87,68 @@ def _picture(
     return path
 
 
-def states(directory: Path, sizes: Sequence[str] = tuple(SIZES)) -> list[Path]:
-    """Write the view *Drive* in each state, with names like `phone-dark-stopped.png`."""
-    directory.mkdir(parents=True, exist_ok=True)
-    written: list[Path] = []
+def states(seen: Callable[[Browser, str], None]) -> None:
+    """Call `seen` with a page that shows the view *Drive*, in each state, and the state's name.
 
-    def draw(state: str, words: str) -> None:
-        until(lambda: browser.text("mode") == words, 10.0, words)
-        for size, look in itertools.product(sizes, LOOKS):
-            written.append(_picture(browser, directory, size, look, "drive", state))
-
-    with tempfile.TemporaryDirectory() as place, browsing() as browser:
+    Each time the robot and the page stay in that state until `seen` returns.
+    """
+    with (
+        tempfile.TemporaryDirectory() as place,
+        Peer(Path(place) / "mcu") as board,
+        browsing() as browser,
+    ):
         there = Path(place)
-        with Daemon(there) as daemon, Bus(daemon.endpoint) as bus, Page(daemon, there) as page:
+
+        def look(state: str, mode: str, hint: str = "") -> None:
+            until(lambda: browser.text("mode") == mode, 10.0, mode)
+            until(lambda: hint in browser.text("hint"), 10.0, hint)
+            seen(browser, state)
+
+        with (
+            Daemon(there, board.path) as daemon,
+            Bus(daemon.endpoint) as bus,
+            Page(daemon, there) as page,
+        ):
             bus.linked()
             browser.size(*PHONE)
             browser.open(page.here)
-            draw("ready", "READY")
+            look("ready", "READY")
+            browser.hold(lambda: (bus.state()["linear"] or 0.0) > 0.15)
+            browser.push(-30, 60)
+            look("driving", "DRIVING")
+            browser.lift()
+            bus.at_rest()
+            with bus.commanding(0.2):
+                look("program-drives", "DRIVING")
             with bus.commanding(0.2, source="teleop"):
-                draw("another-drives", "DRIVING")
+                look("another-drives", "DRIVING", "drives")
             bus.at_rest()
             bus.get("srv/stop")
-            draw("stopped", "STOPPED")
+            look("stopped", "STOPPED", "Stopped")
             bus.get("srv/clear")
             bus.get("srv/deactivate")
-            draw("inactive", "INACTIVE")
+            look("inactive", "INACTIVE", "Switched off")
+            bus.get("srv/activate")
+            board.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
+            look("fault", "FAULT", "Fault")
+            board.unplug()
+            look("fault-no-board", "FAULT", "Fault")
             daemon.signal(signal.SIGSTOP)
             try:
-                draw("no-data", "NO DATA")
+                look("no-data", "NO DATA", "Nothing is received")
             finally:
                 daemon.signal(signal.SIGCONT)
+            browser.open(f"{page.here}/?robot=r2")
+            look("another-robot", "WAITING")
             page.process.kill()
-            draw("no-connection", "NO CONNECTION")
-    with tempfile.TemporaryDirectory() as place, browsing() as browser:
-        there = Path(place)
-        with Daemon(there, there / "none") as daemon, Page(daemon, there) as page:
+            look("no-connection", "NO CONNECTION")
+            browser.tap("stop")
+            until(lambda: "sends it again" in browser.text("alarm"), 5.0, "STOP is not confirmed")
+            seen(browser, "stop-unconfirmed")
+        (bare := there / "bare").mkdir()
+        with Daemon(bare, bare / "none") as daemon, Page(daemon, bare) as page:
             browser.open(page.here)
-            draw("no-board", "NO BOARD")
-    return written
+            look("no-board", "NO BOARD")
 
 
 DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
@@ -163,10 +187,19 @@ def _recorded(path: Path) -> Path:
 
 
 def main() -> None:
-    *words, directory = sys.argv[1:]
-    for write_one in (report,) if words == ["--report"] else (write, states, report):
-        for path in write_one(Path(directory)):
+    *words, name = sys.argv[1:]
+    directory = Path(name)
+
+    def draw(browser: Browser, state: str) -> None:
+        for size, look in itertools.product(SIZES, LOOKS):
+            print(_picture(browser, directory, size, look, "drive", state))
+
+    if words != ["--report"]:
+        for path in write(directory):
             print(path)
+        states(draw)
+    for path in report(directory):
+        print(path)
 
 
 if __name__ == "__main__":

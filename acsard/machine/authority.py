@@ -1,8 +1,8 @@
 """Certificates and their authority as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
 
 The keys are P-256 keys, in files that only their owner can read. People trust the authority on
-their phones, so its certificate limits the names that it may sign: a thief of its key can pose as
-no web site.
+their phones, so its certificate limits the hosts that it may sign for: a thief of its key can pose
+as the robots and as hosts of a private network, and as no other web site.
 """
 
 from __future__ import annotations
@@ -45,8 +45,10 @@ class Authority:
     ) -> Authority:
         """Create an authority in `directory`, valid five times as long as its certificates.
 
-        It may sign for `addresses` (host names with all names below them, and IP addresses, of IPv6
-        the whole /64 network), for `LOCAL` and for `PRIVATE`, and for nothing else.
+        The host names that it may sign are those of `addresses` and of `LOCAL`, with all names
+        below them. The IP addresses are those of `addresses` (of IPv6 the whole /64 network) and of
+        `PRIVATE`. Names of other kinds are not limited: a certificate may have any common name,
+        which names a client on the bus.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())

@@ -23,7 +23,7 @@ import ssl
 import traceback
 from asyncio import sslproto
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Any
 
@@ -90,6 +90,8 @@ class Acceptor:
         self._starting: dict[_Connection, float] = {}
         """The connections in the TLS handshake, with the time of its start, oldest first."""
         self._hurry: asyncio.TimerHandle | None = None
+        self._ended: set[_Connection] = set()
+        """The connections whose token had ended at the last call of `tidy`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Accept connections at a listening socket; `make` creates their protocol.
@@ -120,6 +122,16 @@ class Acceptor:
         """Keep this connection when others have to go, because its client is known."""
         if (one := _connection(transport)) is not None:
             one.pool.prove(one, who.token)
+
+    def tidy(self, valid: Collection[str]) -> None:
+        """Cut the connections whose token is not one of these; the page calls this once a second.
+
+        A connection is cut at the second such call, because a WebSocket is told the reason first.
+        """
+        before = self._ended
+        self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
+        for one in self._ended & before:
+            one.cut()
 
     def _resume(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         if opened in self._listeners:

@@ -34,6 +34,13 @@ HEADERS = {
 """Headers of every answer."""
 
 
+POLICY = (
+    "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
+    "form-action 'self'"
+)
+"""Content security policy. A refused request may have a foreign Host, which must not be echoed."""
+
+
 class TroubleError(AcsardError):
     """A request that cannot be fulfilled now or here, with its HTTP status and an explanation."""
 
@@ -55,6 +62,8 @@ def problem(status: int, text: str) -> web.Response:
 def sent(request: web.Request, file: File) -> web.Response:
     """Return a page file, or 304 if the browser has it. Compress it if the client supports gzip."""
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
+    # Also with 304, because the browser then replaces the policy that it has kept with the file.
+    headers["Content-Security-Policy"] = _policy(request, file.policy)
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)
     body = file.body
@@ -69,15 +78,17 @@ def takes_gzip(request: web.Request) -> bool:
 
 
 async def secured(request: web.Request, response: web.StreamResponse) -> None:
-    """Add the security headers to an answer."""
-    host = request.headers.get("Host", "")
-    # Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out. A refused
-    # request may have a foreign Host, which must not be echoed.
-    connect = f" ws://{host} wss://{host}" if response.status < 400 else ""
-    policy = (
-        f"default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; "
-        "base-uri 'none'; form-action 'self'"
-    )
+    """Add the security headers to an answer. A file and a report have their own policy."""
     response.headers.update(HEADERS)
-    response.headers.setdefault("Content-Security-Policy", policy)  # a report sets its own
+    policy = _policy(request) if response.status < 400 else POLICY.format(connect="")
+    response.headers.setdefault("Content-Security-Policy", policy)
     response.headers.setdefault("Cache-Control", "no-store")
+
+
+def _policy(request: web.Request, more: str = "") -> str:
+    """Return the policy for an admitted request, with the directives `more`.
+
+    Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out.
+    """
+    host = request.headers.get("Host", "")
+    return POLICY.format(connect=f" ws://{host} wss://{host}") + more

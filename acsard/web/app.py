@@ -102,7 +102,7 @@ class Page:
     ) -> None:
         """Make the application; `names` and `rules` are those of `Admission`."""
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
-        self._guide, self._counts, self._vault = guide, counts, vault
+        self._guide, self._counts, self._vault, self._acceptor = guide, counts, vault, acceptor
         self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
@@ -125,8 +125,9 @@ class Page:
     async def tidy(self) -> None:
         """Drop expired work; the server calls this once a second.
 
-        This ends the connection of each viewer whose token has expired, was revoked or cannot be
-        looked up on disk within `READ_S`, and gives up a report that no client waits for.
+        This ends each connection whose token has expired, was revoked or cannot be looked up on
+        disk within `READ_S`, a WebSocket with the reason. It gives up a report that no client waits
+        for.
         """
         self._reports.tidy()
         try:
@@ -136,6 +137,7 @@ class Page:
         for viewer in list(self._viewers):
             if viewer.who.token and viewer.who.token not in counting:
                 viewer.end("your token has expired")
+        self._acceptor.tidy(counting)
 
     # The page and its files.
 

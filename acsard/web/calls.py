@@ -65,12 +65,23 @@ async def _nothing() -> Ending:
     return Ending()
 
 
+def _none(robot: str) -> bool:
+    return False
+
+
 class Calls:
     """The requests that are under way, within the limits above."""
 
-    def __init__(self, robots: Robots, ends: Callable[[], Awaitable[Ending]] = _nothing) -> None:
-        """Store the robots, and `ends`, which ends the server's check or calibration."""
-        self._robots, self._ends = robots, ends
+    def __init__(
+        self,
+        robots: Robots,
+        ends: Callable[[], Awaitable[Ending]] = _nothing,
+        sees: Callable[[str], bool] = _none,
+    ) -> None:
+        """Store the robots, `ends`, which ends the server's check or calibration, and `sees`, which
+        says whether a page shows the robot with this id.
+        """
+        self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
         self._unknown = Buckets(STOPS_ELSEWHERE)
         self._answered: set[str] = set()
@@ -114,7 +125,7 @@ class Calls:
                 return await self._stop(other, client, who, request)
             return await self._stops.ask(request)
 
-        if verb == "stop" and other and other not in self._answered:
+        if verb == "stop" and other and other not in self._answered and not self._sees(other):
             self._require_few(who)
         try:
             if verb == "stop":

@@ -20,7 +20,7 @@ from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
 from acsard.web.socket_messages import Row
-from acsard.web.streams import DECLARE_S, UNREADY
+from acsard.web.streams import DECLARE_S, STATE, UNREADY
 
 MOST = 200
 """Maximum number of robots. The bound is needed because any client of the bus can invent robot
@@ -100,6 +100,13 @@ class Fleet:
             elif (row := self._row(robot, one, now_ns)) is not None:
                 rows.append(row)
         return rows
+
+    def sees(self, robot: str) -> bool:
+        """Return whether a robot exists: a viewer looks at the fleet or at the robot, and the bus
+        has its liveliness token or its state.
+        """
+        one, states = self._known.get(robot), self._robots.streams.followed(robot, STATE)
+        return bool(one and one.here) or bool(states and states.number)
 
     def _row(self, robot: str, one: _Known, now_ns: int) -> Row | None:
         sample, at_ns = one.newest

@@ -7,7 +7,7 @@ WebSockets and subscriptions.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Hashable
+from collections.abc import Collection, Hashable
 from typing import Generic, TypeVar
 
 from acsard.host.rate_limits import Places, Rate
@@ -58,8 +58,8 @@ MESSAGES = Rate(200.0, 400.0)
 network returns."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
-"""Limit on the stops of one token to other robots that have never answered a stop here. They may
-not exist. A robot that has answered one is stopped whenever a client asks."""
+"""Limit on the stops of one token to other robots that no page shows and that have never answered a
+stop here. They may not exist. Any other robot is stopped whenever a client asks."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens: from one address, and in all."""
@@ -124,11 +124,17 @@ class Sockets(Generic[C]):
         return gone
 
     def prove(self, one: C, token: str) -> None:
-        """Note that a connection has shown a valid token; "" stands for the robot itself."""
-        network = self._networks.get(one)
-        if network is None or one in self._known or self._tokens[token] >= SOCKETS_OF_TOKEN:
+        """Note that a connection has shown a valid token; "" stands for the robot itself.
+
+        The last token counts, because a browser may get another one.
+        """
+        network, before = self._networks.get(one), self._known.get(one)
+        if network is None or before == token or self._tokens[token] >= SOCKETS_OF_TOKEN:
             return
-        self._forget(network, one)
+        if before is None:
+            self._forget(network, one)
+        else:
+            self._fewer(before)
         self._known[one] = token
         self._tokens[token] += 1
 
@@ -141,13 +147,20 @@ class Sockets(Generic[C]):
         if token is None:
             self._forget(network, one)
             return
-        self._tokens[token] -= 1
-        if not self._tokens[token]:
-            del self._tokens[token]
+        self._fewer(token)
+
+    def ended(self, valid: Collection[str]) -> list[C]:
+        """Return the connections whose token is not one of these; the robot itself needs none."""
+        return [one for one, token in self._known.items() if token and token not in valid]
 
     def strangers(self) -> list[C]:
         """Return the connections that have shown no valid token."""
         return [one for network in self._strangers.values() for one in network]
+
+    def _fewer(self, token: str) -> None:
+        self._tokens[token] -= 1
+        if not self._tokens[token]:
+            del self._tokens[token]
 
     def _forget(self, network: str, one: C) -> None:
         del self._strangers[network][one]

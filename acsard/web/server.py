@@ -89,7 +89,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
     hand = Hand(lambda: robots.client, counts)
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
-    calls, fleet = Calls(robots, guide.stop), Fleet(robots)
+    fleet = Fleet(robots)
+    calls = Calls(robots, guide.stop, fleet.sees)
     vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
     page = Page(
         robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page,

@@ -60,7 +60,9 @@ HEARTBEAT_S = 10.0
 
 CALLS_AT_ONCE = 8
 
-FLEET, FLEET_S = "fleet", 1.0
+FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
+"""Key of the fleet's rows, their interval, and the time that the robots have to appear before the
+first report. Without it each look at the robots began with an empty list."""
 
 LOOK_S = 0.25
 """Interval at which a viewer checks whether the robot became unreachable or its facts changed."""
@@ -252,9 +254,8 @@ class Viewer:
 
     def _subscribe(self, frame: Subscribe) -> None:
         if frame.subscribe == FLEET:
-            self._fleet_due = 0.0
+            self._fleet_due = asyncio.get_running_loop().time() + FLEET_FIRST_S
             self._fleet.join(self)
-            self._out.wake()
         else:
             self._keys.subscribe(frame)
 

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +199,16 @@ class Browser:
     def too_small(self) -> list[Any]:
         """Return the visible controls that are too small for a finger: name, width, height."""
         return list(self.js(_PRESSED.replace("LEAST", str(FINGER_PX - 0.5))))
+
+    def obstacles(self) -> list[Any]:
+        """Return the serious obstacles for a screen reader that axe finds: grade, rule, element."""
+        if not self.js("'axe' in window"):
+            self.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
+        found = self.js(
+            "axe.run().then(told =>"
+            " told.violations.map(one => [one.impact, one.id, one.nodes[0].html]))"
+        )
+        return [one for one in found if one[0] in ("serious", "critical")]
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         """Send a touch event (Start, Move, End or Cancel) with the fingers that are down."""

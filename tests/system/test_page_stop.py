@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from acsard.web.files import PAGE
+from acsard.web.files import INLINED, PAGE
 from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import Bus, Daemon, until
@@ -18,9 +18,12 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
 ]
 
-FILES = sorted(path.name for path in PAGE.iterdir() if path.name != "index.html")
+WHOLE = {"index.html", *INLINED["index.html"]}
+"""The files that arrive as one."""
 
-MODULES = [name for name in FILES if name.endswith(".js") and name != "stop.js"]
+FILES = sorted(path.name for path in PAGE.iterdir() if path.name not in WHOLE)
+
+MODULES = [name for name in FILES if name.endswith(".js")]
 
 RED = "rgb(196, 18, 10)"
 """The colour of STOP in the light style."""
@@ -83,7 +86,7 @@ def impatient(robot: Robot) -> Iterator[Robot]:
     robot.browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if name not in ("stop.js", "style.css")])
+@pytest.mark.parametrize("name", FILES)
 def test_stop_latches_as_soon_as_it_is_red_without_this_file(impatient: Robot, name: str) -> None:
     with impatient.without(name):
         until(lambda: impatient.mode == "stopped", 5.0, f"stopped without {name}")
@@ -103,22 +106,49 @@ def test_a_page_without_this_module_says_reload_and_its_stick_is_grey(
         robot.alarms("STOP: the robot has confirmed it")
 
 
-def test_a_page_without_its_style_stops(robot: Robot) -> None:
-    with robot.without("style.css"):
-        robot.browser.js("document.getElementById('stop').scrollIntoView()")
-        robot.browser.tap("stop")
-        until(lambda: robot.mode == "stopped", 5.0, "stopped")
-
-
-def test_a_page_without_its_stop_has_no_red_stop_does_not_drive_and_says_reload(
-    robot: Robot,
+def test_stop_latches_as_soon_as_it_is_red_while_every_other_file_is_never_answered(
+    impatient: Robot,
 ) -> None:
-    browser = robot.browser
-    with robot.without("stop.js"):
-        robot.alarms("STOP does not work here")
+    browser = impatient.browser
+    browser.ask("Fetch.enable", patterns=[{"urlPattern": "*/page/*"}])
+    impatient.bus.ask("srv/clear")
+    until(lambda: impatient.mode == "ready", 5.0, "it is ready")
+    try:
+        browser.ask("Page.navigate", url=impatient.page.here)
+        until(lambda: impatient.mode == "stopped", 5.0, "stopped")
+        impatient.alarms("STOP: the robot has confirmed it. This page is not complete: reload it.")
+        assert browser.js("document.getElementById('mode').textContent") == "CONNECTING"
+    finally:
+        browser.ask("Fetch.disable")
+        browser.open("about:blank")
+
+
+@pytest.fixture
+def stopless(robot: Robot) -> Iterator[Robot]:
+    """A browser that does not run the script of STOP, because a name of it is taken."""
+    added = robot.browser.ask("Page.addScriptToEvaluateOnNewDocument", source="class Stopping {}")
+    yield robot
+    robot.browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+
+
+def test_a_page_whose_stop_does_not_run_has_no_red_stop_does_not_drive_and_says_reload(
+    stopless: Robot,
+) -> None:
+    browser = stopless.browser
+    with stopless.without():
+        stopless.alarms("STOP does not work here")
         colour = browser.js("getComputedStyle(document.getElementById('stop')).backgroundColor")
         assert colour != RED
         assert browser.js("document.getElementById('stick').ariaDisabled") == "true"
+
+
+def test_the_browser_runs_no_other_script_within_the_page(robot: Robot) -> None:
+    with robot.without():
+        added = (
+            "document.head.append(Object.assign(document.createElement('script'),"
+            " {textContent: 'window.added = true'})), window.added ?? false"
+        )
+        assert robot.browser.js(added) is False
 
 
 def test_on_a_slow_network_stop_latches_before_the_page_shows_the_robot(impatient: Robot) -> None:

@@ -130,6 +130,7 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         shows("mode", "READY")
         browser.tap("tab-robots")
         shows("cards", THEIRS)
+        shows("cards", "Nobody drives.")
         link = f"document.querySelector('#cards a[href*={THEIRS}]')"
         until(lambda: browser.js(f"Boolean({link})"), 10.0, "a card to open")
         browser.js(f"{link}.click()")

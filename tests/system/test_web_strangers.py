@@ -27,7 +27,7 @@ from acsard.web.limits import (
     CONNECTIONS_OF_TOKEN,
 )
 from acsard.web.server import TIDY_S
-from tests.system.browser import Page, hands, run
+from tests.system.browser import NAME, Page, hands, run
 from tests.system.bystander import lost
 from tests.system.harness import PATIENCE_S, Bus, Daemon, until
 
@@ -199,6 +199,36 @@ def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_st
             bus.at_rest()
             with suppress(ConnectionError):
                 await holding
+
+    run(story)
+
+
+def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(page: Page) -> None:
+    names = [f"{name}-{time.time_ns()}" for name in ("borrowed", "owned")]
+    tokens = [page.invite("viewer", name) for name in names]
+    port = int(page.away.rpartition(":")[2])
+    trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
+
+    async def opened(token: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """Open a connection that has shown its token, and has not sent its next request wholly."""
+        reader, writer = await asyncio.open_connection(
+            "127.0.0.1", port, ssl=trusted, server_hostname=NAME
+        )
+        head = f"Host: {NAME}:{port}\r\nAuthorization: Bearer {token}\r\n"
+        writer.write(f"GET /api/whoami HTTP/1.1\r\n{head}\r\nGET /api/whoami".encode())
+        assert b" 200 " in await reader.readline()
+        await reader.readuntil(b"}")
+        return reader, writer
+
+    async def story() -> None:
+        (borrowed, first), (owned, second) = [await opened(one) for one in tokens]
+        page.vault.revoke(names[0])
+        with suppress(ConnectionError):
+            assert await asyncio.wait_for(borrowed.read(), 3 * TIDY_S + PATIENCE_S) == b""
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(owned.read(1), 2 * TIDY_S)
+        for writer in (first, second):
+            writer.transport.abort()
 
     run(story)
 

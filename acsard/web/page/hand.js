@@ -30,10 +30,14 @@ export function boarded(state) {
   return state.link === "up";
 }
 
-/** Return why a push of the stick would not move the robot, in words, or "". */
-export function still(state) {
+/** Return why a push of the stick by `sender` would not move the robot, in words, or "". A push takes over from
+ *  another source, which has a lower priority, but not from another sender of this one. */
+export function still(state, source, sender) {
   if (!state) return "Nothing is received from the robot.";
-  return BARS[state.mode] ?? (boarded(state) ? "" : "No board: nothing can drive.");
+  if (BARS[state.mode]) return BARS[state.mode];
+  if (!boarded(state)) return "No board: nothing can drive.";
+  const taken = state.mode === "driving" && state.source === source && state.sender && state.sender !== sender;
+  return taken ? `${person(state.sender, sender)} drives: you can when they release.` : "";
 }
 
 /** Return why the robot does not follow `sender`, in words, or "" if it does. */

@@ -17,8 +17,8 @@ const $ = (id) => document.getElementById(id);
 const { stopping, alarm } = window; // of stop.js, which has run before
 if (!stopping) {
   $("alarm").hidden = false;
-  views.text("alarm", "STOP does not work here, because a part of this page did not load. Reload the page.");
-  throw new Error("stop.js did not load, and a page without STOP does not drive");
+  views.text("alarm", "STOP does not work here, because a part of this page did not run. Reload the page.");
+  throw new Error("stop.js did not run, and a page without STOP does not drive");
 }
 /** Id of another robot that this page shows. It can be watched and stopped here; its own page drives and
  *  configures it. */
@@ -169,12 +169,10 @@ function forgotten() {
 /** Grey the stick while a push would not move the robot, and say why beside it. */
 function readied() {
   const fresh = link.open && performance.now() - heard <= 2 * lasts();
-  drive.barred = link.open ? still(fresh ? state : null) : "No connection.";
+  drive.barred = link.open ? still(fresh ? state : null, SOURCE, hello?.sender) : "No connection.";
   const off = !drive.allowed || Boolean(drive.barred);
   $("stick").setAttribute("aria-disabled", String(off));
-  const taken = state?.mode === "driving" && state.source === SOURCE && state.sender && state.sender !== hello?.sender;
-  const why = drive.barred || (taken ? `${objection(state, SOURCE, hello?.sender)}: you can when they release.` : "");
-  views.text("hint", drive.allowed && why ? why : hint(hello, OTHER));
+  views.text("hint", (drive.allowed && drive.barred) || hint(hello, OTHER));
 }
 
 function stated({ detail }) {
@@ -208,14 +206,14 @@ function stated({ detail }) {
   views.counters($("counters"), state);
 }
 
-/** Show the measured speeds and the wished ones, of which only the wish is known without feedback. */
+/** Show the measured speeds and the commanded ones, which are known without feedback too. */
 function dialled() {
   const [unit, times, decimals] = degrees ? ["°/s", 180 / Math.PI, 0] : ["rad/s", 1, 2];
   const shown = (value, by = 1) => (value === null || value === undefined ? null : value * by);
   views.text("speed", `${figure(state.linear, 2)} m/s`);
-  views.text("speed-wish", `wish ${figure(wished?.linear, 2)}`);
+  views.text("speed-command", `command ${figure(wished?.linear, 2)}`);
   views.text("turn", `${figure(shown(state.angular, times), decimals)} ${unit}`);
-  views.text("turn-wish", `wish ${figure(shown(wished?.angular, times), decimals)}`);
+  views.text("turn-command", `command ${figure(shown(wished?.angular, times), decimals)}`);
 }
 
 /** Show turn rates in the other unit. */
@@ -252,7 +250,7 @@ function greeted({ detail }) {
 function elsewhere() {
   const back = views.made("a", "", `Back to ${hello.robot}`);
   back.href = "./";
-  const words = `This is ${OTHER} on the page of ${hello.robot}: you may watch and stop it here. To drive it, open its own page. `;
+  const words = `This is ${OTHER} on the page of ${hello.robot}. You may watch and stop it here.`;
   $("other").replaceChildren(words, back);
   $("other").hidden = false;
 }
@@ -311,7 +309,7 @@ link.addEventListener("down", ({ detail }) => {
   heard = -Infinity;
   views.lost(detail.reason || (state ? "this page connects again" : "")); // the text shown before is outdated
   state = drive.state = wished = null;
-  for (const name of ["speed-wish", "turn-wish"]) views.text(name, "wish –");
+  for (const name of ["speed-command", "turn-command"]) views.text(name, "command –");
   readied();
 });
 

@@ -1,5 +1,5 @@
-// STOP, before everything else. This classic script comes first, needs no other file, and paints STOP red when it
-// runs. It posts the stop until the robot has answered. `main.js` later gives it the WebSocket, which is faster.
+// STOP, before everything else. The page's server puts this classic script into index.html, so STOP arrives with the
+// page, and paints STOP red when it runs. It posts the stop until the robot has answered. `main.js` later gives it the WebSocket, which is faster.
 //
 // A stop is repeated because a dead link is not noticed at once. It is not repeated for long: later another person
 // may have released the stop and be driving.

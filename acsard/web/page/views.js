@@ -1,8 +1,9 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./hand.js";
-import { age, ago, clock, named, person, reason, said, signed } from "./words.js";
+import { age, ago, clock, person, reason, said, signed } from "./words.js";
 
+const DOUBTFUL = "STOP may not reach the robot from here.";
 const LEVELS = ["", "warning", "error", "warning"];
 
 /** Return an element with its children; strings become text nodes. */
@@ -55,7 +56,7 @@ export function folded(events) {
 
 export function happened(list, told, elsewhere) {
   const rows = folded([...told.events].reverse()).map((one) => {
-    const by = `${one.by ? ` — ${one.by}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
+    const by = `${one.by && !one.text.endsWith(one.by) ? ` — ${one.by}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
     const head = made("strong", "", one.name.replaceAll("_", " "));
     return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(one.text, elsewhere)}${by}`);
   });
@@ -79,7 +80,7 @@ export function cards(list, robots, own, here) {
     const [, mode, why, what] = card.children;
     card.className = bad;
     mode.textContent = one.mode ?? "silent";
-    why.textContent = said(named(one.reason ?? ""), one.robot === here ? "" : one.robot);
+    why.textContent = reason({ mode: one.mode, reason: one.reason ?? "" }, one.robot === here ? "" : one.robot);
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
   });
@@ -103,15 +104,19 @@ export function banner(state, locked, elsewhere, own) {
   mode(missing ? "noboard" : state.mode, missing ? "NO BOARD" : state.mode.toUpperCase());
   const why = state.mode === "driving" && state.sender ? `Driven by ${person(state.sender, own)}.` : reason(state, elsewhere);
   text("reason", locked ? why.replace("press Release", "an operator releases it") : why);
-  const doubt = document.getElementById("doubt");
   const warned = [
     alone ? "Nobody can stop the motors from here." : "",
     state.wheel_fault, state.recording_error, state.latch_file_error,
     state.certificate_expiry.startsWith("valid") ? "" : state.certificate_expiry,
   ];
-  doubt.textContent = warned.filter(Boolean).join("; ");
-  doubt.hidden = !doubt.textContent;
+  doubted(warned.filter(Boolean).join("; "));
   document.body.classList.toggle("boardless", alone);
+}
+
+/** Show a warning in the banner until `words` is "". */
+function doubted(words) {
+  document.getElementById("doubt").hidden = !words;
+  text("doubt", words);
 }
 
 /** Show a mode in the banner and in the title, which a background tab shows. STOP and its
@@ -122,7 +127,8 @@ function mode(name, words) {
   const stop = document.getElementById("stop");
   stop.setAttribute("aria-pressed", String(name === "stopped"));
   text("stop-words", `${name === "stopped" ? "STOPPED" : "STOP"}${stop.dataset.robot ?? ""}`);
-  text("clear", name === "fault" ? "Release fault" : "Release STOP");
+  const release = { stopped: "Release STOP", fault: "Release fault" }[name];
+  if (release) text("clear", release);
   document.title = `${words} · ${document.getElementById("robot").textContent}`;
 }
 
@@ -130,18 +136,21 @@ function mode(name, words) {
 export function waiting() {
   mode("waiting", "WAITING");
   text("reason", "for the robot: nothing is heard of it yet");
+  doubted("");
 }
 
 /** Show that the data is old and that the robot may or may not be driving. */
 export function unheard(why) {
-  mode("waiting", "NO DATA");
+  mode("lost", "NO DATA");
   text("reason", why || "nothing is received from the robot; the values below are old");
+  doubted(DOUBTFUL);
 }
 
 /** Show that the connection is lost, and blank the values that are no longer known. */
 export function lost(why) {
-  mode("waiting", "NO CONNECTION");
+  mode("lost", "NO CONNECTION");
   if (why) text("reason", why);
+  doubted(DOUBTFUL);
   for (const name of ["speed", "turn", "who"]) text(name, "–");
 }
 

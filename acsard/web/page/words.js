@@ -1,5 +1,7 @@
 // Formats numbers and times for people. This module is pure.
 
+const UTC = /\b(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d) UTC\b/g;
+
 export function signed(value, decimals) {
   const text = value.toFixed(decimals);
   return Number(text) === 0 ? (0).toFixed(decimals) : text.replace("-", "−");
@@ -74,11 +76,13 @@ export function named(text) {
   return text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page at the robot");
 }
 
-/** Replace service names by button names: of this page, or of the own page of the robot `elsewhere`. */
-export function said(text, elsewhere = "") {
+/** Replace service names by button names, of this page or of the own page of the robot `elsewhere`, and times in UTC
+ *  by local ones. */
+export function said(text, elsewhere = "", now = new Date()) {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere
     ? { "call srv/clear": `Release is ${there}`, "srv/clear": `Release ${there}`, "call srv/activate": `Switch on is ${there}` }
     : { "call srv/clear": "press Release", "srv/clear": "Release", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on under Settings" };
-  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), text);
+  const local = text.replace(UTC, (_, day, time) => clock({ sec: Date.parse(`${day}T${time}Z`) / 1000, nanosec: 0 }, now));
+  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), local);
 }

@@ -25,8 +25,10 @@ from acsard.web.calls import (
     Merged,
     Stops,
 )
+from acsard.web.fleet import Fleet
 from acsard.web.limits import STOPS_ELSEWHERE
-from tests.unit.web.test_fleet import quiet, robots
+from tests.unit.web.test_fleet import quiet, robots, row
+from tests.unit.web.test_metrics import STATE
 
 PATIENCE_S = 20.0
 
@@ -239,4 +241,49 @@ def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_
 
     with zenoh.open(quiet()) as session:
         session.declare_queryable("acsard/r2/srv/stop", served)
+        asyncio.run(story(session))
+
+
+def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refused() -> None:
+    async def story(session: zenoh.Session) -> None:
+        known = robots(Client(session, "acsar", "teleop"))
+        fleet = Fleet(known)
+        calls = Calls(known, sees=fleet.sees)
+
+        async def stop(robot: str) -> str:
+            """Return the answer of the bus, which has no such service, or the refusal."""
+            try:
+                return (await calls.call(MAINTAINER, "stop", {}, robot)).message
+            except RefusedError as error:
+                return error.reason
+
+        async def refused() -> None:
+            async with asyncio.timeout(PATIENCE_S):
+                while await stop("ghost") != "too_fast":
+                    pass
+
+        fleet.join(1)
+        token = session.liveliness().declare_token("acsard/r2/alive")
+        await row(fleet, lambda one: one.robot == "r2")
+        await refused()
+        assert await stop("r2") != "too_fast"
+        token.undeclare()
+        await row(fleet, lambda one: one.robot == "r2" and one.mode == "gone")
+        await refused()
+        assert await stop("r2") == "too_fast"
+        fleet.leave(1)
+        assert known.client is not None
+        await known.streams.follow(known.client, "r3", "state")
+        await refused()
+        assert await stop("r3") == "too_fast"
+        state = encode(STATE, "msgpack")
+        session.put("acsard/r3/state", state, encoding=encoding_name("msgpack", "RobotState"))
+        async with asyncio.timeout(PATIENCE_S):
+            while not fleet.sees("r3"):
+                await asyncio.sleep(0.01)
+        await refused()
+        assert await stop("r3") != "too_fast"
+        await known.streams.leave("r3", "state")
+
+    with zenoh.open(quiet()) as session:
         asyncio.run(story(session))

@@ -5,13 +5,18 @@ They are served by plain names only, compressed where it helps, and reloaded on 
 
 from __future__ import annotations
 
+import base64
 import gzip
+import hashlib
 import os
+import re
 from pathlib import Path
 
 import pytest
+from aiohttp.test_utils import make_mocked_request
 
-from acsard.web.files import Files
+from acsard.web.answers import sent
+from acsard.web.files import INLINED, PAGE, Files
 
 
 @pytest.fixture
@@ -19,6 +24,8 @@ def page(tmp_path: Path) -> Path:
     page = tmp_path / "page"
     page.mkdir()
     (page / "index.html").write_text("<p>robot</p>" * 200)
+    (page / "stop.js").write_text("stop()")
+    (page / "style.css").write_text("p { margin: 0 }")
     (page / "small.js").write_text("1")
     (page / "notes.txt").write_text("not served")
     (page / ".secret.js").write_text("1")
@@ -68,3 +75,55 @@ def test_a_changed_file_is_another(page: Path) -> None:
 
 def test_without_a_directory_there_is_nothing(tmp_path: Path) -> None:
     assert Files(tmp_path / "none").get("index.html") is None
+
+
+def test_the_page_has_stop_and_its_style_in_itself_and_allows_them_by_their_hashes() -> None:
+    page = Files().get("index.html")
+    assert page is not None
+    found = {
+        "script-src": re.findall(rb"<script>(.*?)</script>", page.body, re.DOTALL),
+        "style-src": re.findall(rb"<style>(.*?)</style>", page.body, re.DOTALL),
+    }
+    assert found["script-src"] == [(PAGE / "stop.js").read_bytes()]
+    assert found["style-src"] == [(PAGE / "style.css").read_bytes()]
+    assert not any(loads in page.body for loads, _ in INLINED["index.html"].values())
+    policy = dict(one.split(maxsplit=1) for one in page.policy.split("; ") if one)
+    for name, (source,) in found.items():
+        digest = base64.b64encode(hashlib.sha256(source).digest()).decode()
+        assert policy.pop(name) == f"'self' 'sha256-{digest}'"
+    assert not policy
+
+
+def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
+    """The headers of a 304 replace the kept ones."""
+    page = Files().get("index.html")
+    assert page is not None
+    first = sent(make_mocked_request("GET", "/"), page)
+    again = sent(make_mocked_request("GET", "/", {"If-None-Match": page.tag}), page)
+    assert (first.status, again.status) == (200, 304)
+    policies = [one.headers["Content-Security-Policy"] for one in (first, again)]
+    assert policies[0] == policies[1]
+    assert policies[0].endswith(page.policy)
+
+
+def test_any_other_file_allows_nothing_within_itself() -> None:
+    file = Files().get("main.js")
+    assert file is not None
+    answer = sent(make_mocked_request("GET", "/page/main.js"), file)
+    assert "script-src" not in answer.headers["Content-Security-Policy"]
+    assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+
+
+def test_a_page_whose_stop_changed_is_another(page: Path) -> None:
+    files = Files(page)
+    before = files.get("index.html")
+    (page / "stop.js").write_text("stop(2)")
+    after = files.get("index.html")
+    assert before is not None
+    assert after is not None
+    assert before.policy != after.policy
+
+
+def test_a_page_without_its_stop_is_not_sent(page: Path) -> None:
+    (page / "stop.js").unlink()
+    assert Files(page).get("index.html") is None

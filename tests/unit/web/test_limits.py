@@ -160,6 +160,18 @@ def test_a_connection_with_a_valid_token_is_never_displaced() -> None:
     assert "stranger 0" not in gone
 
 
+def test_the_connections_of_a_token_that_has_ended_are_found() -> None:
+    sockets = Sockets[str](SOCKETS)
+    shown = {"none": [], "lent": ["lent"], "kept": ["kept"], "both": ["lent", "kept"], "here": [""]}
+    for one, tokens in shown.items():
+        sockets.enter("10.0.0.1", one)
+        for token in tokens:
+            sockets.prove(one, token)
+    assert sockets.ended({"kept", "lent"}) == []
+    assert sockets.ended({"kept"}) == ["lent"]
+    assert sockets.ended(()) == ["lent", "kept", "both"]
+
+
 def test_a_token_keeps_a_share_of_the_places_only() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
     for n in range(SOCKETS):

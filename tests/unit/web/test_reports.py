@@ -40,7 +40,14 @@ async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> Re
 
 
 def run(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    asyncio.run(story())
+    async def whole() -> None:
+        await story()
+        # A drawing that was given up is ending its program. The end of the event loop would cancel
+        # that too, and the pipes of the program would outlive the loop.
+        ending = [task for task in asyncio.all_tasks() if task.cancelling()]
+        await asyncio.gather(*ending, return_exceptions=True)
+
+    asyncio.run(whole())
 
 
 def test_it_is_begun_by_who_asks_and_there_when_it_is_done() -> None:
