@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
 from acsard.cli import parser
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
-from tests.unit.calibration.bags import imu, in_order, joint_states, write_bag, write_mcap
+from tests.pages import blocks
+from tests.unit.calibration.bags import (
+    PERIOD_S,
+    imu,
+    in_order,
+    joint_states,
+    write_bag,
+    write_mcap,
+)
 from tests.unit.calibration.cut import usual
 from tests.unit.calibration.robots import GUIDED
 
@@ -210,6 +222,51 @@ def test_a_directory_that_is_no_bag_is_told(tmp_path: Path) -> None:
 def test_the_options_of_a_bag_are_refused_for_a_csv_file(word: str, tmp_path: Path) -> None:
     with pytest.raises(MendableError, match="choose within a ROS 2 bag, and this is none"):
         called(tmp_path, GOOD, word)
+
+
+# the converters of deploy/calibration/README.md
+
+
+def converted(name: str, where: Path, *words: str) -> str:
+    """Return the CSV file that a converter of the page makes, run as the page says."""
+    (script,) = (block.text for block in blocks("python") if f"# {name}:" in block.text)
+    (where / name).write_text(script)
+    command = [sys.executable, name, *words, "drive.csv"]
+    done = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return (where / "drive.csv").read_text()
+
+
+@pytest.mark.parametrize("sqlite", [False, True])
+def test_the_page_s_converter_makes_a_log_of_a_bag(
+    sqlite: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bag(tmp_path / "drive", usual(), sqlite=sqlite)
+    assert called(tmp_path, converted("bag_to_csv.py", tmp_path, "drive"), "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["reference"] == "yaw_rate and positions"
+    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
+
+
+def test_the_page_s_converter_makes_a_log_of_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = usual()
+    rows = [(t, f"{t:.6f},,,{rate:.6f}") for t, rate in zip(seen.gyro_t, seen.gyro, strict=True)]
+    per_rad = 1440 / math.tau
+    left, right = (
+        (65000 + np.floor(np.cumsum(side) * PERIOD_S * per_rad)) % 65536
+        for side in (seen.left, seen.right)
+    )
+    rows += [
+        (t, f"{t + PERIOD_S / 2:.6f},{a:.0f},{b:.0f},")
+        for t, a, b in zip(seen.t, left, right, strict=True)
+    ]
+    text = "\n".join(["t,left_counts,right_counts,yaw_rate", *(row for _, row in sorted(rows))])
+    (tmp_path / "counts.csv").write_text(text + "\n")
+    assert called(tmp_path, converted("counts_to_csv.py", tmp_path, "counts.csv"), "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
 
 
 @pytest.mark.parametrize("word", ["0", "nan", "a=b", "-3", "1e9"])
