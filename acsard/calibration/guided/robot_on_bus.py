@@ -11,7 +11,7 @@ from typing import Any
 
 import zenoh
 
-from acsard.calibration.guided.drive_plan import GuideError, Leg
+from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
 from acsard.calibration.guided.leg_recorder import Recorder
 from acsard.calibration.runs import Run
@@ -114,7 +114,10 @@ class RobotOnBus:
         self._sensors.append((sensor, "place"))
 
     def ride(self, leg: Leg) -> Run:
-        """Drive a leg and return its recording. Raises `GuideError` if the leg was halted."""
+        """Drive a leg and return its recording.
+
+        Raises `GuideError` if the leg was halted; `DisturbedError` if it can be repeated.
+        """
         recorder = Recorder(self._joints)
         self._drain()
         sender = self._client.sender
@@ -130,7 +133,8 @@ class RobotOnBus:
             )
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
-            raise GuideError(f"{driver.halted}{end} The tool commanded zero, and writes nothing")
+            text = f"{driver.halted}{end} The tool commanded zero, and writes nothing"
+            raise DisturbedError(driver.halted, text) if driver.disturbed else GuideError(text)
         return recorder.run()
 
     def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
