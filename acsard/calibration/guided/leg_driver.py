@@ -59,6 +59,9 @@ class LegDriver:
         """The reason why the leg was cut short, or ""."""
         self.disturbed = False
         """Whether `halted` is something that may not happen again, so the leg can be repeated."""
+        self.silent = False
+        """Whether `halted` is the silence of the daemon. It is a disturbance if the daemon returns.
+        """
         self._begun = self._received = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
@@ -135,8 +138,9 @@ class LegDriver:
             self._halt(HELD_UP, disturbed=True)
         elif now - self._received > QUIET_S:
             late = held_up > QUIET_S / 2
-            silent = "nothing received from the daemon: does it run?"
-            self._halt(HELD_UP if late else silent, disturbed=late)
+            self.silent = self.silent or not (late or self.over)
+            silence = "nothing received from the daemon: does it run?"
+            self._halt(HELD_UP if late else silence, disturbed=late)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:

@@ -34,6 +34,12 @@ LOOK_S = 0.005
 SHOWN_S = 0.2
 """Period in which the progress of a leg is shown, s."""
 
+RETURNS_S = 3.0
+"""Time within which a daemon that fell silent must speak again, s.
+
+If it does, its computer was too busy to run it, and the leg can be repeated.
+"""
+
 POSITIONS = (Odometry, PoseStamped)
 """Types of a position message, in the order in which they are tried.
 
@@ -134,8 +140,19 @@ class RobotOnBus:
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
             text = f"{driver.halted}{end} The tool commanded zero, and writes nothing"
-            raise DisturbedError(driver.halted, text) if driver.disturbed else GuideError(text)
+            if driver.disturbed or (driver.silent and self._returns()):
+                raise DisturbedError(driver.halted, text)
+            raise GuideError(text)
         return recorder.run()
+
+    def _returns(self) -> bool:
+        """Return whether the daemon, which fell silent, speaks again within `RETURNS_S`."""
+        end = time.monotonic() + RETURNS_S
+        while time.monotonic() < end:
+            if self._watch.look(time.monotonic()):
+                return True
+            time.sleep(LOOK_S)
+        return False
 
     def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
         begun = sent = shown = time.monotonic()

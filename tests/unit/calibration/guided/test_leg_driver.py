@@ -185,6 +185,8 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
     assert world.driver.halted == "nothing received from the daemon: does it run?"
+    assert world.driver.silent
+    assert not world.driver.disturbed
 
 
 def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
