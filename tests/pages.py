@@ -117,6 +117,7 @@ SERVICE, OPEN = "tests/systemd/test_service.py", "tests/systemd/test_web.py"
 WEB = "tests/system/test_web_strangers.py"
 SIMULATED = "tests/system/test_simulated.py"
 CALIBRATE = "tests/unit/cli/test_calibrate.py"
+BAG = Elsewhere(CALIBRATE, "test_a_bag_that_another_library_wrote_is_read")
 CLIENTS = "tests/system/test_languages.py"
 GUIDED = "tests/system/test_calibrate.py"
 
@@ -301,6 +302,15 @@ COMMANDS: dict[str, How] = {
         GUIDED, "test_the_simulator_is_calibrated_by_its_true_pose_without_a_person"
     ),
     "acsard calibrate --log drive.csv": Elsewhere(CALIBRATE, "test_people_are_told"),
+    # deploy/calibration
+    "acsard calibrate --log drive --config acsard.toml": BAG,
+    "acsard calibrate --log drive --config acsard.toml --write": BAG,
+    "ros2 bag record -s mcap -o drive /joint_states /imu/data": NO_ROS,
+    "rosbags-convert --src drive.bag --dst drive --dst-storage mcap": Shown(
+        "of the library rosbags; the tests write their bags by it"
+    ),
+    "ros2 bag convert -i drive -o mcap.yaml": NO_ROS,
+    "zstd -d drive_0.mcap.zstd": Shown("of the package zstd"),
     "acsard calibrate --log drive.csv --distance 4.03 --write": Elsewhere(
         CALIBRATE, "test_of_two_logs_put_together_a_distance_is_the_straight_one_s"
     ),

@@ -50,7 +50,7 @@ def at(block: Block) -> str:
 
 
 def test_there_is_a_page_beside_each_thing_it_describes() -> None:
-    parts = ("clients", "firmware", "foxglove", "ros2", "systemd", "web", "zenoh")
+    parts = ("calibration", "clients", "firmware", "foxglove", "ros2", "systemd", "web", "zenoh")
     beside = {f"deploy/{part}/README.md" for part in parts}
     assert set(PAGES) == {"README.md", "acsard/README.md", "tests/README.md", *beside}
 
@@ -196,8 +196,12 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
 
 
 def test_python_is_on_the_page_whose_examples_are_run() -> None:
-    """`tests/system/test_client.py` and `test_web.py` run these blocks, and list them."""
-    assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
+    """`test_client.py` and `test_web.py` in `tests/system/` and `tests/unit/cli/test_calibrate.py`
+    run these blocks.
+    """
+    calibration = "deploy/calibration/README.md"
+    pages = {"README.md", "deploy/web/README.md", calibration}
+    assert {block.page for block in blocks("python")} == pages
 
 
 @each("language", ["html", "js"])
@@ -291,6 +295,10 @@ READS_KEYS = {"calibration/error_budget/daemon_messages.py", "web/page/main.js"}
 """Files that follow only some of the published keys."""
 
 
+READS_BAGS = {"calibration/ros_bag_log.py", "deploy/calibration/README.md"}
+"""Files that read some types of ROS from bags, which this robot need not have recorded."""
+
+
 @each(
     ("part", "pattern", "some", "beyond"),
     [
@@ -299,7 +307,7 @@ READS_KEYS = {"calibration/error_budget/daemon_messages.py", "web/page/main.js"}
         ("simulated fault", "stuck_encoder", "core/config/named_faults.py", set()),
         ("setting", "angular_jerk", "core/config/motion_rules.py", {"core/motion/limits.py"}),
         ("ROS topic", "cmd_vel_teleop", "core/ros/transports.py", set()),
-        ("ROS topic", "sensor_msgs/(msg/)?JointState", "core/ros/channels.py", set()),
+        ("ROS topic", "sensor_msgs/(msg/)?JointState", "core/ros/channels.py", READS_BAGS),
         ("firmware dialect", "trailing_comma", "core/link/codec.py", set()),
     ],
 )

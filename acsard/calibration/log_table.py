@@ -88,7 +88,7 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
         with np.errstate(invalid="ignore"):
             wild = np.abs(values) > BOUNDS.get(name, PLACE_BOUND)
         if name in RATES:
-            wild |= _spikes(np.where(wild, math.nan, values), order)
+            wild |= spikes(np.where(wild, math.nan, values), order)
         if wild.any():
             example = float(values[wild][0])
             values[wild] = math.nan
@@ -97,7 +97,7 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
             yield f"{cells} of {name} left out because no robot has such a value, like {example:g}"
 
 
-def _spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Return a mask of the rows that are spikes; `order` sorts the rows by time.
 
     A spike stands out from its neighbours both in the order of the file and in the order of time.

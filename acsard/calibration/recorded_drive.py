@@ -1,43 +1,155 @@
-"""Reads the recorded drive of `acsard calibrate --log`, and calibrates with it."""
+"""Reads the recorded drive of `acsard calibrate --log`, and calibrates with it.
+
+The drive is a CSV file, a black-box recording of acsard, or a ROS 2 bag in MCAP: one file, or the
+directory of a bag.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
-from acsard.calibration.log_table import AS_CSV, LogError, noted, read
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel, Header, Message, Schema
+from mcap.stream_reader import StreamReader
+from msgspec.structs import replace
+
+from acsard.calibration import ros_bag_log
+from acsard.calibration.log_table import AS_CSV, LogError, Table, noted, read
+from acsard.calibration.ros_bag_log import PAGE, Choice, RosMessage
 from acsard.calibration.runs import runs
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.tape_distance import Tape
-from acsard.core.config.settings import DriveConfig
+from acsard.core.config.settings import Config
 from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import measured
 from acsard.recording.file import Recording
-from acsard.recording.mcap_records import MAGIC
+from acsard.recording.mcap_records import DAMAGE, MAGIC
+
+MOST_BYTES = 1 << 30
+"""Size of the largest CSV file or recording of acsard. It is read into memory as a whole."""
+
+MOST_RECORD_BYTES = 1 << 28
+"""Size of the largest record of a bag that is read. A chunk of rosbag2 has less than 1 MiB."""
+
+BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
+"""Exceptions for a damaged bag: those of MCAP, of LZ4, and of a message without its channel."""
+
+OTHER_BAGS = {
+    ".db3": (b"SQLite format 3\0", "in SQLite: convert it to MCAP with `ros2 bag convert`"),
+    ".bag": (b"#ROSBAG V", "of ROS 1: convert it to ROS 2 in MCAP with `rosbags-convert`"),
+    ".zstd": (b"\x28\xb5\x2f\xfd", "compressed as a whole file: unpack it with `zstd -d`"),
+}
+"""Bags that are not read, by their suffix: their first bytes, and what to do."""
 
 
-def calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
-    """Return the calibration from a CSV file or a black-box recording.
+def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
+    """Return the calibration from a recorded drive.
 
     Raises `LogError`, `RefusedError`, and `MendableError` for a file that cannot be read.
+
+    Args:
+        log: the file, or the directory of a bag.
+        config: the robot.
+        tape: a distance that was measured by tape, or None.
+        choice: the topics of a bag that the user chose.
     """
-    if log.is_dir():
-        raise LogError(f"it is a directory (perhaps a ROS bag): {AS_CSV}")
     try:
-        # The whole log is read into memory.
-        if log.stat().st_size > 1 << 30:
-            raise MendableError(f"{log} is larger than 1 GiB: cut it; ten minutes are enough")
-        data = log.read_bytes()
+        table = _table(log, config, choice)
     except OSError as error:
         raise MendableError(f"cannot read {log}: {error.strerror}; correct --log") from None
-    if data.startswith(MAGIC):
-        data = _measured(log)
-    table = read(data)
     try:
         driven = runs(table)
     except LogError as error:
         noted(error, table.notes)
         raise
-    return calibrate(driven, drive, tape)
+    return calibrate(driven, config.drive, tape)
+
+
+def _table(log: Path, config: Config, choice: Choice) -> Table:
+    if log.is_dir():
+        return _bag(_files_of(log), config, choice)
+    with log.open("rb") as stream:
+        begin = stream.read(16)
+    for magic, what in OTHER_BAGS.values():
+        if begin.startswith(magic):
+            raise LogError(_other_bag(what))
+    if begin.startswith(MAGIC) and not _is_ours(log):
+        return _bag([log], config, choice)
+    if choice != Choice():
+        raise LogError("--topic and --yaw-axis choose within a ROS 2 bag, and this is none")
+    if log.stat().st_size > MOST_BYTES:
+        raise MendableError(f"{log} is larger than 1 GiB: cut it; ten minutes are enough")
+    return read(_measured(log) if begin.startswith(MAGIC) else log.read_bytes())
+
+
+def _files_of(directory: Path) -> list[Path]:
+    """Return the MCAP files of a bag's directory in order of their numbers."""
+    files = [path for path in directory.iterdir() if path.suffix == ".mcap"]
+    if not files:
+        for suffix, (_, what) in OTHER_BAGS.items():
+            if any(path.suffix == suffix for path in directory.iterdir()):
+                raise LogError(_other_bag(what))
+        raise LogError(
+            f"it is a directory without an MCAP file: name that of a ROS 2 bag, or {AS_CSV}"
+        )
+    return sorted(files, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
+
+
+def _other_bag(what: str) -> str:
+    return f"it is a ROS bag {what} ({PAGE} has the commands)"
+
+
+def _is_ours(log: Path) -> bool:
+    """Return whether an MCAP file is a recording of acsard, as far as its beginning shows."""
+    with log.open("rb") as stream:
+        try:
+            first = next(StreamReader(stream, record_size_limit=MOST_RECORD_BYTES).records)
+        except (*DAMAGE, StopIteration):
+            return True  # the reader of recordings names the damage
+        return not isinstance(first, Header) or first.profile == "acsard"
+
+
+def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
+    notes: list[str] = []
+    messages = (message for file in files for message in _messages(file, notes))
+    try:
+        table = ros_bag_log.table(messages, config.joints.as_tuple(), choice)
+    except LogError as error:
+        noted(error, notes)
+        raise
+    return replace(table, notes=(*notes, *table.notes))
+
+
+def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
+    """Yield the messages of a bag in their order in the file.
+
+    If the bag is cut off or damaged, the messages before that place are yielded, and a sentence is
+    added to `notes`.
+    """
+    types: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    with file.open("rb") as stream:
+        try:
+            for record in StreamReader(stream, record_size_limit=MOST_RECORD_BYTES).records:
+                match record:
+                    case Schema():
+                        types[record.id] = record.name
+                    case Channel():
+                        channels[record.id] = record
+                    case Message():
+                        channel = channels[record.channel_id]
+                        yield RosMessage(
+                            channel.topic, types.get(channel.schema_id, ""),
+                            channel.message_encoding, record.log_time, record.data,
+                        )  # fmt: skip
+        except EndOfFile:
+            notes.append(f"{file.name} has no end: the messages before the cut are used")
+        except BAG_DAMAGE as error:
+            notes.append(
+                f"{file.name} is damaged, and the messages before that place are used: {error}"
+            )
 
 
 def _measured(log: Path) -> bytes:

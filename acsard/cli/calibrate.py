@@ -3,7 +3,9 @@ how much they improve the odometry. Without --log the tool drives the robot and 
 this terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
 starts each leg with Enter, stops it with any key, and types the tape measurements that the tool
 asks for. The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box
-recording of a robot with a gyro, or a CSV file with a header. The CSV file has the column t (s) and
+recording of a robot with a gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a
+header. A bag has the wheels as JointState, and an Imu, a PoseStamped or an Odometry to compare them
+with. Its topics are chosen by their types, or with --topic. The CSV file has the column t (s) and
 the wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro),
 or x and y (m, from any source of positions) with or without yaw (rad), or both. The column run (any
 name) separates several drives. The columns may be in any order, and a cell is empty if its sensor
@@ -26,6 +28,7 @@ from acsard.calibration.guided.drive_plan import GuideError
 from acsard.calibration.log_table import LogError
 from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.recorded_drive import calibrated
+from acsard.calibration.ros_bag_log import AXES, Choice
 from acsard.calibration.tape_distance import Tape
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_drive_options, differing, guided
 from acsard.cli.common import add_outcome, load, require_asking
@@ -47,7 +50,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--log",
         type=Path,
         metavar="FILE",
-        help="recorded drive: a CSV file or a recording of `acsard recording`",
+        help="recorded drive: a CSV file, a recording of `acsard recording` or a ROS 2 bag in MCAP",
+    )
+    parser.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="with --log and a ROS 2 bag: use this topic, if several fit. If it is an Imu, a "
+        "PoseStamped or an Odometry, the wheels are compared with no other topic; repeat the "
+        "option for more",
+    )
+    parser.add_argument(
+        "--yaw-axis",
+        choices=AXES,
+        default="",
+        help="with --log and a ROS 2 bag: the axis of the IMU that points up (default: z). -x "
+        "means that x points down; write --yaw-axis=-x",
     )
     parser.add_argument(
         "--distance",
@@ -76,7 +95,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     source = str(args.log) if args.log else DRIVEN
     try:
         if args.log:
-            found, config = calibrated(args.log, mine.drive, args.distance), mine
+            found, config = calibrated(args.log, mine, args.distance, _choice(args)), mine
         else:
             found, config = guided(args, mine, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
@@ -109,12 +128,18 @@ def _require_fitting(args: argparse.Namespace) -> None:
         raise UsageError(
             "--distance goes with --log: a guided drive asks for the distances that it needs"
         )
+    if not args.log and _choice(args) != Choice():
+        raise UsageError("--topic and --yaw-axis go with --log: they choose within a ROS 2 bag")
     for name in DRIVE_OPTIONS if args.log else ():
         if getattr(args, name):
             option = "--" + name.replace("_", "-")
             raise UsageError(
                 f"{option} is for a guided drive and --log for a recorded one: leave one out"
             )
+
+
+def _choice(args: argparse.Namespace) -> Choice:
+    return Choice(tuple(args.topic), args.yaw_axis)
 
 
 def _distance(text: str) -> Tape:

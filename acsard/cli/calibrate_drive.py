@@ -91,7 +91,7 @@ def guided(
         elif name == "positions":
             robot.positions(args.positions, _elsewhere(args, tls, stack))
         try:
-            return guide(name, made, prompt, robot.ride), config
+            return guide(name, made, prompt, robot.ride, simulated=info.simulated), config
         except KeyboardInterrupt:
             raise GuideError("the operator ended the drive. Nothing is written") from None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import json
 import math
+import signal
 import subprocess
 import sys
 import threading
@@ -371,6 +372,27 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
     assert found["reference"] == "positions"
     assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
     assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("stalled", ["calibration", "daemon"])
+def test_on_the_simulator_a_process_that_stands_still_does_not_end_the_drive(
+    tmp_path: Path, stalled: str
+) -> None:
+    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        words = ["calibrate", "--positions", "sim/pose", "--yes", "--json"]
+        with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
+            until(lambda: (bus.state()["linear"] or 0.0) > 0.25, 20.0, "the first leg moves")
+            process = program.process if stalled == "calibration" else daemon.process
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(1.5)
+            process.send_signal(signal.SIGCONT)
+            assert program.ended(2 * RIDES_S) == 0, program.stderr
+        assert "was disturbed" in program.stderr
+        found = json.loads(program.stdout)
+    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
 
 
 POSE = {

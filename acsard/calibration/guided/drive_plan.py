@@ -29,6 +29,15 @@ class GuideError(AcsardError):
     """The guided drive cannot continue. The text says why and what to do. No file was changed."""
 
 
+class DisturbedError(GuideError):
+    """A leg was cut short by something that may not happen again, so it can be repeated."""
+
+    def __init__(self, why: str, text: str) -> None:
+        """Take the reason alone, and the text for the case that the leg is not repeated."""
+        super().__init__(text)
+        self.why = why
+
+
 class Move(Struct, frozen=True):
     """A command, and the time for which the tool keeps sending it."""
 
@@ -108,6 +117,8 @@ class Leg(Struct, frozen=True):
     """The measurements that the answers give."""
     by_key: bool = False
     """Whether the person ends the last move with a key. Its duration is then a timeout."""
+    placed: bool = False
+    """Whether a person sets the robot for this leg, so that the measurements begin again here."""
 
     @property
     def seconds(self) -> float:

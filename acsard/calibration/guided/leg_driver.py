@@ -13,6 +13,7 @@ from acsard.calibration.guided.drive_plan import Leg
 from acsard.client.commander import NEVER, OPENED_S, OPENING_S, objection
 from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig
+from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.schema import RobotState
 from acsard.core.values import REST, Twist
 
@@ -56,11 +57,18 @@ class LegDriver:
         self.phase = Phase.OPENING
         self.halted = ""
         """The reason why the leg was cut short, or ""."""
+        self.disturbed = False
+        """Whether `halted` is something that may not happen again, so the leg can be repeated."""
+        self.silent = False
+        """Whether `halted` is the silence of the daemon. It is a disturbance if the daemon returns.
+        """
         self._begun = self._received = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
         self._waits = "no state of the daemon has arrived"
         """Why the zeros do not count yet, or ""."""
+        self._starved = f"no command of source {source} has arrived for {OPENING_S:g} s"
+        """Objection of a computer that is too busy to send."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -99,7 +107,8 @@ class LegDriver:
         self._received = now
         why = self._objection(state)
         if state.mode in (*NEVER, "waiting"):
-            self._halt(f"the robot is {state.mode}: {state.reason}")
+            late = state.mode == "waiting" and is_ours(state.reason)
+            self._halt(f"the robot is {state.mode}: {state.reason}", disturbed=late)
         elif state.source not in ("", self._source):
             self._halt(f"{state.source} commands the robot now: end that program, and start again")
         elif self.phase is Phase.OPENING:
@@ -107,7 +116,9 @@ class LegDriver:
         elif state.sender not in ("", self._sender):
             self._halt(why)
         elif self.phase is Phase.MOVING:
-            self._tolerate_briefly(why or self._deviation(state, now), now)
+            deviation = self._deviation(state, now)
+            disturbed = why == self._starved if why else bool(deviation)
+            self._tolerate_briefly(why or deviation, now, disturbed=disturbed)
 
     def wheels(self, fastest: float, now: float) -> None:
         """Handle wheel feedback. `fastest` is the speed of the fastest wheel, rad/s."""
@@ -124,10 +135,12 @@ class LegDriver:
         # braked meanwhile, and the time of a move may be over, so that the next one would begin at
         # the wrong place.
         if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
-            self._halt(HELD_UP)
+            self._halt(HELD_UP, disturbed=True)
         elif now - self._received > QUIET_S:
-            silent = "nothing received from the daemon: does it run?"
-            self._halt(silent if held_up <= QUIET_S / 2 else HELD_UP)
+            late = held_up > QUIET_S / 2
+            self.silent = self.silent or not (late or self.over)
+            silence = "nothing received from the daemon: does it run?"
+            self._halt(HELD_UP if late else silence, disturbed=late)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:
@@ -173,7 +186,7 @@ class LegDriver:
                 "robot, or does an encoder report a speed at rest?"
             )
 
-    def _tolerate_briefly(self, why: str, now: float) -> None:
+    def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
         """Halt the leg if `why` is given for `DEVIATES_S`. "" means that all is well.
 
         A shorter deviation is tolerated: a computer that is busy for a moment sends its commands
@@ -184,7 +197,7 @@ class LegDriver:
         elif self._deviates_since is None:
             self._deviates_since = now
         elif now - self._deviates_since >= DEVIATES_S:
-            self._halt(why)
+            self._halt(why, disturbed=disturbed)
 
     def _objection(self, state: RobotState) -> str:
         """Return why the daemon does not follow the commands of this leg, or ""."""
@@ -193,7 +206,7 @@ class LegDriver:
         # A source with a long timeout still drives the robot when its commands arrive no longer.
         (age,) = [source.age for source in state.sources if source.name == self._source]
         if age is None or age >= OPENING_S:
-            return f"no command of source {self._source} has arrived for {OPENING_S:g} s"
+            return self._starved
         return ""
 
     def _deviation(self, state: RobotState, now: float) -> str:
@@ -221,6 +234,7 @@ class LegDriver:
                 )
         return ""
 
-    def _halt(self, why: str) -> None:
+    def _halt(self, why: str, *, disturbed: bool = False) -> None:
         if not self.over:
             self.phase, self._command, self.halted = Phase.HALTED, REST, why
+            self.disturbed = disturbed

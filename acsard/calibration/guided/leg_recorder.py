@@ -89,13 +89,23 @@ class Recorder:
 def times(samples: Sequence[Sample]) -> Floats:
     """Return the times of the samples of one stream by this computer's clock, s.
 
-    If every sample has a stamp and the delays vary little, the times are the stamps plus the
-    smallest delay. Otherwise they are the times of arrival.
+    They are the times of arrival unless every sample has a stamp.
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
-    if not len(came) or np.isnan(made).any():
-        return came
+    return came if not len(came) or np.isnan(made).any() else on_arrival_clock(came, made)
+
+
+def on_arrival_clock(came: Floats, made: Floats) -> Floats:
+    """Return the times of the samples of one stream by the clock of their arrival, s.
+
+    If the delays vary little, the times are the stamps plus the smallest delay. Otherwise they are
+    the times of arrival.
+
+    Args:
+        came: the times of arrival, s.
+        made: the stamps by the sender's clock, s.
+    """
     delay = came - made
     if float(np.ptp(delay)) > MOST_JITTER_S:
         return came

@@ -138,6 +138,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             (SETTLE, setup.ahead(setup.length), SETTLE),
             (FROM_MARK, *TO_LINE),
             (DISTANCE, Slant("angle", *LINE)),
+            placed=True,
         ),
         Leg(
             "back", "The robot drives back to the middle.", (setup.ahead(-setup.to_middle), SETTLE)
@@ -190,6 +191,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
             (STOP, out, STOP, half, STOP, home, STOP),
             _corners("front"),
             (Slant("angle", *FRONT, plus=side * math.pi),),
+            placed=True,
         )
 
     return (
@@ -205,6 +207,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
                 ),
             ),
             (DISTANCE,),
+            placed=True,
         ),
         once_round(
             setup,
@@ -227,6 +230,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
             (STOP, setup.ahead(OUT_M), STOP, around, STOP, setup.ahead(GAP_M - OUT_M), STOP),
             _corners("rear"),
             (Slant("angle", *REAR),),
+            placed=True,
         ),
     )  # fmt: skip
 
@@ -269,6 +273,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
                 Mean("aside", ("aside",), END_M),
                 Slant("angle", "left", "right", "width"),
             ),
+            placed=True,
         )
 
     return (
@@ -279,6 +284,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
             (STOP, setup.ahead(setup.length), STOP),
             (FROM_MARK,),
             (DISTANCE,),
+            placed=True,
         ),
         once_round(
             setup,

@@ -11,7 +11,7 @@ from typing import Any
 
 import zenoh
 
-from acsard.calibration.guided.drive_plan import GuideError, Leg
+from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
 from acsard.calibration.guided.leg_recorder import Recorder
 from acsard.calibration.runs import Run
@@ -33,6 +33,12 @@ LOOK_S = 0.005
 
 SHOWN_S = 0.2
 """Period in which the progress of a leg is shown, s."""
+
+RETURNS_S = 3.0
+"""Time within which a daemon that fell silent must speak again, s.
+
+If it does, its computer was too busy to run it, and the leg can be repeated.
+"""
 
 POSITIONS = (Odometry, PoseStamped)
 """Types of a position message, in the order in which they are tried.
@@ -114,7 +120,10 @@ class RobotOnBus:
         self._sensors.append((sensor, "place"))
 
     def ride(self, leg: Leg) -> Run:
-        """Drive a leg and return its recording. Raises `GuideError` if the leg was halted."""
+        """Drive a leg and return its recording.
+
+        Raises `GuideError` if the leg was halted; `DisturbedError` if it can be repeated.
+        """
         recorder = Recorder(self._joints)
         self._drain()
         sender = self._client.sender
@@ -130,8 +139,20 @@ class RobotOnBus:
             )
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
-            raise GuideError(f"{driver.halted}{end} The tool commanded zero, and writes nothing")
+            text = f"{driver.halted}{end} The tool commanded zero, and writes nothing"
+            if driver.disturbed or (driver.silent and self._returns()):
+                raise DisturbedError(driver.halted, text)
+            raise GuideError(text)
         return recorder.run()
+
+    def _returns(self) -> bool:
+        """Return whether the daemon, which fell silent, speaks again within `RETURNS_S`."""
+        end = time.monotonic() + RETURNS_S
+        while time.monotonic() < end:
+            if self._watch.look(time.monotonic()):
+                return True
+            time.sleep(LOOK_S)
+        return False
 
     def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
         begun = sent = shown = time.monotonic()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 
-from acsard.calibration.guided.drive_plan import UNITS, Leg, Setup
+from acsard.calibration.guided.drive_plan import UNITS, DisturbedError, Leg, Setup, Slant
 from acsard.calibration.guided.equipment import NEEDS
 from acsard.calibration.guided.methods import METHODS, STRAIGHT
 from acsard.calibration.guided.tape_calibration import calibrated
@@ -16,15 +16,49 @@ from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.tape_distance import LEAST_M, Tape
 from acsard.terminal.prompt import Ask, Prompt
 
+MOST_REPEATS = 2
+"""Number of times that a disturbed leg is repeated on a real robot."""
 
-def guide(name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run]) -> Calibration:
+MOST_SIMULATED_REPEATS = 20
+"""Number of times on the simulator, which no floor limits and no person has to set back."""
+
+
+def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
+    """Return the index of the leg from which the drive goes on after a disturbance.
+
+    A sensor measures each leg alone. Tape readings belong together from the leg for which a person
+    sets the robot. A leg that is measured from the angle after the leg before it can begin again by
+    itself, if the person measures that angle anew.
+
+    Args:
+        legs: the legs of the method.
+        number: the index of the disturbed leg.
+        sensor: whether a sensor measures instead of a person.
+    """
+    if sensor or angle_before(legs[number]):
+        return number
+    return max(at for at in range(number + 1) if legs[at].placed or at == 0)
+
+
+def angle_before(leg: Leg) -> str:
+    """Return the leg after which the angle was measured that this leg alone adds to, or ""."""
+    slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
+    return next((slant.since for slant in slants if slant.since and not slant.over), "")
+
+
+def guide(
+    name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run], *, simulated: bool = False
+) -> Calibration:
     """Lead a person through a method of calibration, and return the result.
+
+    A leg that was disturbed is repeated, twice at most, after the person has set the robot back.
 
     Args:
         name: the name of the method, a key of `METHODS`.
         setup: the robot and the speeds and lengths of its drive.
         prompt: asks the person.
         ride: drives one leg and returns its recording.
+        simulated: whether the robot is the built-in simulator.
 
     Raises:
         GuideError: the drive cannot continue.
@@ -36,31 +70,59 @@ def guide(name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run]) -
     longest = method.longest_s(setup)
     prompt.say(
         f"Calibration with {NEEDS[name]}. The robot drives for at most {longest:.0f} "
-        "s in all. Stay near the robot: any key stops it at once."
+        "s in all. If a leg is disturbed, it is driven again. Stay near the robot: any key stops "
+        "it at once."
     )
     rides: dict[str, Run] = {}
     answers: Answers = {}
-    readings: list[Reading] = []
+    readings: dict[str, list[Reading]] = {}
     # The legs are computed again after each leg: those that depend on the effective track come
     # after the measurement that shows it.
     track, number = 1.0, 0
+    repeats: dict[str, int] = {}
+    most = MOST_SIMULATED_REPEATS if simulated else MOST_REPEATS
 
     def ask_for(leg: str, asks: tuple[Ask, ...]) -> None:
         for ask in asks:
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
+    def repeat(disturbed: DisturbedError) -> int:
+        """Prepare the repetition of the present leg, and return the index of the leg to begin."""
+        leg = legs[number]
+        repeats[leg.name] = repeats.get(leg.name, 0) + 1
+        if repeats[leg.name] > most:
+            raise disturbed
+        again = begins_again(legs, number, sensor=not method.tool)
+        back = "" if simulated else ": set the robot back where it stood when that leg began"
+        prompt.say(
+            f"Leg {number + 1} was disturbed: {disturbed.why}. The drive goes on with leg "
+            f"{again + 1}{back}."
+        )
+        if method.tool and again == number and (since := angle_before(leg)):
+            (before,) = [one for one in legs if one.name == since]
+            ask_for(since, before.asks)
+        return again
+
     ask_for("", method.asks)
     while number < len(legs := method.legs(setup, track)):
-        leg, number = legs[number], number + 1
-        prompt.start(f"{number}. {leg.words} ({leg.seconds:.0f} s)", leg.by_key)
-        rides[leg.name] = ride(leg)
+        leg = legs[number]
+        prompt.start(f"{number + 1}. {leg.words} ({leg.seconds:.0f} s)", leg.by_key)
+        try:
+            rides[leg.name] = ride(leg)
+        except DisturbedError as error:
+            number = repeat(error)
+            continue
+        number += 1
         ask_for(leg.name, leg.asks)
+        readings[leg.name] = []
         for measure in leg.measures:
-            readings.append(reading(measure, leg.name, rides, answers))
+            made = reading(measure, leg.name, rides, answers)
+            readings[leg.name].append(made)
             if measure.quantity == "turned":
-                track = track_ratio(readings[-1], setup.drive)
+                track = track_ratio(made, setup.drive)
     if method.tool:
-        return calibrated(method.tool, readings, setup.drive)
+        taken = [made for leg in legs for made in readings[leg.name]]
+        return calibrated(method.tool, taken, setup.drive)
     metres = answers.get((STRAIGHT, "metres"), 0.0)
     tape = Tape(metres, STRAIGHT) if metres >= LEAST_M else None
     log = Log(tuple(replace(run, name=name) for name, run in rides.items()), ())

@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from mcap.writer import Writer
+from mcap.writer import CompressionType
 
 from acsard.cli import parser
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
+from tests.pages import blocks
+from tests.unit.calibration.bags import (
+    PERIOD_S,
+    imu,
+    in_order,
+    joint_states,
+    write_bag,
+    write_mcap,
+)
 from tests.unit.calibration.cut import usual
+from tests.unit.calibration.robots import GUIDED
 
 GOOD = usual().csv(places=False)
 
@@ -120,25 +134,139 @@ def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
         args.main(args)
 
 
-@pytest.mark.parametrize("what", ["a bag", "an MCAP of others"])
-def test_what_ros_records_is_told_to_be_exported(
-    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+# ROS 2 bags
+
+
+def of_bag(where: Path, log: Path, *words: str) -> int:
+    """Return the exit code of `acsard calibrate --json --log` with a bag."""
+    (where / "acsard.toml").write_text("")
+    given = ["calibrate", "--json", "--log", str(log), "--config", str(where / "acsard.toml")]
+    args = parser(["calibrate"]).parse_args([*given, *words])
+    return int(args.main(args))
+
+
+@pytest.mark.parametrize("form", ["directory", "file"])
+def test_a_bag_that_another_library_wrote_is_read(
+    form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = tmp_path / "bag"
-    if what == "a bag":
-        log.mkdir()
-    else:
-        with log.open("wb") as stream:
-            writer = Writer(stream)
-            writer.start("ros2", "libmcap")
-            schema = writer.register_schema("nav_msgs/msg/Odometry", "ros2msg", b"")
-            channel = writer.register_channel("/odom", "cdr", schema)
-            writer.add_message(channel, 1, b"\0\1\0\0", 1)
-            writer.finish()
-    args = parser(["calibrate"]).parse_args(["calibrate", "--json", "--log", str(log)])
-    with pytest.raises(MendableError, match="export it as CSV"):
-        args.main(args)
-    assert "export it as CSV" in json.loads(capsys.readouterr().out)["refused"]
+    log = write_bag(tmp_path / "bag", usual())
+    if form == "file":
+        (log,) = log.glob("*.mcap")
+    assert of_bag(tmp_path, log) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["reference"] == "yaw_rate and positions"
+    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
+    assert found["notes"][0].startswith("used: the wheels from /joint_states (JointState)")
+
+
+def test_the_options_of_a_bag_choose_its_sensor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write_bag(tmp_path / "bag", usual())
+    assert of_bag(tmp_path, log, "--topic", "/imu/data", "--yaw-axis=z") == 0
+    assert json.loads(capsys.readouterr().out)["reference"] == "yaw_rate"
+    with pytest.raises(MendableError, match="no topic /imu to use"):
+        of_bag(tmp_path, log, "--topic", "/imu")
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(
+    compression: CompressionType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = usual(plan=GUIDED[:10])
+    log = write_mcap(tmp_path / "bag.mcap", in_order(joint_states(seen), imu(seen)), compression)
+    log.write_bytes(log.read_bytes()[: log.stat().st_size * 8 // 10])
+    assert of_bag(tmp_path, log) == 0
+    assert "bag.mcap has no end" in json.loads(capsys.readouterr().out)["notes"][0]
+
+
+def test_the_files_of_a_bag_are_one_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seen = usual(plan=GUIDED[:10])
+    messages = in_order(joint_states(seen), imu(seen))
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    for number in range(12):
+        part = messages[number * len(messages) // 12 : (number + 1) * len(messages) // 12]
+        write_mcap(bag / f"bag_{number}.mcap", part)
+    assert of_bag(tmp_path, bag) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["runs"] == 1
+    assert found["seconds"] == pytest.approx(seen.t[-1], abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "why"),
+    [
+        ("bag_0.db3", b"SQLite format 3\0" + bytes(100), "ros2 bag convert"),
+        ("drive.bag", b"#ROSBAG V2.0\n" + bytes(100), "rosbags-convert"),
+        ("bag_0.mcap.zstd", b"\x28\xb5\x2f\xfd" + bytes(100), "zstd -d"),
+    ],
+)
+def test_another_kind_of_bag_is_told_with_the_command_that_converts_it(
+    name: str, data: bytes, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / name).write_bytes(data)
+    for log in (tmp_path / "bag", tmp_path / "bag" / name):
+        with pytest.raises(MendableError, match=why):
+            of_bag(tmp_path, log)
+    assert "deploy/calibration/README.md" in capsys.readouterr().out
+
+
+def test_a_directory_that_is_no_bag_is_told(tmp_path: Path) -> None:
+    with pytest.raises(MendableError, match="directory without an MCAP file"):
+        of_bag(tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize("word", ["--topic=/imu", "--yaw-axis=x"])
+def test_the_options_of_a_bag_are_refused_for_a_csv_file(word: str, tmp_path: Path) -> None:
+    with pytest.raises(MendableError, match="choose within a ROS 2 bag, and this is none"):
+        called(tmp_path, GOOD, word)
+
+
+# the converters of deploy/calibration/README.md
+
+
+def converted(name: str, where: Path, *words: str) -> str:
+    """Return the CSV file that a converter of the page makes, run as the page says."""
+    (script,) = (block.text for block in blocks("python") if f"# {name}:" in block.text)
+    (where / name).write_text(script)
+    command = [sys.executable, name, *words, "drive.csv"]
+    done = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return (where / "drive.csv").read_text()
+
+
+@pytest.mark.parametrize("sqlite", [False, True])
+def test_the_page_s_converter_makes_a_log_of_a_bag(
+    sqlite: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bag(tmp_path / "drive", usual(), sqlite=sqlite)
+    assert called(tmp_path, converted("bag_to_csv.py", tmp_path, "drive"), "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["reference"] == "yaw_rate and positions"
+    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
+
+
+def test_the_page_s_converter_makes_a_log_of_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = usual()
+    rows = [(t, f"{t:.6f},,,{rate:.6f}") for t, rate in zip(seen.gyro_t, seen.gyro, strict=True)]
+    per_rad = 1440 / math.tau
+    left, right = (
+        (65000 + np.floor(np.cumsum(side) * PERIOD_S * per_rad)) % 65536
+        for side in (seen.left, seen.right)
+    )
+    rows += [
+        (t, f"{t + PERIOD_S / 2:.6f},{a:.0f},{b:.0f},")
+        for t, a, b in zip(seen.t, left, right, strict=True)
+    ]
+    text = "\n".join(["t,left_counts,right_counts,yaw_rate", *(row for _, row in sorted(rows))])
+    (tmp_path / "counts.csv").write_text(text + "\n")
+    assert called(tmp_path, converted("counts_to_csv.py", tmp_path, "counts.csv"), "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
 
 
 @pytest.mark.parametrize("word", ["0", "nan", "a=b", "-3", "1e9"])
@@ -170,6 +298,8 @@ def driving(*words: str) -> int:
         (["--log", "drive.csv", "--imu", "imu"], "--imu is for a guided drive"),
         (["--method", "tape", "--imu", "imu"], "--imu is for --method gyro, not for --method tape"),
         (["--positions", "sim/pose", "--imu", "x/imu"], "not for --positions"),
+        (["--topic", "/imu"], "--topic and --yaw-axis go with --log"),
+        (["--yaw-axis=x"], "--topic and --yaw-axis go with --log"),
         (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
         (["--log", "drive.csv", "--json-lines"], "--json-lines is for a guided drive"),
         (["--yes", "--json-lines"], "--json-lines asks them through a program"),

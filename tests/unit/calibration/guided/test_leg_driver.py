@@ -12,6 +12,7 @@ from acsard.calibration.guided.leg_driver import HELD_UP, LegDriver, Phase
 from acsard.client.commander import OPENED_S
 from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig
+from acsard.core.link.link_diagnosis import HOST
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import REST, Twist
 from tests.each import each
@@ -133,6 +134,27 @@ def of_two(leg: Leg, sender: str) -> World:
     return world
 
 
+PASSING = {
+    "no command of source app has arrived for 0.4 s", "although 0.30 is commanded",
+    "sends no feedback",
+}  # fmt: skip
+"""The stops of `STOPS` that may not happen again."""
+
+
+@each("why", sorted(STOPS))
+def test_only_a_passing_disturbance_lets_a_leg_be_repeated(why: str) -> None:
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving().run(2.0)
+    world.tells = STOPS[why]
+    assert world.run(2.0).driver.halted
+    assert world.driver.disturbed == (why in PASSING)
+
+
+def test_a_link_that_was_lost_because_this_computer_did_not_run_is_such_a_disturbance() -> None:
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
+    world.tells = changed(mode="waiting", reason=f"{HOST} 0.4 s")
+    assert world.run(1.0).driver.disturbed
+
+
 def test_of_two_calibrations_the_one_that_is_followed_goes_on() -> None:
     assert of_two(LEG, US).run(5.0).driver.phase is Phase.DONE
 
@@ -163,12 +185,15 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
     assert world.driver.halted == "nothing received from the daemon: does it run?"
+    assert world.driver.silent
+    assert not world.driver.disturbed
 
 
 def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     assert world.driver.step(world.now + QUIET_S + TICK) == REST
     assert world.driver.halted == HELD_UP
+    assert world.driver.disturbed
 
 
 def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> None:
@@ -189,6 +214,7 @@ def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
     world.now += 1.5
     world.driver.key(" ", world.now)
     assert world.driver.halted == HELD_UP
+    assert not world.driver.disturbed  # the person may have wanted it to stop
 
 
 def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:

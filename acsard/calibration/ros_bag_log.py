@@ -1,0 +1,552 @@
+"""Builds the table of a log from the messages of a ROS 2 bag.
+
+The wheels come from a `JointState`, the turn rates from an `Imu`, and the positions from a
+`PoseStamped` or an `Odometry`. The types choose the topics. If several topics fit, or if a topic
+should not be used, the user names the topics with `--topic`.
+
+An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. So it is
+used only if the user names it, or if the bag has no other reference. In the second case it is
+refused if it turns exactly as the wheels do.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from array import array
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.calibration.guided.leg_recorder import on_arrival_clock
+from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table, bounded, spikes
+from acsard.calibration.runs import RESTART_S
+from acsard.calibration.wheel_angles import cumulative, gaps
+from acsard.core.formatting import many, printable
+from acsard.core.messages.encodings import DecodeError, decode_cdr
+from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Quaternion
+from acsard.core.values import NS_PER_S
+
+TYPES: dict[str, type[JointState | Imu | Odometry | PoseStamped]] = {
+    "sensor_msgs/msg/JointState": JointState,
+    "sensor_msgs/msg/Imu": Imu,
+    "nav_msgs/msg/Odometry": Odometry,
+    "geometry_msgs/msg/PoseStamped": PoseStamped,
+}
+"""The types that are read, by their ROS name."""
+
+REFERENCES = "a gyro (sensor_msgs/msg/Imu) or positions (geometry_msgs/msg/PoseStamped)"
+
+PAGE = "deploy/calibration/README.md"
+
+AXES = ("z", "-z", "x", "-x", "y", "-y")
+"""Axes of an IMU that may point up. `-x` means that x points down."""
+
+LEAST_MESSAGES = 20
+"""Smallest number of messages with which a topic is a candidate."""
+
+CLOCKS_APART_S = 1.0
+"""Difference between the delays of two topics above which their stamps are of different clocks.
+
+The delay of a topic is the median time from the stamp of a message to its recording.
+"""
+
+STEP_S = 1.0
+"""Length of the intervals in which the turns of a sensor and of the wheels are compared, s."""
+
+UPRIGHT, LYING = 0.5, 0.8
+"""Correlations with the turns of the wheels.
+
+If that of the axis in use is below `UPRIGHT` and that of another axis above `LYING`, the other axis
+points up or down.
+"""
+
+OWN = 3e-3
+"""Share of the turns by which an odometry that was computed from the wheels differs from them."""
+
+DELAYS_S = np.arange(-0.1, 0.101, 0.01)
+"""Delays of an odometry that are tried in the comparison with the wheels, s."""
+
+
+class RosMessage(NamedTuple):
+    """A message of a bag as it was recorded."""
+
+    topic: str
+    type: str
+    """ROS name of the type, such as `nav_msgs/msg/Odometry`."""
+    encoding: str
+    """Encoding of the data; ROS 2 uses `cdr`."""
+    wall_ns: int
+    """Time at which the message was recorded, ns since 1970."""
+    data: bytes
+
+
+class Choice(Struct, frozen=True):
+    """The topics and the axis that the user chose."""
+
+    topics: tuple[str, ...] = ()
+    """The topics to use. () means that the types decide."""
+    axis: str = ""
+    """The axis of the IMU that points up, one of `AXES`; "" means z."""
+
+
+class _Topic:
+    """The samples of one topic."""
+
+    def __init__(self, name: str, type_: str) -> None:
+        self.name, self.type = name, type_
+        self.kind = TYPES[type_]
+        self.came, self.made, self.values = array("q"), array("q"), array("d")
+        self.wheels: tuple[str, ...] = ()
+        """For a `JointState`: the columns of the log that its joints give."""
+        self.joints: set[str] = set()
+        self.unreadable, self.why = 0, ""
+
+    def __len__(self) -> int:
+        return len(self.came)
+
+    def __str__(self) -> str:
+        return f"{printable(self.name)} ({self.kind.__name__})"
+
+    def take(self, message: RosMessage, joints: Sequence[str]) -> None:
+        """Add a message. `joints` has the configured joints of the wheels."""
+        if message.encoding != "cdr":
+            self._refuse(f"it is encoded as {message.encoding or 'nothing'}, not as cdr")
+            return
+        try:
+            decoded: Any = decode_cdr(self.kind, message.data)
+        except DecodeError as error:
+            self._refuse(str(error))
+            return
+        values = self._values(decoded, joints)
+        if values:
+            self.came.append(message.wall_ns)
+            self.made.append(decoded.header.stamp.to_ns())
+            self.values.extend(values)
+
+    def _refuse(self, why: str) -> None:
+        self.unreadable += 1
+        self.why = self.why or why
+
+    def _values(self, message: Any, joints: Sequence[str]) -> Sequence[float]:
+        match message:
+            case JointState():
+                return self._joints(message, joints)
+            case Imu():
+                if message.angular_velocity_covariance[0] == -1.0:
+                    return ()
+                rate = message.angular_velocity
+                return rate.x, rate.y, rate.z
+            case Odometry():
+                pose = message.pose.pose
+            case _:
+                pose = message.pose
+        return pose.position.x, pose.position.y, _yaw(pose.orientation)
+
+    def _joints(self, message: JointState, joints: Sequence[str]) -> Sequence[float]:
+        """Return the angles and then the speeds of the columns; NaN for what is not there."""
+        columns = wheel_joints(tuple(message.name), tuple(joints))
+        self.joints.update(message.name[:8])
+        self.wheels = self.wheels or tuple(columns)
+        if not columns or tuple(columns) != self.wheels:
+            return ()
+        return [
+            sum(numbers[at] for at in indices) / len(indices)
+            if len(numbers) == len(message.name)
+            else math.nan
+            for numbers in (message.position, message.velocity)
+            for indices in columns.values()
+        ]
+
+    def columns(self) -> Floats:
+        """Return the values, one row for each message."""
+        return np.frombuffer(self.values).reshape(len(self), -1)
+
+    def seconds(self, times: array[int], since_ns: int) -> Floats:
+        return (np.frombuffer(times, dtype=np.int64) - since_ns) / NS_PER_S
+
+    @property
+    def stamped(self) -> bool:
+        return all(self.made)
+
+
+def _yaw(turn: Quaternion) -> float:
+    """Return the yaw of a rotation, rad; NaN for a quaternion of zeros."""
+    size = turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2
+    if not size:
+        return math.nan
+    return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), size - 2 * (turn.y**2 + turn.z**2))
+
+
+_SHORT = {
+    "fl": ("fl", "lf"), "fr": ("fr", "rf"), "rl": ("rl", "lr", "bl", "lb"),
+    "rr": ("rr", "br", "rb"), "left": ("l",), "right": ("r",),
+}  # fmt: skip
+"""Abbreviations in the names of joints, by the column of the log."""
+
+_COLUMN = {word: column for column, words in _SHORT.items() for word in words}
+
+_NO_WHEEL = ("caster", "castor", "steer")
+
+
+def wheel_of(joint: str) -> str:
+    """Return the column that the name of a joint shows, such as "fl" or "left", or ""."""
+    name = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint).lower()
+    if any(word in name for word in _NO_WHEEL):
+        return ""
+    sides = [side for side in TWO if side in name]
+    if len(sides) == 1:
+        end = "f" if "front" in name else "r" if "rear" in name or "back" in name else ""
+        return end + sides[0][0] if end else sides[0]
+    short = [_COLUMN[word] for word in re.findall("[a-z]+", name) if word in _COLUMN]
+    return short[0] if len(short) == 1 and not sides else ""
+
+
+@cache
+def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, list[int]]:
+    """Return the indices of the wheels' joints by the column of the log; empty if a side lacks.
+
+    Args:
+        names: the joints of a message.
+        joints: the joints of the configuration, in the order of `FOUR`.
+    """
+    if set(joints) <= set(names):
+        return {column: [names.index(joint)] for column, joint in zip(FOUR, joints, strict=True)}
+    wheels = [name for name in names if "wheel" in name.lower()] or names
+    found: dict[str, list[int]] = {}
+    for name in wheels:
+        if column := wheel_of(name):
+            found.setdefault(column, []).append(names.index(name))
+    if found.keys() == set(FOUR) and all(len(indices) == 1 for indices in found.values()):
+        return {column: found[column] for column in FOUR}
+    sides: dict[str, list[int]] = {side: [] for side in TWO}
+    for column, indices in found.items():
+        sides["left" if column[-1] == "l" or column == "left" else "right"] += indices
+    return sides if all(sides.values()) else {}
+
+
+def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice) -> Table:
+    """Return the log in the messages of a bag. Raises `LogError`.
+
+    `joints` has the configured joints of the wheels, in the order of `FOUR`.
+    """
+    topics: dict[str, _Topic] = {}
+    others: dict[str, str] = {}
+    for message in messages:
+        type_ = message.type if "/msg/" in message.type else message.type.replace("/", "/msg/", 1)
+        if type_ not in TYPES:
+            others[message.topic] = message.type
+            continue
+        topic = topics.setdefault(message.topic, _Topic(message.topic, type_))
+        if topic.type == type_:
+            topic.take(message, joints)
+    return _Log(list(topics.values()), others, joints, choice).table()
+
+
+class _Log:
+    """The topics of a bag, and the table that is built from those in use."""
+
+    def __init__(
+        self, topics: list[_Topic], others: dict[str, str], joints: Sequence[str], choice: Choice
+    ) -> None:
+        self._topics, self._others, self._joints, self._choice = topics, others, joints, choice
+        self._axis = choice.axis or "z"
+        self._notes: list[str] = []
+
+    def table(self) -> Table:
+        wheels, gyro, places = self._chosen()
+        used = [topic for topic in (wheels, gyro, places) if topic is not None]
+        for topic in used:
+            if topic.unreadable:
+                self._notes.append(
+                    f"{many(topic.unreadable, 'message')} of {topic} left out: {topic.why}"
+                )
+        times = dict(zip((topic.name for topic in used), self._times(used), strict=True))
+        parts = [self._wheels(wheels, times[wheels.name])]
+        sides = _sides(parts[0])
+        if gyro is not None:
+            parts.append(self._gyro(gyro, times[gyro.name], sides))
+        if places is not None:
+            parts.append(self._places(places, times[places.name], sides))
+        if self._choice.axis and gyro is None:
+            raise LogError("--yaw-axis is the axis of an IMU, but no IMU is used: leave it out")
+        roles = [f"the wheels from {wheels}"]
+        roles += [f"the turn rates from {gyro} about its {self._axis} axis"] if gyro else []
+        roles += [f"the positions from {places}"] if places else []
+        return _joined(parts, (f"used: {', '.join(roles)}", *self._notes))
+
+    # Choice of the topics
+
+    def _chosen(self) -> tuple[_Topic, _Topic | None, _Topic | None]:
+        """Return the topics of the wheels, of the gyro and of the positions."""
+        names = self._choice.topics
+        known = {topic.name: topic for topic in self._topics}
+        for name in names:
+            if name not in known:
+                raise LogError(f"it has no topic {printable(name)} to use. {self._listed()}")
+        of = {
+            kind: [topic for topic in self._topics if topic.kind is kind]
+            for kind in TYPES.values()
+        }  # fmt: skip
+        wheels = self._one("the wheels", [topic for topic in of[JointState] if topic.wheels])
+        if wheels is None:
+            raise LogError(self._no_wheels(of[JointState]))
+        free = not any(known[name].kind is not JointState for name in names)
+        gyro = self._one("the turn rates", of[Imu], free=free)
+        places = self._one("the positions", of[PoseStamped] if free else
+                           [*of[PoseStamped], *of[Odometry]], free=free)  # fmt: skip
+        if free and places is None:
+            odometry = [topic for topic in of[Odometry] if len(topic) >= LEAST_MESSAGES]
+            if gyro is None:
+                places = self._one("the positions", odometry)
+            elif odometry:
+                name = printable(odometry[0].name)
+                self._notes.append(
+                    f"{', '.join(map(str, odometry))} not used: most odometry is computed from "
+                    "the wheels. If it comes from a sensor of its own, such as SLAM or motion "
+                    f"capture, name the topics to compare: --topic {printable(gyro.name)} "
+                    f"--topic {name}"
+                )
+        if gyro is None and places is None:
+            raise LogError(
+                f"it has nothing with which to compare the wheels: record {REFERENCES} as well. "
+                f"{self._listed()}"
+            )
+        return wheels, gyro, places
+
+    def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
+        """Return the only topic that fits, or None. A named topic comes before all others."""
+        named = [topic for topic in fit if topic.name in self._choice.topics]
+        for topic in named:
+            if len(topic) < LEAST_MESSAGES:
+                raise LogError(_too_few(topic))
+        if not named and not free:
+            return None
+        candidates = named or [topic for topic in fit if len(topic) >= LEAST_MESSAGES]
+        if len(candidates) > 1:
+            names = ", ".join(map(str, candidates))
+            raise LogError(
+                f"several topics can be {what}: {names}; choose one, for example with "
+                f"--topic {printable(candidates[0].name)}"
+                + (" (then also name each other sensor to use)" if what != "the wheels" else "")
+            )
+        if not candidates and (few := [topic for topic in fit if topic.unreadable]):
+            raise LogError(_too_few(few[0]))
+        return candidates[0] if candidates else None
+
+    def _no_wheels(self, states: Sequence[_Topic]) -> str:
+        for topic in states:
+            if not topic.wheels and topic.joints:
+                names = ", ".join(printable(name) for name in sorted(topic.joints)[:8])
+                return (
+                    f"no joint of {topic} is known as a wheel of the left and one of the right "
+                    f"side: its joints are {names}. Write those of the wheels into [joints] of the "
+                    f"configuration, or convert the bag as {PAGE} shows"
+                )
+            if topic.unreadable or topic.wheels:
+                return _too_few(topic)
+        return (
+            "it has no wheel angles: record a topic of type sensor_msgs/msg/JointState with the "
+            f"wheels' joints. {self._listed()}"
+        )
+
+    def _listed(self) -> str:
+        shown = [str(topic) for topic in self._topics]
+        shown += [f"{printable(name)} ({printable(kind)})" for name, kind in self._others.items()]
+        if not shown:
+            return "It has no message at all"
+        return f"Its topics: {', '.join(shown[:20])}{', ...' if len(shown) > 20 else ''}"
+
+    # Times
+
+    def _times(self, used: Sequence[_Topic]) -> list[Floats]:
+        """Return the times of each topic's samples by one clock, s."""
+        since_ns = min(topic.came[0] for topic in used)
+        came = [topic.seconds(topic.came, since_ns) for topic in used]
+        made = [topic.seconds(topic.made, since_ns) for topic in used]
+        for topic, stamps in zip(used, made, strict=True):
+            back = float(np.diff(stamps).min(initial=0.0))
+            if topic.stamped and back < -RESTART_S:
+                raise LogError(
+                    f"the stamps of {topic} go back by {-back:.0f} s in the middle, because a "
+                    "simulation or a played bag began again: record each drive in its own bag"
+                )
+        start = since_ns / NS_PER_S
+        if all(topic.stamped for topic in used):
+            delays = [float(np.median(c - m)) for c, m in zip(came, made, strict=True)]
+            apart = max(delays) - min(delays)
+            if apart <= CLOCKS_APART_S:
+                return [stamps + start for stamps in made]
+            self._notes.append(
+                f"the stamps of the topics are of different clocks, {apart:.3g} s apart: each "
+                "topic's are moved to the clock of the recording"
+            )
+        return [
+            (on_arrival_clock(c, m) if topic.stamped else c) + start
+            for topic, c, m in zip(used, came, made, strict=True)
+        ]
+
+    # Columns
+
+    def _wheels(self, topic: _Topic, t: Floats) -> dict[str, Floats]:
+        count = len(topic.wheels)
+        angles, speeds = topic.columns()[:, :count], topic.columns()[:, count:]
+        held = angles[np.isfinite(angles).all(axis=1)]
+        if len(held) and np.any(np.ptp(held, axis=0) > 0.0):
+            t, speeds = speeds_of(t, angles)
+        elif not np.any(np.abs(speeds) > 0.0):
+            raise LogError(
+                f"{topic} has no position and no velocity that changes: its publisher leaves both "
+                "empty, or the wheels stood still. Record the wheels while the robot drives"
+            )
+        return {"t": t} | dict(zip(topic.wheels, speeds.T, strict=True))
+
+    def _gyro(
+        self, topic: _Topic, t: Floats, sides: tuple[Floats, Floats, Floats]
+    ) -> dict[str, Floats]:
+        rates, axis = topic.columns(), self._axis
+        sign, used = (-1.0 if axis[0] == "-" else 1.0), "xyz".index(axis[-1])
+        follow = np.nan_to_num([_follows(t, rates[:, at], sides) for at in range(3)])
+        best = int(np.argmax(np.abs(follow)))
+        if abs(follow[used]) < UPRIGHT and abs(follow[best]) > LYING:
+            up = "-" * bool(follow[best] < 0.0) + "xyz"[best]
+            raise LogError(
+                f"the {axis[-1]} axis of {topic} does not follow the turns of the wheels, but its "
+                f"{'xyz'[best]} axis does: the IMU lies on its side. Give --yaw-axis={up}"
+            )
+        return {"t": t, "yaw_rate": sign * rates[:, used]}
+
+    def _places(
+        self, topic: _Topic, t: Floats, sides: tuple[Floats, Floats, Floats]
+    ) -> dict[str, Floats]:
+        x, y, yaw = topic.columns().T
+        named = topic.name in self._choice.topics
+        if topic.kind is Odometry and not named and _computed_from(t, yaw, sides):
+            raise LogError(
+                f"{topic} turns exactly as the wheels do, so it was computed from them and cannot "
+                f"show their errors: record {REFERENCES}. If it comes from a sensor, give --topic "
+                f"{printable(topic.name)}"
+            )
+        turns = np.isfinite(yaw)
+        # A source of positions without an orientation repeats one.
+        return {"t": t, "x": x, "y": y} | (
+            {"yaw": yaw} if turns.any() and float(np.ptp(yaw[turns])) > 0.0 else {}
+        )
+
+
+def _too_few(topic: _Topic) -> str:
+    if topic.unreadable > len(topic):
+        return f"the messages of {topic} cannot be read: {topic.why}"
+    return (
+        f"{topic} has only {many(len(topic), 'message')} with a value: record it while the robot "
+        "drives"
+    )
+
+
+def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
+    """Return the speeds of wheels whose angles were recorded, with their times.
+
+    The mean of the speed over each period keeps the angle exactly: the sum of all steps is the
+    whole angle, however the times of the samples vary. No speed is computed across a gap, or across
+    a jump, at which a driver began again at 0.
+
+    Args:
+        t: the times, s.
+        angles: the angles, one column for each wheel, rad.
+    """
+    whole = np.isfinite(angles).all(axis=1)
+    times, first = np.unique(t[whole], return_index=True)
+    angles = np.column_stack([_unwrapped(column) for column in angles[whole][first].T])
+    if len(times) < 2:
+        return times[:0], angles[:0]
+    period = float(np.median(np.diff(times)))
+    steps = np.diff(angles, axis=0) / np.maximum(np.diff(times), period)[:, None]
+    order = np.arange(len(steps))
+    cut = np.any([spikes(column, order) for column in steps.T], axis=0)
+    cut |= np.isin(times[:-1], gaps(times)[:, 0])
+    found_t, found = [], []
+    for part in np.split(np.arange(len(times)), np.flatnonzero(cut) + 1):
+        if len(part) < 2:
+            continue
+        begin, end = times[part[0]], times[part[-1]]
+        edges = np.linspace(begin, end, max(1, round((end - begin) / period)) + 1)
+        sampled = [np.interp(edges, times[part], column[part]) for column in angles.T]
+        found_t.append((edges[1:] + edges[:-1]) / 2)
+        found.append(np.column_stack([np.diff(column) / np.diff(edges) for column in sampled]))
+    return np.concatenate(found_t), np.concatenate(found)
+
+
+def _unwrapped(angles: Floats) -> Floats:
+    """Return angles without jumps of a whole turn, if they are all within one turn."""
+    jumps = np.abs(np.diff(angles)).max(initial=0.0) > np.pi
+    within = float(np.ptp(angles)) <= 2 * np.pi + 1e-3 if len(angles) else False
+    return np.unwrap(angles) if jumps and within else angles
+
+
+def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
+    """Return the times of the wheels, and the angles of the left and of the right side."""
+    t = wheels["t"]
+    left, right = (
+        np.mean([wheels[name] for name in wheels if name in names], axis=0)
+        for names in (("left", "fl", "rl"), ("right", "fr", "rr"))
+    )
+    return t, _summed(t, left), _summed(t, right)
+
+
+def _summed(t: Floats, rates: Floats) -> Floats:
+    return cumulative(np.nan_to_num((rates[1:] + rates[:-1]) / 2 * np.diff(t)))
+
+
+def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
+    wheels = sides[0]
+    if not len(t) or not len(wheels):
+        return np.zeros(0)
+    return np.arange(max(t.min(), wheels[0]), min(t.max(), wheels[-1]), STEP_S)
+
+
+def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
+    """Return the correlation of a sensor's turns with those of the wheels; NaN if unknown."""
+    order = np.argsort(t, kind="stable")
+    edges = _edges(t, sides)
+    if len(edges) < 4:
+        return math.nan
+    shown = np.diff(np.interp(edges, t[order], _summed(t[order], rates[order])))
+    wheels, left, right = sides
+    turned = np.diff(np.interp(edges, wheels, right - left))
+    if not np.ptp(shown) or not np.ptp(turned):
+        return math.nan
+    return float(np.corrcoef(shown, turned)[0, 1])
+
+
+def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
+    """Return whether a yaw is computed from these wheels, so that it differs by less than `OWN`."""
+    held = np.isfinite(yaw)
+    order = np.argsort(t[held], kind="stable")
+    times, angle = t[held][order], np.unwrap(yaw[held][order])
+    edges = _edges(times, sides)[1:-1]
+    if len(edges) < 4:
+        return False
+    wheels, left, right = sides
+    rolled = np.column_stack([np.diff(np.interp(edges, wheels, side)) for side in (left, right)])
+    for delay in DELAYS_S:
+        turned = np.diff(np.interp(edges + delay, times, angle))
+        off = turned - rolled @ np.linalg.lstsq(rolled, turned, rcond=None)[0]
+        if float(off @ off) <= OWN**2 * float(turned @ turned):
+            return True
+    return False
+
+
+def _joined(parts: Sequence[dict[str, Floats]], notes: Sequence[str]) -> Table:
+    """Return the table in which each sample of each sensor is a row, in order of time."""
+    counts = [len(part["t"]) for part in parts]
+    columns = {name: np.full(sum(counts), math.nan) for part in parts for name in part}
+    for begin, part in zip(np.cumsum([0, *counts]), parts, strict=False):
+        for name, values in part.items():
+            columns[name][begin : begin + len(values)] = values
+    order = np.argsort(columns["t"], kind="stable")
+    columns = {name: values[order] for name, values in columns.items()}
+    runs = np.zeros(len(order), dtype=np.int64)
+    return Table(columns, runs, ("",), (*notes, *bounded(columns)))

@@ -1,0 +1,181 @@
+"""ROS 2 bags of simulated drives: their messages, and files that the library rosbags writes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
+
+from acsard.calibration.ros_bag_log import TYPES, RosMessage
+from acsard.core.messages.encodings import encode
+from tests.unit.calibration.robots import RADIUS, SEPARATION, Drive, Floats
+
+START_NS = 1_700_000_000_000_000_000
+JOINTS = ("wheel_left_joint", "wheel_right_joint")
+NAMES = {cls: name for name, cls in TYPES.items()}
+PERIOD_S = 0.01
+
+
+def message(topic: str, kind: str, at: float, *, came: float | None = None, **fields: object
+            ) -> RosMessage:  # fmt: skip
+    """Return a message that was made at `at` and recorded at `came`, s since the start."""
+    made_ns = START_NS + round(at * 1e9)
+    wall_ns = made_ns if came is None else START_NS + round(came * 1e9)
+    (cls,) = (cls for cls in NAMES if cls.__name__ == kind)
+    stamp = dict(zip(("sec", "nanosec"), divmod(made_ns, 10**9), strict=True))
+    decoded = msgspec.convert({"header": {"stamp": stamp}, **fields}, cls)
+    return RosMessage(topic, NAMES[cls], "cdr", wall_ns, encode(decoded, "cdr"))
+
+
+def joint_states(
+    seen: Drive, topic: str = "/joint_states", names: Sequence[str] = JOINTS, *,
+    speeds: bool = False,
+) -> Iterator[RosMessage]:  # fmt: skip
+    """Yield the wheels: angles at the end of each period, or speeds in its middle.
+
+    The first half of the joints are on the left.
+    """
+    half = len(names) // 2
+    sides = np.column_stack([seen.left] * half + [seen.right] * half)
+    angles = np.cumsum(sides, axis=0) * PERIOD_S
+    for t, speed, angle in zip(seen.t, sides, angles, strict=True):
+        values = {"velocity": speed.tolist()} if speeds else {"position": angle.tolist()}
+        at = float(t) if speeds else float(t) + PERIOD_S / 2
+        yield message(topic, "JointState", at, name=list(names), **values)
+
+
+def imu(seen: Drive, topic: str = "/imu/data", axis: int = 2, sign: float = 1.0, late: float = 0.0
+        ) -> Iterator[RosMessage]:  # fmt: skip
+    """Yield the gyro, whose axis `axis` points up (`sign` 1) or down (-1).
+
+    Its clock is `late` seconds behind.
+    """
+    none = [0.0] * 9
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (len(seen.gyro_t), 3))
+    for t, rate, other in zip(seen.gyro_t, seen.gyro, noise.tolist(), strict=True):
+        other[axis] = sign * float(rate)
+        yield message(
+            topic, "Imu", float(t) - late, came=float(t), orientation={},
+            orientation_covariance=none, angular_velocity=dict(zip("xyz", other, strict=True)),
+            angular_velocity_covariance=none, linear_acceleration={},
+            linear_acceleration_covariance=none,
+        )  # fmt: skip
+
+
+def pose(place: complex, yaw: float | None) -> dict[str, object]:
+    turn = {"z": 0.0, "w": 0.0} if yaw is None else {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+    return {"position": {"x": place.real, "y": place.imag}, "orientation": turn}
+
+
+def poses(seen: Drive, topic: str = "/slam/pose", *, yaw: bool = False) -> Iterator[RosMessage]:
+    """Yield the positions of the drive as `PoseStamped`, with or without the true yaw."""
+    for t, place in zip(seen.place_t, seen.place, strict=True):
+        turn = float(np.interp(t, seen.t, seen.yaw)) + 0.7 if yaw else None
+        yield message(topic, "PoseStamped", float(t), pose=pose(complex(place), turn))
+
+
+def odometry(
+    t: Floats, where: Sequence[complex], yaw: Floats, topic: str = "/odom"
+) -> Iterator[RosMessage]:
+    none = [0.0] * 36
+    for at, place, turn in zip(t, where, yaw, strict=True):
+        yield message(
+            topic, "Odometry", float(at), child_frame_id="base_link",
+            pose={"pose": pose(complex(place), float(turn)), "covariance": none},
+            twist={"twist": {"linear": {}, "angular": {}}, "covariance": none},
+        )  # fmt: skip
+
+
+def wheel_odometry(seen: Drive, track: float = 1.4, topic: str = "/odom") -> Iterator[RosMessage]:
+    """Yield the odometry of a driver that computes it from the same wheels."""
+    turn = (seen.right - seen.left) * RADIUS / (SEPARATION * track) * PERIOD_S
+    yaw = np.cumsum(turn)
+    ahead = (seen.right + seen.left) / 2 * RADIUS * PERIOD_S
+    where = np.cumsum(ahead * np.exp(1j * (yaw - turn / 2)))
+    return odometry(seen.t + PERIOD_S / 2, list(where), yaw, topic)
+
+
+def in_order(*topics: Iterator[RosMessage]) -> list[RosMessage]:
+    return sorted((one for topic in topics for one in topic), key=lambda one: one.wall_ns)
+
+
+def write_mcap(
+    path: Path, messages: Sequence[RosMessage], compression: CompressionType = CompressionType.ZSTD
+) -> Path:
+    """Write a bag's file by the MCAP library."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1 << 16, compression=compression)
+        writer.start("ros2", "libmcap")
+        schemas: dict[str, int] = {}
+        channels: dict[str, int] = {}
+        for one in messages:
+            if one.type not in schemas:
+                schemas[one.type] = writer.register_schema(one.type, "ros2msg", b"")
+            if one.topic not in channels:
+                channels[one.topic] = writer.register_channel(
+                    one.topic, one.encoding, schemas[one.type]
+                )
+            writer.add_message(channels[one.topic], one.wall_ns, one.data, one.wall_ns)
+        writer.finish()
+    return path
+
+
+def write_bag(directory: Path, seen: Drive, *, sqlite: bool = False) -> Path:
+    """Write wheels, gyro and positions of a drive as a bag, encoded by the library rosbags alone.
+
+    It shares no code with acsard.
+    """
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+
+    def header(at_ns: int) -> Any:
+        stamp = types["builtin_interfaces/msg/Time"](*divmod(at_ns, 10**9))
+        return types["std_msgs/msg/Header"](stamp, "base_link")
+
+    zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+    level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    nothing = np.zeros(9)
+    angles = np.cumsum(np.column_stack((seen.left, seen.right)), axis=0) * PERIOD_S
+    rows: list[tuple[int, str, Any]] = []
+    for t, both in zip(seen.t, angles, strict=True):
+        at_ns = START_NS + round((float(t) + PERIOD_S / 2) * 1e9)
+        state = types["sensor_msgs/msg/JointState"](
+            header(at_ns), list(JOINTS), both, np.zeros(0), np.zeros(0)
+        )
+        rows.append((at_ns, "/joint_states", state))
+    for t, rate in zip(seen.gyro_t, seen.gyro, strict=True):
+        at_ns = START_NS + round(float(t) * 1e9)
+        turn = types["geometry_msgs/msg/Vector3"](0.0, 0.0, float(rate))
+        sample = types["sensor_msgs/msg/Imu"](
+            header(at_ns), level, nothing, turn, nothing, zero, nothing
+        )
+        rows.append((at_ns, "/imu/data", sample))
+    for t, place in zip(seen.place_t, seen.place, strict=True):
+        at_ns = START_NS + round(float(t) * 1e9)
+        spot = types["geometry_msgs/msg/Point"](place.real, place.imag, 0.0)
+        where = types["geometry_msgs/msg/Pose"](spot, level)
+        rows.append((at_ns, "/slam/pose", types["geometry_msgs/msg/PoseStamped"](
+            header(at_ns), where
+        )))  # fmt: skip
+    plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
+    with BagWriter(directory, version=9, storage_plugin=plugin) as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in (
+                ("/joint_states", "sensor_msgs/msg/JointState"),
+                ("/imu/data", "sensor_msgs/msg/Imu"),
+                ("/slam/pose", "geometry_msgs/msg/PoseStamped"),
+            )
+        }
+        for at_ns, topic, value in sorted(rows, key=lambda row: row[0]):
+            connection = connections[topic]
+            writer.write(connection, at_ns, store.serialize_cdr(value, connection.msgtype))
+    return directory

@@ -1,0 +1,97 @@
+"""Tests of a guided calibration whose legs are disturbed and repeated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acsard.calibration.guided.drive_plan import DisturbedError, Leg
+from acsard.calibration.guided.methods import METHODS
+from acsard.calibration.guided.runner import (
+    MOST_REPEATS,
+    MOST_SIMULATED_REPEATS,
+    begins_again,
+    guide,
+)
+from acsard.calibration.runs import Run
+from acsard.calibration.solve import Calibration
+from tests.each import each
+from tests.unit.calibration.guided.played import Asked, Player, anyone, usual_setup
+
+SET_BACK_RAD = 0.3
+"""Error with which the person sets the robot back."""
+
+
+@each(
+    ("way", "leg", "again"),
+    [
+        ("gyro", "turns", "turns"), ("positions", "turns", "turns"), ("tape", "ahead", "ahead"),
+        ("tape", "once round", "ahead"), ("tape", "slowly", "slowly"), ("tape", "fast", "fast"),
+        ("wall", "home", "out"), ("wall", "half round to the left", "half round to the left"),
+        ("wall", "round at the wall", "round at the wall"),
+        ("umbmark", "once round", "ahead"), ("umbmark", "square to the right",
+                                             "square to the right"),
+    ],
+)  # fmt: skip
+def test_a_drive_goes_on_from_the_last_leg_whose_measurement_stands_alone(
+    way: str, leg: str, again: str
+) -> None:
+    method = METHODS[way]
+    legs = method.legs(usual_setup(), 1.6)
+    number = [one.name for one in legs].index(leg)
+    assert legs[begins_again(legs, number, sensor=not method.tool)].name == again
+
+
+class Disturbed:
+    """A drive in which the first rides of one leg are disturbed half-way."""
+
+    def __init__(self, way: str, leg: str, times: int) -> None:
+        self._way, self._leg, self._left = way, leg, times
+        self.player = Player(anyone(5), gyro=way == "gyro", places=way == "positions")
+        self.prompt = Asked(self.player)
+        self.driven: list[str] = []
+
+    def ride(self, leg: Leg) -> Run:
+        self.driven.append(leg.name)
+        if leg.name == self._leg and self._left:
+            self._left -= 1
+            self.player.yaw += SET_BACK_RAD
+            raise DisturbedError("a person stood in the way", "stopped")
+        return self.player.ride(leg)
+
+    def found(self, *, simulated: bool = False) -> Calibration:
+        return guide(self._way, usual_setup(), self.prompt, self.ride, simulated=simulated)
+
+
+@pytest.mark.parametrize(
+    ("way", "leg"),
+    [("gyro", "turns"), ("tape", "slowly"), ("tape", "once round"), ("wall", "home")],
+)
+def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
+    way: str, leg: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = Disturbed(way, leg, MOST_REPEATS)
+    values = drive.found().multipliers.values
+    expected = Disturbed(way, leg, 0).found().multipliers
+    robot = drive.player.robot
+    assert drive.driven.count(leg) == 1 + MOST_REPEATS
+    assert values[0] == pytest.approx(robot.chi * (1 + 0.5 * robot.rate), rel=0.05)
+    assert np.all(np.abs(values - expected.values) < 4 * expected.std)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "was disturbed: a person stood in the way" in said
+    assert "set the robot back" in said
+
+
+def test_a_leg_that_is_disturbed_three_times_ends_the_drive() -> None:
+    drive = Disturbed("gyro", "turns", MOST_REPEATS + 1)
+    with pytest.raises(DisturbedError, match="stopped"):
+        drive.found()
+    assert drive.driven == ["straight", *["turns"] * (MOST_REPEATS + 1)]
+
+
+def test_on_the_simulator_a_leg_is_repeated_more_often_and_nobody_sets_it_back(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    drive = Disturbed("gyro", "turns", MOST_SIMULATED_REPEATS)
+    assert drive.found(simulated=True).multipliers.values[0] > 0.9
+    assert "set the robot back" not in capsys.readouterr().err
