@@ -265,15 +265,15 @@ class Multipliers(Struct, frozen=True):
         return float(np.sqrt(max(0.0, apart @ shares @ apart)))
 
     def own(self) -> tuple[Floats, float]:
-        """Return the standard deviations as the settings of `[odometry]` declare them.
+        """Return four standard deviations, as the settings of `[odometry]` declare them.
 
-        The first three belong to the single multipliers. The fourth is that of a scale that all of
-        them share, as a fraction. The odometry treats the four errors as independent.
+        The first three belong to one multiplier each. The fourth belongs to the common scale of all
+        multipliers, as a fraction. The odometry treats the four errors as independent.
 
-        Let d be the relative variance of the difference of both radii. Each radius then has the own
-        variance d / 2, and their mean has d / 4 from it. This d / 4 is subtracted from the
-        variances of the mean radius (the scale) and of the track relative to the mean radius (the
-        track).
+        Let d be the relative variance of the difference of both radii. Each radius then has its own
+        variance d / 2, which contributes d / 4 to the variance of their mean. This d / 4 is
+        subtracted from the variances of the mean radius (the scale) and of the track relative to
+        the mean radius (the track).
         """
         shares = self.covariance / np.outer(self.values, self.values)
         mean, track, apart = (

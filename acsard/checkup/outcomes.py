@@ -1,4 +1,4 @@
-"""All printed words of the check, and the findings that are made of them.
+"""All printed texts of the check, and the findings with these texts.
 
 A step names its outcome and gives the measured figures that go into the words.
 """

@@ -1,9 +1,8 @@
-"""The command line: one module per verb. Its docstring is the text of its `--help`.
+"""The command line: one module per subcommand, whose docstring is the text of its `--help`.
 
-Each module has `add_options`, and `main`, which calls one room and prints. A verb with actions sets
-the `main` of each action instead. Only the module of the verb that is called is imported, so the
-modules import at their top all that the verb needs. Libraries that may be missing are the
-exception.
+Each module has `add_options`, and `main`, which calls one package and prints. A subcommand with
+actions sets the `main` of each action instead. Only the module of the typed subcommand is imported,
+so each module imports everything it needs at its top, except libraries that may be missing.
 """
 
 from __future__ import annotations

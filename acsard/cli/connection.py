@@ -1,4 +1,4 @@
-"""Shared by the verbs that use the bus: their options, the connection, and checks of keys."""
+"""Options, connection and key checks that all subcommands on the bus share."""
 
 from __future__ import annotations
 

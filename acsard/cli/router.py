@@ -1,6 +1,6 @@
 """Run Zenoh in router mode with a configuration file of Zenoh, such as deploy/zenoh/router.json5.
-The router is a child process. It is ended and restarted if a client takes all its time or memory.
-It runs no plugins; for storages use zenohd.
+The router is a child process. It is killed and restarted if a client takes all of the router's
+processor time or memory. It runs no plugins; for storages use zenohd.
 """
 
 from __future__ import annotations

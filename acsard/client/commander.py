@@ -212,5 +212,5 @@ def heard(state: RobotState, source: str) -> bool:
 
 
 def hopeless(state: RobotState, source: str) -> bool:
-    """Return whether waiting cannot help a sender whose commands do not count."""
+    """Return whether the daemon will keep refusing this source, so that waiting cannot help."""
     return state.mode in NEVER or all(one.name != source for one in state.sources)

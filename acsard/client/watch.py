@@ -1,4 +1,4 @@
-"""Binds a `Follower` to the bus: subscribes to `state`, and queries it if it is late."""
+"""Binds a `Follower` to the bus: subscribes to `state`, and queries it if none arrives in time."""
 
 from __future__ import annotations
 

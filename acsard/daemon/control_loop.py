@@ -134,7 +134,7 @@ class ControlLoop:
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time of the next step for a command that came too soon after a line, if any."""
+        """Monotonic time of the extra step for a command that came too soon after the last line."""
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property

@@ -159,7 +159,7 @@ class Heard(Struct):
 
     @property
     def counted(self) -> str:
-        """The number of bytes or lines and the last bad one, as text."""
+        """Text with the number of received lines and the last bad line; bytes if no line ended."""
         if not self.size:
             return "nothing was received"
         if not self.lines:
@@ -186,7 +186,7 @@ class Heard(Struct):
 
 
 class SilenceDiagnosis:
-    """The diagnosis while the link is not up; `heard` is its last complete interval."""
+    """Diagnoses, in intervals of `PATIENCE_NS`, why the link is not up."""
 
     def __init__(self) -> None:
         self.heard: Heard | None = None

@@ -306,7 +306,7 @@ class Negotiation:
     # Lines that come back.
 
     def echoed(self, line: bytes) -> bool:
-        """Return whether the line is, or earlier lines were, an echo of a question.
+        """Return whether this line or an earlier one was an echo of the daemon's own question.
 
         After an echo no received line is believed until the port is reopened.
         """

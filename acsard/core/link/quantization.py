@@ -192,7 +192,7 @@ class WheelCounter:
         return whole * self.angle + speed * missing
 
     def owed(self, period: float) -> float:
-        """Return the rounding error until the counts were known, rad. Call it once."""
+        """Return and reset the rounding errors of the lines before the counts were known, rad."""
         told, self._told = self._told or {}, None
         return math.fsum(
             times * (round(speed / self.quantum) * self.angle - speed * period)
@@ -248,7 +248,7 @@ class CountRecovery:
         return tuple([wheel.counts for wheel in self._wheels])
 
     def look(self, line: Feedback) -> Feedback:
-        """Return the line with its counted angles, if its speeds show any, and its steps."""
+        """Return the line with each wheel's counted angle and quantization step, where known."""
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if line.turned is None and own > 0.0:
             counted = self._counted(speeds, own)

@@ -99,9 +99,9 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Note that the turn of lines during the gyro's trial has changed by `turn` rad.
+        """Note that the wheels' turn during the gyro's trial was corrected by `turn` rad.
 
-        Return the part of this change that the gyro has already corrected.
+        Return the part of this correction that the gyro has already made.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 

@@ -70,7 +70,7 @@ CERTAIN = 3.0
 
 
 class Match:
-    """Compares the turns of wheels and gyro, feedback line by feedback line."""
+    """Compares the robot's turn according to wheels and gyro, feedback line by feedback line."""
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2

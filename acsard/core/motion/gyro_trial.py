@@ -56,9 +56,10 @@ class Trial:
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Take a line: the turns by wheels and gyro, rad, in its `dt` s.
+        """Take the robot's turn of one line according to wheels and gyro, rad in `dt` s.
 
-        Without a certain bias the only possible verdict is "in degrees".
+        `certain` is False while the gyro's bias is uncertain. The only verdict is then "in
+        degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro

@@ -157,13 +157,13 @@ class Odometry:
         self._rolling.skip(feedback)
 
     def fold(self, feedback: Feedback, commanded: WheelSpeeds | None = None) -> Estimate:
-        """Advance by one feedback line: by its counts, else by its speeds times dt.
+        """Advance the pose by one feedback line: by its counts, else by its speeds times dt.
 
-        After a gap without counts only the uncertainty advances. At rest nothing does: a count back
-        and forth waits until its direction is clear. If a gyro provides the turn since the line
-        before, the wheels provide only the distance. `commanded` is the commanded wheel speeds, by
-        which a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines
-        are recomputed.
+        After a gap without counts only the uncertainty grows. At rest the pose stays: a single
+        count is added only when its direction is clear. If a gyro provides the turn since the line
+        before, the wheels provide only the distance. Wheels that contradict `commanded`, the
+        commanded wheel speeds, are faulty. The other wheel of the side replaces a faulty wheel,
+        also in the lines before.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)

@@ -97,9 +97,9 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the angle of one wheel divided by that of the other, for wheels that agree.
+        """Return the usual ratio of the angles of this side's two wheels.
 
-        If `front` is true, the result is front / rear, otherwise rear / front.
+        If `front` is true, the ratio is front / rear, otherwise rear / front.
         """
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
