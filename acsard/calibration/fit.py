@@ -290,7 +290,7 @@ def configured(base: Base) -> Multipliers:
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of these rows, whose turns by the wheels are `by_wheels`, rad."""
+    """Return the turn rates of these rows; `by_wheels` has their turns from the wheels, rad."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -304,9 +304,9 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
-    """Return the multipliers that serve best at the turn rates of the log.
+    """Return the multipliers that fit best at the turn rates of the log.
 
-    The variance of the track is that of the constant track which serves best there. The turns that
+    The variance of the track is that of the best constant track there. The turns that
     skid more or less than usual belong to the noise of the odometry.
 
     Args:

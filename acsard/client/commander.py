@@ -60,7 +60,7 @@ NEVER = ("inactive", "stopped", "fault", "shutdown")
 
 
 class Wish(Struct, frozen=True):
-    """A command, and its time by the clock of its sender, ns; None for a sender without a clock."""
+    """A command, and its time on the sender's clock, ns; None for a sender without a clock."""
 
     twist: Twist
     stamp_ns: int | None = None

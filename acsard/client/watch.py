@@ -46,7 +46,7 @@ class Watch(Follower):
         """Replies to queries. A thread of Zenoh puts them here and does nothing else."""
 
     def look(self, now: float) -> list[RobotState]:
-        """Take the states that have arrived, query a late one, and return those that are news.
+        """Take the states that have arrived, query a late one, and return the new ones.
 
         Raises `ZError` after the session was closed.
         """

@@ -1,8 +1,8 @@
 """Certificates and their authority as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
 
 The keys are P-256 keys, in files that only their owner can read. People trust the authority on
-their phones, so its certificate limits the names that it may sign: a thief of its key can pose as
-no web site.
+their phones, so its certificate limits the names that it may sign: a thief of its key cannot
+impersonate a web site.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class Authority:
 
     @property
     def limited(self) -> bool:
-        """Whether the authority may sign for some names only. One from an earlier version may sign
-        for any.
+        """Whether the authority may sign for some names only. An authority that an earlier version
+        made may sign for any name.
         """
         return bool(self._permitted())
 

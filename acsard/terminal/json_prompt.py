@@ -152,7 +152,7 @@ class JsonPrompt:
             file = writable(config)
             require_changeable(file, keys)
         except MendableError as error:
-            self.say(f"The tool cannot write the file from here: {error}")
+            self.say(f"The tool cannot write the file: {error}")
             return False
         wanted = self.ask(f"Write these lines into {file}? Its comments stay.", ("write", "leave"))
         self._moves = False

@@ -323,7 +323,7 @@ def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path
             assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
             assert program.ended(5.0) == 1
             assert "a key was pressed" in terminal.screen
-            assert "writes nothing" in terminal.screen
+            assert "writes no file" in terminal.screen
         assert daemon.config.read_bytes() == before
 
 

@@ -118,7 +118,7 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, stan
             end = await guided.ended()
             assert (end["ended"], end["meaning"]) == (1, "failure")
             assert "a key was pressed" in end["text"]
-            assert "writes nothing" in end["text"]
+            assert "writes no file" in end["text"]
             await other.says(lambda said: said.get("running") == "")
 
     run(story)

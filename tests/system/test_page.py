@@ -99,7 +99,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     until(lambda: bus.state()["mode"] == "stopped", 5.0, "it stops")
     page.shows("mode", "STOPPED")
     page.shows("reason", "press Release")
-    assert "stopped by a page at the robot at" in browser.text("reason")
+    assert "stopped by a page on the robot itself at" in browser.text("reason")
     # A person who still holds the stick does not drive when another person clears.
     browser.touch("End")
     browser.tap("clear")
@@ -679,7 +679,7 @@ PERSON = """import('/page/words.js').then(({person}) => [
 def test_a_sender_has_the_name_that_a_person_knows(page: Phone) -> None:
     assert page.browser.js(PERSON) == [
         "you",
-        "another page at the robot",
+        "another page on the robot itself",
         "phone",
         "another page of phone",
         "a program without a name",
@@ -726,9 +726,9 @@ def test_a_second_driver_is_told_at_once_who_drives_and_the_ring_is_not_blue(pag
 
     def look() -> None:
         browser = page.browser
-        page.shows("reason", "Driven by another page at the robot.")
-        page.shows("who", "another page at the robot")
-        page.shows("hint", "another page at the robot drives: you can when they release.")
+        page.shows("reason", "Driven by another page on the robot itself.")
+        page.shows("who", "another page on the robot itself")
+        page.shows("hint", "another page on the robot itself drives: you can when they release.")
         browser.push(0, 0, "Start")
         browser.push(0, 90)
         ring = "getComputedStyle(document.getElementById('stick')).borderColor"

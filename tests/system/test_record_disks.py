@@ -77,7 +77,7 @@ def disk(where: Path, *options: str) -> Iterator[Path]:
 
 @contextmanager
 def both(where: Path, record: Path, **how: object) -> Iterator[tuple[Daemon, Bus, Bus]]:
-    """A daemon that records there, its bus, and the bus of a daemon that records nothing."""
+    """A daemon that records to the bad disk, its bus, and the bus of a daemon without recording."""
     other = where / "other"
     other.mkdir()
     with (

@@ -250,7 +250,7 @@ class UnansweredLines:
 
 
 def damaged(link: Link, check: Negotiation) -> bool:
-    """Return whether the check is being asked for because replies came damaged."""
+    """Return whether the daemon asks for the checked link because replies were damaged."""
     return link.damaged and check.asking
 
 
@@ -295,7 +295,7 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event for a newly agreed check, as a warning if it is less than was asked for."""
+    """Return the event for a newly agreed line form, a warning if the board lacks part of it."""
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the serial lines are {check.in_force}"
     if check.state == "plain":

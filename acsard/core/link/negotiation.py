@@ -326,7 +326,7 @@ class Negotiation:
         return self.echoes
 
     def heard_plain(self) -> None:
-        """Note a whole plain line while asking.
+        """Note a whole plain line while the daemon asks for the checked link.
 
         The board is awake, so from now on its silence is an answer too.
         """

@@ -87,7 +87,7 @@ class Match:
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
-        """The present rate by the wheels, and that at the start of the block."""
+        """The turn rate from the wheels now, and at the start of the block."""
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
 

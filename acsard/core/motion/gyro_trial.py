@@ -20,7 +20,7 @@ unequal tyres the wheels report a turn on a straight, so below `LEAST_RATE` a gy
 nothing is not called dead."""
 
 PROPORTIONS = (0.25, 2.5)
-"""Range of the robot's turn per turn by the wheels, at any skid."""
+"""Range of the robot's true turn divided by the turn from the wheels, for any skidding."""
 
 PROVED, REFUTED = 0.1, 0.4
 """Turn to one side by the wheels, rad, in which a gyro is proven or refuted. Refuting takes more,
@@ -45,7 +45,7 @@ class Trial:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """Turn by the wheels, duration and turn by the gyro in the present stretch: rad, s, rad."""
+        """Turn from the wheels, duration, and turn from the gyro in this stretch: rad, s, rad."""
         self._fast = self._fast_gyro = 0.0
         """Turns by wheels and gyro over the stretches that were fast enough to call a gyro dead,
         rad."""

@@ -131,7 +131,7 @@ class Odometry:
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, as certain as at the start.
 
-        The wheel angles continue.
+        The wheel angles do not change.
         """
         self._path.set(pose)
         self._steps.clear()

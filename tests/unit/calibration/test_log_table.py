@@ -124,7 +124,7 @@ def test_runs_are_told_apart_by_any_name() -> None:
         (b"t left right yaw_rate\n1 2 3 4\n", "no commas between"),
         (b"t,left,right,left,x,y\n1,2,3,4,5,6\n", "left exists twice"),
         (LOG_HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is not a number'),
-        (LOG_HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, the header 4"),
+        (LOG_HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, but the header 4"),
         (b"SQLite format 3\0\0\0", "not text"),
     ],
 )

@@ -103,7 +103,7 @@ SUBSETS = 20
                             for kind in ("constant track", "squares"))],
 )  # fmt: skip
 def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> None:
-    """The truth of a track that grows is the one that serves best at the drive's turn rates.
+    """The truth of a track that grows is the constant that fits best at the drive's turn rates.
 
     Each run of a set of squares has its own ratio of left to right, because it slips differently.
     """

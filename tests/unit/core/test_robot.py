@@ -736,7 +736,7 @@ def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
     late = (Request("clear", 7, asked_ns=asked_ns, latch=latch),)
     out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=late))
     assert (out.mode, out.answers[0].success) == ("stopped", False)
-    assert "call it again" in out.answers[0].message
+    assert "call srv/clear again" in out.answers[0].message
     bench.now_ns += 10 * MS
     again = (Request("clear", 8, asked_ns=bench.now_ns, latch=latch),)
     assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=again)).answers[0].success

@@ -400,7 +400,7 @@ def test_a_second_clear_of_the_same_fault_does_not_release_the_stop_under_it() -
 def test_a_clear_that_arrived_before_the_fault_does_not_release_it() -> None:
     life = ready()
     life.fault("a wheel is dead", at(3.0))
-    with pytest.raises(RefusedError, match="call it again"):
+    with pytest.raises(RefusedError, match="call srv/clear again"):
         life.clear(None, ns(2.0), at(3.1))
     life.clear(None, ns(4.0), at(4.0))
     assert mode(life) is Mode.READY
