@@ -360,7 +360,7 @@ def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
     assert commands(page) == []
 
 
-def test_a_port_that_the_daemon_has_is_told_with_how_to_end_it(tmp_path: Path) -> None:
+def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(tmp_path: Path) -> None:
     with Program(acsard("sim"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
 

@@ -138,7 +138,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.touch("End")
 
 
-def test_what_a_button_could_not_is_said_once(page: Phone) -> None:
+def test_what_a_button_could_not_is_reported_once(page: Phone) -> None:
     page.browser.tap("tab-set")
     page.browser.js("document.getElementById('reset').click()")
     page.shows("set-told", "pose is x 0")

@@ -217,7 +217,7 @@ def test_a_port_that_is_not_there_is_66(tmp_path: Path, words: list[str]) -> Non
     assert end.value.code == 66
 
 
-def test_a_person_is_asked_until_the_answer_is_one(
+def test_a_person_is_asked_until_the_answer_is_valid(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n RL \n"))

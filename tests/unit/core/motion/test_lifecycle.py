@@ -263,7 +263,7 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
 
 
-def test_a_stop_that_comes_with_the_first_step_is_none_from_the_start() -> None:
+def test_a_stop_in_the_first_step_is_not_older_than_the_start() -> None:
     life = ready()
     life.begin(at(10.0))
     stop(life, 10.0)
