@@ -22,7 +22,7 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
     """Add the options of the tools that talk to a running daemon.
 
     Args:
-        parser: the parser of the verb.
+        parser: the parser of the subcommand.
         more: text that is appended to the help of `--id`.
     """
     add_config(parser)

@@ -25,8 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
     )
-    # The verb starts itself with this option: the child is the router and ends with its standard
-    # input.
+    # The subcommand starts itself with this option: the child is the router and ends with its
+    # standard input.
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
 

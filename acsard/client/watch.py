@@ -76,7 +76,7 @@ class Watch(Follower):
             return None
 
     def objection(self, source: str, sender: str, now: float) -> str:
-        """Return why commands have no effect, or "" if they have or no state has arrived yet."""
+        """Return why commands have no effect; "" if they have one, or before the first state."""
         if self.silent(now):
             return "nothing received from the daemon: does it run?"
         return "" if self.state is None else objection(self.state, source, sender)

@@ -251,7 +251,7 @@ CREDIBLE = 0.85, 3.0
 """Credible ratios of effective track to wheel separation. Outside them, a reading must be wrong."""
 
 Answers = dict[tuple[str, str], float]
-"""The person's answers in m and rad, by the names of the leg and of the question.
+"""The person's answers in m and rad, keyed by the names of leg and question.
 
 The name of the leg is "" for questions that were asked before the first leg.
 """

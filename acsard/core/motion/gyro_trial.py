@@ -23,8 +23,8 @@ PROPORTIONS = (0.25, 2.5)
 """Range of the robot's true turn divided by the turn from the wheels, for any skidding."""
 
 PROVED, REFUTED = 0.1, 0.4
-"""Turn to one side by the wheels, rad, in which a gyro is proven or refuted. Refuting takes more,
-because the gyro may be late."""
+"""Turn to one side according to the wheels, rad, in which a gyro is proven or refuted. Refuting
+takes more, because the gyro may be late."""
 
 REFUTED_S = 0.3
 """Seconds of turning before a gyro is refuted. No gyro is as late as that."""

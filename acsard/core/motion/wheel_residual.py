@@ -43,7 +43,7 @@ LAG_S = 0.03
 """Allowed delay of one motor behind the other, s."""
 
 LEAST = 0.002
-"""Allowed difference in addition, rad, for the two decimals and for backlash."""
+"""Additional allowed difference, rad, for the two decimals and for backlash."""
 
 UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
