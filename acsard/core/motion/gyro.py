@@ -79,8 +79,8 @@ class Turn(Struct, frozen=True, gc=False):
     angle: float
     variance: float
     rate: float
-    """The present turn rate by the gyro, rad/s. The angle may include late samples, so it is not dt
-    times this rate."""
+    """The turn rate that the gyro measures, rad/s. The angle may include late samples, so it is not
+    dt times this rate."""
     rate_variance: float
     wheels: float | None = None
     """The angle that the wheels would report for this turn, including their skid, rad."""

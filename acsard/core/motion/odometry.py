@@ -54,7 +54,7 @@ class Step(Struct, frozen=True, gc=False):
     pieces: tuple[Motors, ...]
     """How far the wheels turned in it, rad."""
     gyro: Turn | None
-    """The turn by a gyro, None without one."""
+    """The turn that a gyro measured, None without a gyro."""
     speeds: WheelSpeeds
     """The speeds in the line."""
     turn: float
@@ -256,7 +256,7 @@ class Odometry:
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
     ) -> list[tuple[float, float]]:
-        """Return the arcs for these wheel angles, m and rad: (4) to (7) are linear.
+        """Return the arcs (m, rad) for these wheel angles; equations (4) to (7) are linear.
 
         A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
         one.
