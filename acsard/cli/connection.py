@@ -102,8 +102,8 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot ask this key.
 
-    These are keys that do not answer, services, which would act, and wildcards: `get` prints one
-    answer.
+    It refuses keys that do not answer queries, services, which a query would call, and wildcards,
+    because `get` prints one answer.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(

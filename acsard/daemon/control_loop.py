@@ -257,7 +257,7 @@ class ControlLoop:
                     by = caller_name(arrival.via, arrival.attachment, arrival.sender)
                     requests.append(Request("stop", asked_ns=arrival.arrived_ns, by=by))
                 else:
-                    refusals.append(Refusal("not_a_put", "stop: a DELETE is not a stop"))
+                    refusals.append(Refusal("not_a_put", "stop: send a PUT, not a DELETE"))
                 continue
             try:
                 commands.append(self._receiver.command(arrival))

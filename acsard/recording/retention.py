@@ -191,7 +191,7 @@ class ClockWatch(Struct):
 
 
 class IncidentWindow(Generic[File]):
-    """Finds the recording files within a minute of an incident, while files begin and end.
+    """Finds the recording files within a minute of an incident, while the recording goes on.
 
     All times are ns of the monotonic clock.
     """

@@ -312,7 +312,7 @@ def test_a_delete_on_stop_is_counted_as_not_a_put_and_latches_nothing(bus: Bus) 
     until(lambda: bus.count("commands") > before, 5.0, "the command behind it")
     state = bus.state()
     assert state["counters"]["command_not_a_put"] == refused + 1
-    assert state["refused"] == "stop: a DELETE is not a stop"
+    assert state["refused"] == "stop: send a PUT, not a DELETE"
     assert state["mode"] != "stopped"
     bus.at_rest()
 
