@@ -16,7 +16,7 @@ mode, limit it, invert the kinematics, report. No other function decides anythin
 Where to look: each package may import only those below it. `pyproject.toml` states
 this order as contracts, and `lint-imports` checks them.
 
-    cli/             one file per verb: its options, one call into another package, its output
+    cli/             one file per subcommand: its options, a call into another package, output
     bench/           `acsard bench`: measures a daemon from outside
     foxglove/        `acsard foxglove`: a live server for Foxglove
     report/          `acsard recording report`: what a recording shows, as a page
@@ -33,7 +33,7 @@ this order as contracts, and `lint-imports` checks them.
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
-    terminal/        tables and output of all tools, by the library rich; how a verb asks the person
+    terminal/        tables and output of all tools, by the library rich; questions to the person
                      beside the robot: at a terminal, or through a program in JSON
     host/            what every process uses: clock, timers, threads and the mailboxes between
                      them, child processes, files, rate limits, systemd, logs, errors

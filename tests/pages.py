@@ -402,7 +402,7 @@ COMMANDS: dict[str, How] = {
         "pip is not called again",
     ),
     "sudo /opt/acsard/venv/bin/acsard recording": Elsewhere(
-        LOG, "test_the_list_has_a_line_each_and_says_what_happened"
+        LOG, "test_the_list_has_a_line_for_each_recording_with_its_events"
     ),
     "sudo /opt/acsard/venv/bin/acsard recording show --from 14:05": Elsewhere(
         LOG, "test_a_part_of_a_story_by_seconds_and_by_the_time_of_day"

@@ -285,7 +285,7 @@ def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
     assert {"core/values.py", "deploy/ros2/README.md"} <= listed
     with_payload = files_with("set_pose|SetPose", "acsard", "deploy") - {"core/motion/odometry.py"}
     assert "core/incoming/commands.py" in with_payload
-    assert listed | with_payload <= recipe("## Add a verb", "A verb of the command line")
+    assert listed | with_payload <= recipe("## Add a verb", "A subcommand of `acsard`")
 
 
 LISTS_KEYS = r"(?s)^(?=.*\bwheel_states\b)(?=.*\bcmd_vel_out\b)(?=.*\bdiagnostics\b)"

@@ -265,15 +265,15 @@ class Multipliers(Struct, frozen=True):
         return float(np.sqrt(max(0.0, apart @ shares @ apart)))
 
     def own(self) -> tuple[Floats, float]:
-        """Return the standard deviations as the settings of `[odometry]` declare them.
+        """Return four standard deviations, as the settings of `[odometry]` declare them.
 
-        The first three belong to the single multipliers. The fourth is that of a scale that all of
-        them share, as a fraction. The odometry treats the four errors as independent.
+        The first three belong to one multiplier each. The fourth belongs to the common scale of all
+        multipliers, as a fraction. The odometry treats the four errors as independent.
 
-        Let d be the relative variance of the difference of both radii. Each radius then has the own
-        variance d / 2, and their mean has d / 4 from it. This d / 4 is subtracted from the
-        variances of the mean radius (the scale) and of the track relative to the mean radius (the
-        track).
+        Let d be the relative variance of the difference of both radii. Each radius then has its own
+        variance d / 2, which contributes d / 4 to the variance of their mean. This d / 4 is
+        subtracted from the variances of the mean radius (the scale) and of the track relative to
+        the mean radius (the track).
         """
         shares = self.covariance / np.outer(self.values, self.values)
         mean, track, apart = (
@@ -290,7 +290,7 @@ def configured(base: Base) -> Multipliers:
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of these rows, whose turns by the wheels are `by_wheels`, rad."""
+    """Return the turn rates of these rows; `by_wheels` has their turns from the wheels, rad."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -304,9 +304,9 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
-    """Return the multipliers that serve best at the turn rates of the log.
+    """Return the multipliers that fit best at the turn rates of the log.
 
-    The variance of the track is that of the constant track which serves best there. The turns that
+    The variance of the track is that of the best constant track there. The turns that
     skid more or less than usual belong to the noise of the odometry.
 
     Args:

@@ -334,7 +334,7 @@ Both are added as squares. A row with a much larger residual is an outlier.
 
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """Return the turn of each row by the wheels for these parameters, rad."""
+    """Return the robot's turn in each row, rad, computed from the wheels and these parameters."""
     left, right, inverse, growth = parameters[[LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]]
     constant = base.gain * inverse * (right * rows.right - left * rows.left)
     return np.asarray(constant + growth * _by_growth(rows, base, parameters))
@@ -369,7 +369,7 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
 def bias(rows: Rows, by_wheels: Floats) -> float:
     """Return the sensor's turn rate minus that of the wheels, rad/s, by robust least squares.
 
-    `by_wheels` is the turn of each row by the wheels, rad.
+    `by_wheels` is the turn of each row according to the wheels, rad.
     """
     seconds, found = rows.seconds, 0.0
     for _ in range(10):
@@ -398,5 +398,8 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the turn of each row by the wheels, rad, for `sides` as `first` returns them."""
+    """Return the robot's turn in each row, rad, computed from the wheels.
+
+    `sides` has the factors of left and right that `first` returns.
+    """
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

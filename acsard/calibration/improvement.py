@@ -24,10 +24,10 @@ from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative
 
 FOLDS = 5
 LEAST_RUNS = 3
-"""Number of runs from which on whole runs are left out. Below it, fifths of the log are."""
+"""Smallest number of runs for which whole runs are left out, not fifths of the log."""
 
 STRAIGHT = 0.1
-"""Largest curvature of a straight drive by the wheels, rad/m."""
+"""Largest curvature of a straight drive according to the wheels, rad/m."""
 
 
 class BeforeAfter(Struct, frozen=True):
@@ -156,8 +156,8 @@ def improvement(
         held: the folds of the fit.
         configured: the parameters with the configured multipliers.
         base: the configured geometry.
-        rows: the turns of the log by the heading sensor; all 0 without one.
-        places: the positions of each fold's drive.
+        rows: the log's rows, with the turns that the heading sensor measured; 0 without a sensor.
+        places: for each fold, the measured positions of the drive that it left out.
         steps: the wheel steps of each run.
     """
     by_wheels = turned(rows, base, configured)
@@ -256,7 +256,7 @@ def _of_positions(
 
 
 def no_better(found: Improvement) -> str:
-    """Return the reason to keep the configured multipliers, with the errors over whole drives."""
+    """Return the message that the new multipliers are not surely better, with both errors."""
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} then"
         for name, error, unit, factor in (

@@ -338,7 +338,7 @@ class _Reader:
                 return
             cells += [""] * short
         elif short < 0 and any(cell.strip() for cell in cells[short:]):
-            self._refuse(f"line {number} has {len(cells)} cells, the header {len(self._names)}")
+            self._refuse(f"line {number} has {len(cells)} cells, but the header {len(self._names)}")
             return
         try:
             row = [float(cells[i] or "nan") for i in self._picks]

@@ -78,15 +78,15 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
 
     Args:
         source: the name of the heading sensor.
-        turned: the turn of each row by the sensor, rad.
-        by_wheels: the turn of each row by the wheels, rad, scaled to fit the sensor best.
+        turned: the turn of each row according to the sensor, rad.
+        by_wheels: the turn of each row from the wheels, rad, scaled to fit the sensor best.
     """
     spread = float(turned @ turned)
     if not spread or float(np.sum((turned - by_wheels) ** 2)) > UNLIKE * spread:
         raise RefusedError(
-            f"{source} does not follow the wheels: does it measure the upright axis (yaw, not "
-            "roll or pitch), is it from the same drive, on the same clock within 2 s, and did the "
-            "wheels touch the ground? Are the wheels' columns speeds, not angles?"
+            f"{source} does not follow the wheels. Check that it is the yaw axis (not roll or "
+            "pitch), that it is from the same drive, that its clock agrees within 2 s, that the "
+            "wheels touched the ground, and that the wheels' columns are speeds, not angles"
         )
 
 
@@ -144,8 +144,8 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
             else ", or the sensor is positive to the right (it must be positive to the left)"
         )
         raise RefusedError(
-            f"by {sensor} the robot turns in the opposite direction than by the wheels: the "
-            "columns of left and right are swapped, or ahead is negative on both sides"
+            f"{sensor} and the wheels show turns in opposite directions: the columns of left and "
+            "right are swapped, or ahead is negative on both sides"
             f"{or_sensor}"
         )
 
@@ -158,8 +158,8 @@ def turns_like_the_wheels(source: str, turned: Floats, rows: Rows, base: Base) -
         raise RefusedError(
             f"{source} shows turns of {np.degrees(shown):.0f} deg in all, but the wheels would "
             f"turn the robot by up to {np.degrees(by_wheels):.0f} deg: is {source} the rate about "
-            "the upright axis? If the IMU lies on its side, another of its axes points up: write "
-            "that one into the column, positive to the left. Are the wheel speeds in rad/s, not "
+            "the upright axis? If the IMU lies on its side, write the rate about the axis that "
+            "points up into the column, positive to the left. Are the wheel speeds in rad/s, not "
             "counts, deg/s or rpm?"
         )
 

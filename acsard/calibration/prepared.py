@@ -105,7 +105,9 @@ TRACK, RATIO = "the effective track", "the ratio of left to right"
 def unsure(
     found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
 ) -> dict[str, float]:
-    """Return the relative standard deviations that are too large to be useful, by `TRACK`, `RATIO`.
+    """Return the relative standard deviations that are too large to be useful, by name.
+
+    The names are `TRACK` and `RATIO`.
 
     Args:
         found: the multipliers.

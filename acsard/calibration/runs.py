@@ -87,9 +87,9 @@ class Run(Struct, frozen=True):
 
 
 class Notes:
-    """Sentences about a log. What happens in many runs is one sentence with the sum of its counts.
+    """Sentences about a log. A sentence that occurs in many runs is listed once.
 
-    A sentence with a count has "{}" in place of it.
+    "{}" in a sentence stands for its count, summed over all runs.
     """
 
     def __init__(self, sentences: Iterable[str]) -> None:

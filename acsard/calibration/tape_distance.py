@@ -46,7 +46,7 @@ class Extent(Struct, frozen=True):
 
     @property
     def straight(self) -> float:
-        """Straightness of the path: 1 for a straight line, 0 for a short distance."""
+        """Distance divided by length: 1 for a straight line, 0 for at most `LEAST_M`."""
         return self.distance / self.length if self.distance > LEAST_M else 0.0
 
 

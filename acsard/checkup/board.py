@@ -191,7 +191,7 @@ class Board:
 
     @property
     def known(self) -> Known:
-        """Results that a step may have changed, to be restored before it is repeated."""
+        """The results so far. The check restores them before it repeats a check step."""
         return Known(*(getattr(self, name) for name in Known._fields))
 
     @known.setter

@@ -52,9 +52,9 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send all damaged lines and judge the effect.
+    """Send every kind of damaged line and report whether a motor obeyed one.
 
-    `motors` are motors that turn as commanded. They stand before and after.
+    `motors` are motors that turn as commanded. They stand before and after this test.
     """
     if not motors:
         return outcomes.find("damaged lines: untested")

@@ -136,7 +136,7 @@ def replies(board: Board) -> Finding:
 def check(board: Board) -> Finding:
     """Find out whether the board knows the checked link and the sample fields.
 
-    From here on the check uses those that it knows.
+    From here on the check uses the forms that the board knows.
     """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True

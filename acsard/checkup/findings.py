@@ -45,7 +45,7 @@ class WireLostError(AcsardError):
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
-    """Return the wheel of a motor by the configuration, and 1 or -1 for its forward direction."""
+    """Return the configured wheel of a motor, and 1 or -1 for its forward direction."""
     for wheel in WHEELS:
         entry = getattr(mcu.wheels, wheel)
         if entry[1] == LETTERS[motor]:
@@ -59,7 +59,7 @@ def words(wheel: str) -> str:
 
 
 def motor_name(mcu: McuConfig, motor: int) -> str:
-    """Return the letter of a motor and its wheel by the configuration: `motor d (rear right)`."""
+    """Return the letter of a motor and its configured wheel: `motor d (rear right)`."""
     return f"motor {LETTERS[motor]} ({words(wheel_of(mcu, motor)[0])})"
 
 

@@ -1,4 +1,4 @@
-"""Counts lines that are lost or damaged, finds long silences of the board, and the way of a loss.
+"""Counts lost and damaged lines, and finds long silences of the board and the direction of a loss.
 
 A line that arrives damaged was damaged on the way back. An unanswered line may have been lost in
 either direction, and the motors show the direction. Single lines turn standing motors for a moment,
@@ -157,7 +157,7 @@ SEEN, GRAINS = 0.02, 4
 
 
 class Ways(Struct, frozen=True):
-    """Counts of pulses: lost on the way `there`, and obeyed with the answer lost (`back`)."""
+    """Numbers of pulses: `sent`, lost on the way `there`, and obeyed without an answer (`back`)."""
 
     sent: int
     there: int
@@ -165,13 +165,14 @@ class Ways(Struct, frozen=True):
 
 
 def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
-    """Judge the direction with motors that turn as commanded.
+    """Find out whether lines are lost on the way to the board or back.
 
-    Returns None if no line is known to be lost.
+    `motors` are motors that turn as commanded: their encoders show which commands arrived. Returns
+    None if no line is known to be lost.
     """
     if not (board.own_clock or board.lost > MOST):
         return None
-    operator.doing("the motors turn for a moment each time, to find out where lines are lost")
+    operator.doing("the motors turn briefly, several times, to find out where lines are lost")
     ways = pulsed(board, motors) if motors else None
     if ways is None:
         return outcomes.find("lost where: untold")

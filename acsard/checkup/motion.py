@@ -62,7 +62,7 @@ class Reply(Struct, frozen=True):
 class Step(Struct, frozen=True):
     """The interval between two replies: its duration in s and the speeds in rad/s.
 
-    If the MCU reports them, it also has the duration by the MCU's clock, and by how many counts
+    If the MCU reports them, it also has the duration on the MCU's clock, and by how many counts
     each encoder moved, wrapped to the shorter way.
     """
 

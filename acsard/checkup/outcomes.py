@@ -1,6 +1,6 @@
-"""All printed words of the check, and the findings that are made of them.
+"""All printed texts of the check, and the findings with these texts.
 
-A step names its outcome and gives the measured figures that go into the words.
+A check step names its outcome and gives the measured figures for the text.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ CONFIRM = (
     "The wheels will turn one by one, then together. The tool commands 3 rad/s at most, but a "
     "wheel whose encoder is dead or reversed can reach full speed for about a second. Lift the "
     "robot so that no wheel touches anything, keep a hand on the power switch, then type "
-    f'"{LIFTED}". Nothing has turned yet; q or Ctrl-C quits, here and later:'
+    f'"{LIFTED}". No wheel has turned yet; q or Ctrl-C quits at any time:'
 )
 
 STEPS = (
@@ -178,7 +178,7 @@ class _Steps:
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
-                self._operator.doing("this computer was late; the step runs again")
+                self._operator.doing("this computer was late; this part of the check runs again")
                 board.known = known
                 if board.armed:
                     board.rest()
@@ -248,7 +248,9 @@ class _Steps:
         """Send zeros until a restarted board answers and its motors stand."""
         board = self._board
         board.forget()
-        self._operator.doing("the board restarted; the step runs again when it answers")
+        self._operator.doing(
+            "the board restarted; this part of the check runs again when the board answers"
+        )
         if not board.wakes(BOOT_S):
             raise StoppedError(restarts.finding(board.mcu, self._seen, back=False))
         if said := restarts.cause(board.others):

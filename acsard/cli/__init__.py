@@ -1,9 +1,8 @@
-"""The command line: one module per verb. Its docstring is the text of its `--help`.
+"""The command line: one module per subcommand, whose docstring is the text of its `--help`.
 
-Each module has `add_options`, and `main`, which calls one room and prints. A verb with actions sets
-the `main` of each action instead. Only the module of the verb that is called is imported, so the
-modules import at their top all that the verb needs. Libraries that may be missing are the
-exception.
+Each module has `add_options`, and `main`, which calls one package and prints. A subcommand with
+actions sets the `main` of each action instead. Only the module of the typed subcommand is imported,
+so each module imports everything it needs at its top, except libraries that may be missing.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
 
 VERBS = {
-    "run": "run the daemon (the default verb)",
+    "run": "run the daemon (the default)",
     "sim": "simulate a microcontroller on a pty, for a separate `acsard run --port …`",
     "check": "check the configuration and print the effective one",
     "topics": "list the keys on the bus: direction, type, rate, meaning",
@@ -55,7 +54,7 @@ VERBS = {
     "completion": "print the script for completion with Tab in a shell",
     "man": "print the text of every --help as a man page",
 }
-"""The verbs in the order of `acsard --help`, with their lines in it. Each one is a module here."""
+"""The subcommands and their help texts, in the order of `acsard --help`. Each is a module here."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 66 no such port, 69 daemon unreachable, 75 port,
@@ -69,7 +68,7 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 
 class _Parser(argparse.ArgumentParser):
-    """An argument parser that suggests the nearest known word for a misspelt verb or choice."""
+    """An argument parser that suggests the nearest known word for a misspelt choice."""
 
     def _check_value(self, action: argparse.Action, value: object) -> None:
         try:
@@ -82,17 +81,17 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of the `acsard` command; it has the options of these verbs only."""
+    """Return the parser of `acsard` with all subcommands, and the options of those in `called`."""
     whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot. It connects "
-        "the robot's microcontroller (serial port) to a Zenoh bus. Without a verb, acsard "
+        "the robot's microcontroller (serial port) to a Zenoh bus. Without a subcommand, acsard "
         "runs the daemon.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     whole.add_argument("--version", action="version", version=f"acsard {__version__}")
-    verbs = whole.add_subparsers(title="verbs", metavar="VERB", dest="verb")
+    verbs = whole.add_subparsers(title="subcommands", metavar="SUBCOMMAND", dest="verb")
     for name, text in VERBS.items():
         verb = verbs.add_parser(name, help=text)
         if name in called:

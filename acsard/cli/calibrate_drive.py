@@ -93,7 +93,7 @@ def guided(
         try:
             return guide(name, made, prompt, robot.ride, simulated=info.simulated), config
         except KeyboardInterrupt:
-            raise GuideError("the operator ended the drive. Nothing is written") from None
+            raise GuideError("the operator ended the drive. No file is written") from None
 
 
 def _usable(args: argparse.Namespace, odometry: str) -> None:

@@ -20,7 +20,7 @@ from acsard.daemon.bus.robot_discovery import ALL, named, present, seen
 from acsard.host.errors import Exit, UsageError
 
 CALLED = tuple(service for service in SERVICES if service != "set")
-"""The services of this verb.
+"""The services of this subcommand.
 
 `set` is missing because `acsard set` calls it and knows the settings.
 """

@@ -1,4 +1,4 @@
-"""Shared by the verbs: the configuration, and the types of their options."""
+"""Options of the subcommands: the configuration, and the types of option values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from acsard.host.errors import Exit, ExitError, UsageError
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
-    """Add `--config`, which nearly every verb takes."""
+    """Add `--config`, which nearly every subcommand takes."""
     parser.add_argument(
         "--config",
         metavar="FILE",
@@ -28,7 +28,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add the options of a verb that asks a person and has a result for the configuration."""
+    """Add the options of a subcommand that asks a person and has a result for the configuration."""
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object")
     form.add_argument(
@@ -75,7 +75,10 @@ def seconds(text: str) -> float:
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
-    """Return an argparse type for a whole number from 1 to `most`; `hint` ends its message."""
+    """Return an argparse type for a whole number from 1 to `most`.
+
+    `hint` is appended to its error message.
+    """
 
     def number(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:

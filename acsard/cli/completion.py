@@ -1,6 +1,6 @@
-"""Print the script with which a shell completes verbs, options, keys, settings, recordings and
-files when you press Tab. Write it to the file that the shell reads. Needs the library shtab; if it
-is missing, a message gives the command that installs it.
+"""Print the script with which a shell completes subcommands, options, keys, settings, recordings
+and files when you press Tab. Write it to the file that the shell reads. Needs the library shtab; if
+it is missing, a message gives the command that installs it.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _words() -> Mapping[tuple[str, str], list[str]]:
-    """Return the words for each (verb, argument).
+    """Return the words for each (subcommand, argument).
 
     The names of sources are those of the defaults.
     """
@@ -108,7 +108,7 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield every option and argument with its verb.
+    """Yield every option and argument with its subcommand.
 
     Those of `recording show` belong to `recording`.
     """

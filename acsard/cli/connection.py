@@ -1,4 +1,4 @@
-"""Shared by the verbs that use the bus: their options, the connection, and checks of keys."""
+"""Options, connection and key checks that all subcommands on the bus share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
     """Add the options of the tools that talk to a running daemon.
 
     Args:
-        parser: the parser of the verb.
+        parser: the parser of the subcommand.
         more: text that is appended to the help of `--id`.
     """
     add_config(parser)
@@ -102,8 +102,8 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot ask this key.
 
-    These are keys that do not answer, services, which would act, and wildcards: `get` prints one
-    answer.
+    It refuses keys that do not answer queries, services, which a query would call, and wildcards,
+    because `get` prints one answer.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(

@@ -73,7 +73,7 @@ def main(args: argparse.Namespace) -> int:
     if args.write:
         writable(args.config)
         if why := withheld(config.mcu.simulated, load(args.config)[1]):
-            raise UsageError(f"{where} would not be changed: {why}; leave --write out")
+            raise UsageError(f"--write cannot change {where}: {why}; leave --write out")
     with _prompt(args, config.mcu.port) as prompt:
         return _checked(args, config, where, prompt)
 

@@ -1,6 +1,6 @@
-"""Work with the recordings that the daemon has made. Without a verb, list them, oldest first, with
-the main events of each. FILE is a recording or its number in that list (default: the newest
-recording).
+"""Work with the recordings that the daemon has made. Without a subcommand, list them, oldest
+first, with the main events of each. FILE is a recording or its number in that list (default: the
+newest recording).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SERVICE = Path("/var/lib/acsard/record")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     _directory(parser, None)
-    actions = parser.add_subparsers(title="verbs", metavar="VERB")
+    actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
     shown = actions.add_parser(
         "show",
         help="print the events of a recording as text",

@@ -1,6 +1,6 @@
 """Run Zenoh in router mode with a configuration file of Zenoh, such as deploy/zenoh/router.json5.
-The router is a child process. It is ended and restarted if a client takes all its time or memory.
-It runs no plugins; for storages use zenohd.
+The router is a child process. It is killed and restarted if a client takes all of the router's
+processor time or memory. It runs no plugins; for storages use zenohd.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
     )
-    # The verb starts itself with this option: the child is the router and ends with its standard
-    # input.
+    # The subcommand starts itself with this option: the child is the router and ends with its
+    # standard input.
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
 

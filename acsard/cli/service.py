@@ -103,5 +103,5 @@ def _do(steps: Iterable[Step], dry_run: bool) -> None:
             raise
         except OSError as error:
             raise MendableError(
-                f"could not: {step}: {error.strerror}; fix that and run it again"
+                f"failed: {step}: {error.strerror}; fix that and run this command again"
             ) from None

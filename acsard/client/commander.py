@@ -60,7 +60,7 @@ NEVER = ("inactive", "stopped", "fault", "shutdown")
 
 
 class Wish(Struct, frozen=True):
-    """A command, and its time by the clock of its sender, ns; None for a sender without a clock."""
+    """A command, and its time on the sender's clock, ns; None for a sender without a clock."""
 
     twist: Twist
     stamp_ns: int | None = None
@@ -212,5 +212,5 @@ def heard(state: RobotState, source: str) -> bool:
 
 
 def hopeless(state: RobotState, source: str) -> bool:
-    """Return whether waiting cannot help a sender whose commands do not count."""
+    """Return whether the daemon will keep refusing this source, so that waiting cannot help."""
     return state.mode in NEVER or all(one.name != source for one in state.sources)

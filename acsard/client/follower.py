@@ -71,14 +71,14 @@ class Follower:
         return False
 
     def asks(self, now: float) -> bool:
-        """Return whether to query the state now, and count on the caller to do it."""
+        """Return whether the caller must query `state` now, and plan the next query."""
         if now < self.due:
             return False
         self.due = now + self._ask_s
         return True
 
     def age(self, now: float) -> float:
-        """Return the time since the daemon was last heard, or since the start, s."""
+        """Return the time since the last sign of life of the daemon, or since the start, s."""
         return max(0.0, now - self.last_seen)
 
     @property

@@ -1,4 +1,4 @@
-"""Binds a `Follower` to the bus: subscribes to `state`, and queries it if it is late."""
+"""Binds a `Follower` to the bus: subscribes to `state`, and queries it if none arrives in time."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Watch(Follower):
         """Replies to queries. A thread of Zenoh puts them here and does nothing else."""
 
     def look(self, now: float) -> list[RobotState]:
-        """Take the states that have arrived, query a late one, and return those that are news.
+        """Take the states that have arrived, query a late one, and return the new ones.
 
         Raises `ZError` after the session was closed.
         """
@@ -76,7 +76,7 @@ class Watch(Follower):
             return None
 
     def objection(self, source: str, sender: str, now: float) -> str:
-        """Return why commands have no effect, or "" if they have or no state has arrived yet."""
+        """Return why commands have no effect; "" if they have one, or before the first state."""
         if self.silent(now):
             return "nothing received from the daemon: does it run?"
         return "" if self.state is None else objection(self.state, source, sender)

@@ -146,7 +146,7 @@ class Robot:
 
     @property
     def latches(self) -> Latches:
-        """The latches in force, also in the middle of a step that a bug has ended."""
+        """The latches in force. They are valid even after an exception in the middle of a step."""
         return self._life.latches
 
     @property

@@ -270,7 +270,7 @@ class WheelsStatus(Struct, frozen=True):
 
 
 class RoutersStatus(Struct, frozen=True):
-    """The connections of `bus.connect`. All fields are empty if the setting is."""
+    """The connections of `bus.connect`. All fields are empty if `bus.connect` is empty."""
 
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()

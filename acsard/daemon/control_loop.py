@@ -134,7 +134,7 @@ class ControlLoop:
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time of the next step for a command that came too soon after a line, if any."""
+        """Monotonic time of the extra step for a command that came too soon after the last line."""
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
@@ -257,7 +257,7 @@ class ControlLoop:
                     by = caller_name(arrival.via, arrival.attachment, arrival.sender)
                     requests.append(Request("stop", asked_ns=arrival.arrived_ns, by=by))
                 else:
-                    refusals.append(Refusal("not_a_put", "stop: a DELETE is not a stop"))
+                    refusals.append(Refusal("not_a_put", "stop: send a PUT, not a DELETE"))
                 continue
             try:
                 commands.append(self._receiver.command(arrival))

@@ -54,9 +54,9 @@ class Departure:
         self.hurried = False
 
     def watch(self) -> None:
-        """Handle the signals.
+        """Handle the signals that end the daemon.
 
-        Those of a closed terminal are included, because it must not leave the wheels turning.
+        SIGHUP is one of them, because closing the terminal must stop the wheels.
         """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):

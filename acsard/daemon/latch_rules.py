@@ -84,7 +84,7 @@ def decode(robot: str, data: bytes) -> Latches:
 
 
 def at_start(why: str) -> str:
-    """Return the text of a stop that the daemon itself sets when it starts, because of `why`."""
+    """Return the reason text of a stop that the daemon itself sets at its start."""
     return f"stopped when the daemon started, because {why}"
 
 
@@ -164,7 +164,7 @@ class Handover:
 
     @property
     def held(self) -> bool:
-        """Return whether a process that is killed now would start with these latches."""
+        """Return whether the daemon would restart with these latches if it were killed now."""
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:

@@ -198,7 +198,10 @@ class Stopwatch:
             self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
-        """Record a line that left, after one at `before_ns`, by the age of its command."""
+        """Record the age of a line's command at the time of sending.
+
+        `before_ns` is when the line before was sent.
+        """
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
@@ -209,7 +212,7 @@ class Stopwatch:
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """Record a feedback line.
 
-        `told_ns` is when its messages were queued, None if nobody listens.
+        `told_ns` is when its messages were queued for the bus, None without subscribers.
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:

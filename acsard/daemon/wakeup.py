@@ -125,7 +125,7 @@ class Next(Struct, frozen=True):
 class Wakeup:
     """The wake-up of the control loop.
 
-    A call runs a step; a call during a step runs one afterwards.
+    A call runs a step at once. A call during a step runs another step after it.
     """
 
     def __init__(self) -> None:

@@ -34,9 +34,10 @@ WAITING = 100
 
 
 class Notice(Struct, frozen=True):
-    """A message.
+    """A message to the viewer.
 
-    `stays` is the id of a lasting status, or "" for a single message; an empty `text` ends it.
+    `stays` is the id of a lasting status, or "" for a single message. An empty `text` removes the
+    lasting status.
     """
 
     level: Level

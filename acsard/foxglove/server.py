@@ -1,6 +1,6 @@
 """The websocket server of foxglove-sdk: its callbacks and its start.
 
-The library implements the protocol. The protocol has no authentication, so the verb
+The library implements the protocol. The protocol has no authentication, so the subcommand
 (`cli/foxglove.py`) takes only an address of this machine.
 """
 

@@ -28,7 +28,7 @@ NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "propertie
 
 
 def services(robot: Client, ros: RosConfig, verbs: Iterable[Verb]) -> list[foxglove.Service]:
-    """Return the services for these verbs under their ROS names, for example `/acsard/stop`."""
+    """Return these services of the robot under their ROS names, for example `/acsard/stop`."""
     return [_service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in verbs]
 
 

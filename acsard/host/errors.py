@@ -2,8 +2,8 @@
 
 Each error is an `AcsardError` and also the built-in exception that Python uses for such a case, so
 either can be caught. The text says what is wrong and how to fix it. Each class has the exit code of
-a verb that ends with it. A `MendableError` itself is for what no other class names. Bugs are not
-among these errors, and neither are states of the robot, such as a lost port or a stale command.
+a subcommand that ends with it. A `MendableError` itself is for what no other class names. Bugs are
+not among these errors, and neither are states of the robot, such as a lost port or a stale command.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class MendableError(AcsardError):
     """Base class of these errors."""
 
     code: Exit = Exit.FAILURE
-    """Exit code of a verb that ends with this error."""
+    """Exit code of a subcommand that ends with this error."""
 
 
 class UsageError(MendableError, ValueError):

@@ -83,8 +83,8 @@ class Authority:
 
     @property
     def limited(self) -> bool:
-        """Whether the authority may sign for some names only. One from an earlier version may sign
-        for any.
+        """Whether the authority may sign for some names only. An authority that an earlier version
+        made may sign for any name.
         """
         return bool(self._permitted())
 

@@ -1,6 +1,6 @@
 """Examines the daemon: whether it can be reached, whether it runs, and its own reports.
 
-Two states of the daemon tell how well the link to the microcontroller works.
+The counters of two `state` messages, a second apart, show how well the serial link works.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LOST = 0.02
 
 
 def link(running: Running) -> Iterator[Finding]:
-    """Yield findings about the link, by the counters and reports of the daemon."""
+    """Yield findings about the serial link, from the counters and reports of the daemon."""
     config, state = running.config, running.state
     mend = check(running)
     if state.link != "up":
@@ -58,7 +58,7 @@ def link(running: Running) -> Iterator[Finding]:
     for times, text in went:
         yield Finding("link", "warning" if times > often else "ok", text, mend)
     if not problems and not late and not went:
-        yield Finding("link", "ok", "up, and no line is lost")
+        yield Finding("link", "ok", "up, and no serial line is lost")
     if state.wheel_fault:
         yield Finding("wheels", "warning", state.wheel_fault, mend)
 
@@ -89,7 +89,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return the number of lost links that this computer did not cause, with a description."""
+    """Return the number of link losses that this computer did not cause, with a description."""
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
         f"it was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
@@ -202,7 +202,7 @@ def daemon(running: Running) -> Iterator[Finding]:
 
 
 def latch_file(trouble: str) -> Iterator[Finding]:
-    """Report that a stop would be lost at a restart, if it would."""
+    """Yield a warning if a stop would be lost at a restart; `trouble` is the reason."""
     if trouble:
         mend = "free disk space, or name a writable directory: control.state_directory"
         yield Finding("latch file", "warning", trouble, mend)

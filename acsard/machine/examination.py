@@ -103,16 +103,15 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
 
     Args:
         wanted: the setting control.real_time.
-        pid: the process of the daemon on this machine; without one, the rights of this process
-            count.
+        pid: the daemon's process on this machine; None checks the permissions of this process.
     """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
         yield Finding("real time", "ok", "is not requested (control.real_time = false)")
     elif has:
-        yield Finding("real time", "ok", f"the daemon that runs (pid {pid}) has it")
+        yield Finding("real time", "ok", f"the running daemon (pid {pid}) uses it")
     elif has is False:
-        yield Finding("real time", "warning", f"the daemon that runs (pid {pid}) has none", REAL)
+        yield Finding("real time", "warning", f"the running daemon (pid {pid}) lacks it", REAL)
     elif real_time.allowed():
         yield Finding("real time", "ok", "is permitted")
     else:

@@ -135,7 +135,7 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
-        yield Finding("configuration", "ok", f"the running daemon ({who}) has it")
+        yield Finding("configuration", "ok", f"the running daemon ({who}) has that of the file")
         return
     for belongs, level, how, mend in WAYS:
         its = {key: one for key, one in others.items() if belongs(key)}

@@ -221,8 +221,8 @@ def uninstalling(
 ) -> list[Step]:
     """Return the steps that remove the service, with a reason for each file that stays.
 
-    A changed file stays unless `force` or `purge` is set; for a `kept` file only `purge` counts.
-    `others` and the `STATES` of the `stateful` units stay unless `purge` is set.
+    A changed file stays unless `force` or `purge` is set. A changed `kept` file stays unless
+    `purge` is set, and so do `others` and the `STATES` of the `stateful` units.
     """
     there = [file for file in wanted if found[file.path] is not None]
     why: dict[Path, str] = {}

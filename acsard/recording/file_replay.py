@@ -127,7 +127,7 @@ class RecordedRun:
             self.number = step.number
             yield step
         if self.number is None:
-            raise RecordingError(f"{path} has no complete second of steps")
+            raise RecordingError(f"{path} has no steps: it ends within its first second")
 
 
 def replay_file(

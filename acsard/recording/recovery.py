@@ -50,13 +50,13 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     try:
         if not _has_configuration(part):
             if before.st_size > NOTHING_BYTES or _has_chunks(part):
-                raise RecordingError(f"{part} has no readable beginning")
+                raise RecordingError(f"{part} has no readable beginning: nothing can be recovered")
             part.unlink()
             return f"{part.name} is removed: it has no beginning" if before.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
             if recording.damaged or before.st_size > NOTHING_BYTES or _has_chunks(part):
-                raise RecordingError(f"{part} has no intact data")
+                raise RecordingError(f"{part} has no intact data: nothing can be recovered")
             part.unlink()
             return ""
         if room and _copy(recording, part, whole, cut):

@@ -1,9 +1,9 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
 A recording is protected if an incident happened in it, or within a minute of it. Protected
-recordings are deleted last. Other programs use the disk too, so a part of the disk is left to them.
-If they need more than that part, the unprotected recordings other than the newest are deleted. All
-others are deleted only when the room to record is nearly used up.
+recordings are deleted last. A part of the disk is left to other programs. If they need more than
+that part, the unprotected recordings except the newest are deleted. Protected recordings and the
+newest are deleted only when the space for recordings is nearly used up.
 
 `ClockWatch` decides whether the wall clock can be trusted for the age of a recording.
 """
@@ -191,7 +191,7 @@ class ClockWatch(Struct):
 
 
 class IncidentWindow(Generic[File]):
-    """Finds the recording files within a minute of an incident, while files begin and end.
+    """Finds the recording files within a minute of an incident, while the recording goes on.
 
     All times are ns of the monotonic clock.
     """

@@ -247,7 +247,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
         trouble = trouble if rare.trouble is None else rare.trouble
         status = rare.status or status
         if opened is None or trouble is None or status is None:
-            raise ValueError("the first step lacks a value that every first step has")
+            raise ValueError("its first step has no `opened`, `trouble` or `status`")
         now = _instant(batch, tick_ns + row.now * batch.unit, row.offset)
         received = []
         for read in row.reads:

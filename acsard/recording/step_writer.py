@@ -127,7 +127,7 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Mark the file that is being written, so that it does not pass for one that a crash cut.
+        """Mark the unfinished file, so that the next start does not report it as cut by a crash.
 
         Another thread may call this method while `write` waits for the disk.
         """

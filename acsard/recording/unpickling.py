@@ -166,7 +166,9 @@ class _Machine:
         """
         if name in ARGUMENTS:
             if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
-                raise ValueError(f"it has a number of {argument.bit_length()} bits")
+                raise ValueError(
+                    f"it has a number of {argument.bit_length()} bits, too large for a robot"
+                )
             self._push(argument)
         elif name in VALUES:
             self._push(VALUES[name])
@@ -305,11 +307,11 @@ class _Machine:
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
-            raise ValueError(f"it sets attributes of a {type(whole.value).__name__}")
+            raise ValueError(f"it sets attributes of a {type(whole.value).__name__}, not of a part")
         for name in named:
             if not isinstance(name, str) or hasattr(type(whole.value), name):
                 raise ValueError(
-                    f"it sets the attribute {name!r:.50} of a {type(whole.value).__name__}"
+                    f"it replaces {name!r:.50} of the class {type(whole.value).__name__}"
                 )
         whole.holds([state])
         self._copies(state)

@@ -1,9 +1,9 @@
 """`--json-lines`: a program, such as the robot's page, shows the prompts to a person.
 
 Texts and questions are written to standard output as JSON objects, one per line. Answers, key
-presses and signs of life are read from standard input. The end of the input interrupts the verb as
-Ctrl-C does. So does a silence of the program while something may move: the program sends as long as
-it is in contact with the person. deploy/web/README.md describes the fields.
+presses and signs of life are read from standard input. The end of the input interrupts the
+subcommand as Ctrl-C does. So does a silence of the program while something may move: the program
+sends as long as it is in contact with the person. deploy/web/README.md describes the fields.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ hand, each command is a sign of life, and the source's timeout applies.
 LISTEN_S = 0.05
 
 LINE_BYTES = 65536
-"""Largest length of an input line. A longer one interrupts the verb, because the program is
+"""Largest length of an input line. A longer one interrupts the subcommand, because the program is
 faulty.
 """
 
@@ -152,7 +152,7 @@ class JsonPrompt:
             file = writable(config)
             require_changeable(file, keys)
         except MendableError as error:
-            self.say(f"The tool cannot write the file from here: {error}")
+            self.say(f"The tool cannot write the file: {error}")
             return False
         wanted = self.ask(f"Write these lines into {file}? Its comments stay.", ("write", "leave"))
         self._moves = False
@@ -204,7 +204,7 @@ class JsonPrompt:
     # Input
 
     def _listen(self) -> None:
-        """Read the input until the conversation ends; any other end interrupts the verb."""
+        """Read the input until the conversation ends; any other end interrupts the subcommand."""
         try:
             self._end(self._heard_out())
         except BaseException as error:

@@ -1,4 +1,4 @@
-"""The protocol of a prompt, and the signals that end a verb that asks.
+"""The protocol of a prompt, and the signals that end a subcommand that asks.
 
 Change its three forms together: `TerminalPrompt`, `NoPrompt` and `JsonPrompt`.
 """
@@ -56,7 +56,7 @@ class Prompt(Protocol):
     """
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """Show which robot or board the verb is about."""
+        """Show which robot or board the subcommand is about."""
 
     def say(self, text: str) -> None:
         """Show a text that stays visible."""
@@ -99,7 +99,7 @@ class Prompt(Protocol):
 
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-"""The signals that end a verb that moves something.
+"""The signals that end a subcommand that moves something.
 
 Ctrl-Z is included because a suspended program would leave a wheel turning.
 """

@@ -31,11 +31,11 @@ COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_
 
 
 class Screen:
-    """Output of a verb that asks.
+    """Output of a subcommand that asks.
 
     The present activity is a line on the terminal that the next output overwrites. It is left out
-    if standard error is a pipe. With `as_json`, the verb prints one JSON object at its end, so that
-    only texts and questions are shown.
+    if standard error is a pipe. With `as_json`, the subcommand prints one JSON object at its end,
+    so that only texts and questions are shown.
     """
 
     def __init__(self, as_json: bool = False) -> None:
@@ -119,7 +119,7 @@ class TerminalPrompt(Screen):
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """Return one of the answers; q, or the end of the input, ends the verb."""
+        """Return one of the answers; q, or the end of the input, ends the subcommand."""
         self._clear()
         choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
         while True:

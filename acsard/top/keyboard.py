@@ -53,7 +53,7 @@ class Keyboard:
             self._move, self._until, self._zeros = (0, 0), now, ZEROS
 
     def wish(self, now: float) -> Twist | None:
-        """Return the command that is wished at `now` s, or None if nothing is to be sent."""
+        """Return the command for the keys pressed until `now` s, or None to send nothing."""
         if now < self._until:
             return Twist(self.linear * self._move[0], self.angular * self._move[1])
         if self._zeros:

@@ -38,10 +38,9 @@ def drive(ride: Ride) -> None:
 
 
 def part(ride: Ride) -> None:
-    """Print a last report when the robot stands, or after `PART_S`.
+    """Wait until the robot stands, at most `PART_S`, and print a last report.
 
-    Without the wait, the last line would say that the robot drives although it stands a moment
-    later.
+    Without the wait, this report would say that the robot drives although it stops a moment later.
     """
     left = time.monotonic()
     while os.isatty(0) and os.isatty(1):

@@ -142,7 +142,7 @@ class Admission:
                 answer.force_close()
             return answer
         except TimeoutError:
-            return problem(503, "the disk does not answer")
+            return problem(503, "the disk of this page's server does not answer: try again")
         except TroubleError as trouble:
             return problem(trouble.status, str(trouble))
         except web.HTTPException as error:

@@ -255,7 +255,7 @@ class Page:
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Return the newest picture of the camera, once the client has not seen it."""
+        """Wait for a camera picture that the client has not seen, and return it."""
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.mono_ns()
         picture = await self._camera.after(int(seen) if seen.isdecimal() and len(seen) < 16 else 0)

@@ -110,7 +110,7 @@ def place(asked: Asked, names: Collection[str]) -> Place:
     if asked.proxied:
         raise RefusedError(
             "proxy",
-            "through a proxy every browser would seem to run on this machine: open this page "
+            "the request came through a proxy, which hides the browser's machine: open this page "
             "without a proxy, and from another machine by https",
         )
     host = host_name(asked.host)
@@ -119,7 +119,7 @@ def place(asked: Asked, names: Collection[str]) -> Place:
     if not asked.secure:
         raise RefusedError(
             "plain" if not is_loopback(asked.peer) else "host",
-            f"{host or 'no name'!r} is not a name by which this machine calls itself: use "
+            f"the request is for {host or 'no host'!r}, but plain http is only for localhost: use "
             "http://localhost here, and https from another machine",
         )
     if host not in names:
@@ -131,7 +131,9 @@ def require_own_origin(asked: Asked) -> None:
     """Raise `RefusedError` if a web page of another origin made the browser send this request."""
     strange = asked.origin is not None and asked.origin.lower() != _own_origin(asked)
     if strange or asked.site not in (None, "same-origin", "none"):
-        raise RefusedError("origin", "a page from another origin may not do that")
+        raise RefusedError(
+            "origin", "the request comes from a page of another site: open the robot's own page"
+        )
 
 
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:

@@ -92,7 +92,7 @@ class Command(_Frame, frozen=True):
 
     @property
     def stamp_ns(self) -> int:
-        """The stamp in ns."""
+        """The stamp in ns since 1970."""
         return int(self.stamp * 1e6)
 
     @property

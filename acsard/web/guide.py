@@ -94,7 +94,7 @@ class Guide:
     """The running check or calibration and the viewers that are informed of it."""
 
     def __init__(self, reach: Reach, configured: str) -> None:
-        """Store how a child reaches the daemon, and the serial port of the configuration."""
+        """Store how a child reaches the daemon, and `configured`, the configured serial port."""
         self._reach, self._configured = reach, configured
         self._viewers: dict[object, Say] = {}
         self._errand: _Errand | None = None

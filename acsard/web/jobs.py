@@ -36,12 +36,12 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
         if begin.method or begin.positions:
-            raise FrameError("begin", "method and positions are only for calibrate")
+            raise FrameError("begin", "`method` and `positions` are only for a calibration")
         if begin.port not in ports:
             raise FrameError("begin", f"port is one of {', '.join(sorted(ports))}")
         return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
     if begin.port:
-        raise FrameError("begin", "port is only for check")
+        raise FrameError("begin", "`port` is only for the check of a board")
     given = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
     if reach.tls:
         given.append(f"--tls={reach.tls}")
@@ -52,8 +52,8 @@ def _method(begin: Begin) -> list[str]:
     if begin.method and begin.method not in NEEDS:
         raise FrameError("begin", f"method is one of {', '.join(NEEDS)}")
     if (begin.method == POSITIONS) != bool(begin.positions):
-        raise FrameError("begin", "positions is the key of the positions, for the method positions")
+        raise FrameError("begin", f"`positions` is a key; it belongs to the method {POSITIONS}")
     if begin.positions and not KEY.match(begin.positions):
-        raise FrameError("begin", "positions must be a key like sim/pose: letters, digits, _ / -")
+        raise FrameError("begin", "`positions` must be a key like sim/pose: letters, digits, _ / -")
     options = {"method": begin.method, "positions": begin.positions}
     return [f"--{name}={value}" for name, value in options.items() if value]

@@ -41,7 +41,7 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key or change its rate. An invalid request is refused to the viewer."""
+        """Subscribe to a key or change its rate. The viewer receives the reason for a refusal."""
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)
@@ -56,19 +56,21 @@ class Keys:
         others = sum(1.0 / one.period for one in self._out.following.values() if one is not known)
         if others + frame.rate > FRAMES_HZ:
             self._out.refuse(
-                "subscribe", "too_many", f"at most {FRAMES_HZ:g} messages a second in all"
+                "subscribe",
+                "too_many",
+                f"at most {FRAMES_HZ:g} messages a second in all: lower the rates",
             )
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
         elif len(self._out.following) >= MOST:
-            self._out.refuse("subscribe", "too_many", f"at most {MOST} keys")
+            self._out.refuse("subscribe", "too_many", f"at most {MOST} keys: unsubscribe some")
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
                 f"one token may follow {STREAMS_OF_ONE} keys of other robots at once, "
                 f"and all tokens together {STREAMS}"
             )
-            self._out.refuse("subscribe", "too_many", f"no room: {text}; unsubscribe some")
+            self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe some")
         else:
             one = Following(robot, key, self._robots.id, 1.0 / frame.rate)
             self._out.following[robot, key] = one

@@ -77,11 +77,12 @@ def sockets_for(files: int) -> int:
 
 
 class Sockets(Generic[C]):
-    """The open TCP connections. A new one displaces the oldest one that has shown no valid token.
+    """The open TCP connections. When all places are taken, a new connection displaces an old one.
 
-    It is displaced from the network that has the most such connections, so a flood from a few
-    networks displaces its own connections. If every connection has shown a valid token, the oldest
-    one of the token that has the most goes, if that token has more than one browser needs.
+    1. The network with the most connections without a valid token loses its oldest such connection,
+       so a flood from a few networks displaces its own connections.
+    2. If every connection has shown a valid token, the token with the most connections loses its
+       oldest one, unless it has only as many as one browser needs.
     """
 
     def __init__(self, most: int) -> None:

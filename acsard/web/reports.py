@@ -81,7 +81,7 @@ State = Literal["drawing", "ready", "failed", "busy"]
 
 
 class ReportState(Struct, frozen=True, omit_defaults=True):
-    """ReportState of a report."""
+    """The state of a report."""
 
     report: State
     text: Annotated[str, Meta(description="why it failed, or the reason to wait")] = ""

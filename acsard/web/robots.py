@@ -46,7 +46,7 @@ PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
 """Age and number of the points of a path at most, and the distance of two points at least."""
 
 JUMP_M = 1.0
-"""A longer step than any robot moves between two states, so the pose was set."""
+"""Step of the pose between two states that no robot can drive, m: the pose was set."""
 
 Connect = Callable[[], Client]
 """Opens the connection to the daemon or raises `UnreachableError`; it blocks."""

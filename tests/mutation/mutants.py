@@ -64,7 +64,7 @@ class Mutant(NamedTuple):
 
 
 def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
-    """The faults this node may have: what would stand in its place."""
+    """Return the nodes that may replace this node, one for each fault."""
 
     def made(kind: type, **changed: Any) -> Any:
         parts = {name: getattr(node, name) for name in node._fields} | changed

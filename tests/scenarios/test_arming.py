@@ -75,7 +75,7 @@ def test_a_shared_sender_that_a_crowd_pushed_out_must_let_go_as_before(way: Way)
 
 @pytest.mark.parametrize("pauses", [(1.1, 1.1, 5.0), pytest.param((60.0,), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("way", get_args(Way))
-def test_a_pause_arms_nobody(way: Way, pauses: tuple[float, ...]) -> None:
+def test_a_pause_arms_no_sender(way: Way, pauses: tuple[float, ...]) -> None:
     """A user ran `ros2 topic pub -r 10 /cmd_vel`, Ctrl-C, and the same line again: 2.0 m."""
     world, (speaker,) = cleared(way, "a")
     since_ns = world.now_ns

@@ -414,7 +414,7 @@ def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
 
 
 @by_each_way
-def test_of_two_on_the_same_key_the_first_is_obeyed_alone_and_the_second_is_told(
+def test_of_two_on_the_same_key_the_first_is_obeyed_alone_and_the_second_is_reported(
     world: World, via: Via
 ) -> None:
     first, second = Person(world, via, "a"), Person(world, via, "b")

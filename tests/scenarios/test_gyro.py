@@ -118,7 +118,7 @@ def test_the_diagnostics_show_bias_delay_and_the_track_it_implies() -> None:
     assert values["multiplier_in_use"] == 1.0
 
 
-def test_a_gyro_that_dies_is_told_and_the_wheels_go_on() -> None:
+def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
     made = world()
     made.drive(0.3, 0.5, 1.0)
     made.gyro_dead = True
@@ -152,7 +152,7 @@ def test_where_the_pose_is_set_what_the_wheels_told_before_is_of_no_account(
 
 
 @pytest.mark.slow
-def test_wheels_that_lose_their_grip_are_told() -> None:
+def test_wheels_that_lose_their_grip_are_reported() -> None:
     made = world()
     wandering(made, 5, seconds=20.0)
     made.drive(0.0, 1.0, 2.0)
@@ -227,7 +227,7 @@ def test_the_covariance_knows_how_well_the_track_is_known() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_learned_is_lived_again_to_the_last_bit() -> None:
+def test_what_was_learned_is_replayed_to_the_last_bit() -> None:
     tape = Tape()
     made = world(learned_track=True, recorder=tape)
     wandering(made, 13, seconds=25.0)

@@ -46,7 +46,7 @@ def moving(lines: list[bytes]) -> list[bytes]:
     return [line for line in lines if line not in (ZERO, b"\r\n")]
 
 
-def test_unplugging_is_told_at_once_and_wishes_nothing(world: World) -> None:
+def test_unplugging_is_reported_at_once_and_wishes_nothing(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     world.port.unplug()
     world.run(0.01)
@@ -448,7 +448,7 @@ def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> 
 
 @pytest.mark.variations(9)
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands"])
-def test_a_link_that_loses_lines_is_told_once(fault: str) -> None:
+def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:
     world = World()
     with world.mcu.having(named(fault)):
         world.run(25.0)

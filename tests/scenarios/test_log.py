@@ -60,7 +60,7 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
 
 
 @pytest.mark.parametrize("service", [key.removeprefix("srv/") for key in VERBS])
-def test_every_service_is_told_once_with_who_called_it(world: World, service: str) -> None:
+def test_every_service_is_reported_once_with_who_called_it(world: World, service: str) -> None:
     if service == "clear":
         call(world, "stop", signed("ann@desk"))
     call(world, service, signed("joe@laptop patrol"))
@@ -82,7 +82,7 @@ def test_who_stopped_and_who_cleared_stand_in_order(world: World) -> None:
     ]
 
 
-def test_a_second_one_who_stops_is_told_too_a_second_later(world: World) -> None:
+def test_the_stop_of_a_second_client_is_reported_a_second_later(world: World) -> None:
     call(world, "stop", signed("joe"))
     call(world, "stop", signed("ann"))
     assert [event.by for event in told(world, "stop")] == [shown("joe")]
@@ -98,7 +98,9 @@ def test_ros_says_less_of_who_calls_and_the_log_says_so(world: World) -> None:
     assert told(world, "clear")[0].by == "unnamed (bridge)"
 
 
-def test_a_put_on_stop_is_told_with_its_name_or_the_session_that_stamped_it(world: World) -> None:
+def test_a_put_on_stop_is_reported_with_its_name_or_the_session_that_stamped_it(
+    world: World,
+) -> None:
     world.put("stop", b"", stamp_ns=1)
     world.run(2.0)
     world.bus.arrivals.append(

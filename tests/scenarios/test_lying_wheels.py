@@ -128,7 +128,7 @@ def test_with_a_gyro_the_heading_and_the_distance_stay_right() -> None:
     assert turn < 0.05
 
 
-def test_pushed_by_hand_with_a_dead_encoder_nothing_is_known_and_slip_is_told() -> None:
+def test_pushed_by_hand_with_a_dead_encoder_nothing_is_known_and_slip_is_reported() -> None:
     made = world()
     made.drive(0.3, seconds=0.5)
     made.send(0.0)

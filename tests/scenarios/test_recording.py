@@ -73,7 +73,7 @@ def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(afte
         pytest.param(FULL, id="checked, counted, with a gyro"),
     ],
 )
-def test_a_drive_through_every_fault_is_lived_again_to_the_last_bit(config: Config) -> None:
+def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config) -> None:
     tape = Tape()
     world = World(config, recorder=tape)
     assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS}
@@ -83,7 +83,7 @@ def test_a_drive_through_every_fault_is_lived_again_to_the_last_bit(config: Conf
     lives_again(tape, config)
 
 
-def test_settings_that_were_changed_meanwhile_are_lived_again_too() -> None:
+def test_settings_that_were_changed_meanwhile_are_replayed_too() -> None:
     tape = Tape()
     world = World(PLAIN, recorder=tape)
     world.drive(0.5, seconds=1.0)
@@ -113,13 +113,13 @@ def test_it_goes_on_from_any_moment_of_such_a_drive() -> None:
 
 @pytest.mark.soak
 @pytest.mark.timeout(1200)
-def test_ten_minutes_through_every_fault_are_lived_again() -> None:
+def test_ten_minutes_through_every_fault_are_replayed() -> None:
     lives_again(taped(FULL, 600.0), FULL)
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
-def test_an_hour_through_every_fault_is_lived_again() -> None:
+def test_an_hour_through_every_fault_is_replayed() -> None:
     lives_again(taped(PLAIN, 3600.0), PLAIN)
 
 

@@ -313,7 +313,7 @@ def test_a_stop_while_the_bus_closes_is_there_at_the_next_start() -> None:
 
 @pytest.mark.parametrize("by", ["put", "call"])
 @pytest.mark.parametrize("where", ["_note", "_publish"])
-def test_a_stop_beside_a_bug_outside_of_the_robot_is_there_at_the_next_start(
+def test_a_stop_in_the_step_of_a_bug_survives_the_restart(
     monkeypatch: pytest.MonkeyPatch, where: str, by: str
 ) -> None:
     host = Host(random.Random(16))

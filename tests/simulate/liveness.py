@@ -161,7 +161,7 @@ class Liveness:
         run.run_to(run.true_ns + NS)
 
     def _check_course(self, speed: float, turn: float) -> None:
-        """The robot drives as it was told, or slower on the same curve."""
+        """The robot drives as commanded, or slower on the same curve."""
         run = self.run
         witness, limits = run.witness, run.witness.limits
         got, told = witness.twist(witness.last), witness.clamped(speed, turn)

@@ -39,7 +39,7 @@ class PoseWitness:
         self._last: tuple[int, Pose] | None = None
 
     def doubt(self) -> None:
-        """A way was lost that no encoder told of: compare from the next estimate on."""
+        """The encoders missed a part of the drive: restart the comparison at the next estimate."""
         self._anchor = self._last = None
 
     def placed(self) -> None:

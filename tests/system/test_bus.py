@@ -185,7 +185,7 @@ def test_a_get_on_every_schema_answers_one_per_type(bus: Bus) -> None:
     assert {*PUBLISHED.values(), *asked} <= set(types)
 
 
-def test_a_schema_that_does_not_exist_is_no_answer_at_once(bus: Bus) -> None:
+def test_a_query_for_a_missing_schema_ends_at_once_without_an_answer(bus: Bus) -> None:
     start = time.monotonic()
     assert bus.ask("schema/Nonsense") == []
     assert time.monotonic() - start < 1.0 + lost(start)
@@ -312,7 +312,7 @@ def test_a_delete_on_stop_is_counted_as_not_a_put_and_latches_nothing(bus: Bus) 
     until(lambda: bus.count("commands") > before, 5.0, "the command behind it")
     state = bus.state()
     assert state["counters"]["command_not_a_put"] == refused + 1
-    assert state["refused"] == "stop: a DELETE is not a stop"
+    assert state["refused"] == "stop: send a PUT, not a DELETE"
     assert state["mode"] != "stopped"
     bus.at_rest()
 

@@ -324,13 +324,13 @@ def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path
             assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
             assert program.ended(5.0) == 1
             assert "a key was pressed" in terminal.screen
-            assert "writes nothing" in terminal.screen
+            assert "writes no file" in terminal.screen
         assert daemon.config.read_bytes() == before
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["stop", "teleop", "interrupt"])
-def test_whatever_else_ends_a_leg_is_told(tmp_path: Path, how: str) -> None:
+def test_whatever_else_ends_a_leg_is_reported(tmp_path: Path, how: str) -> None:
     with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         with calibrating(daemon) as (terminal, program):
@@ -425,7 +425,7 @@ def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free
                 assert recorder.samples["places"][0] == Sample(9.0, 7.0, (1.5, -2.0))
 
 
-def test_what_is_no_position_and_what_does_not_come_is_told(
+def test_positions_that_are_missing_or_of_another_type_are_reported(
     free: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(robot_on_bus, "FIRST_S", 0.2)

@@ -332,7 +332,7 @@ def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
     assert ended.seconds < 4.0 + lost(begun)
 
 
-def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -> None:
+def test_a_robot_of_another_id_is_not_reached_and_that_is_reported(shared: Daemon) -> None:
     ended = tool(shared, "call", "stop", "--id", "other")
     assert (ended.code, ended.out) == (69, "")
     assert "other" in ended.err

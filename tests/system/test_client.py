@@ -336,7 +336,7 @@ def test_services_answer_in_words(shared: Daemon, fresh: Bus) -> None:
         assert (pose.x, pose.y, pose.yaw) == pytest.approx((1.0, 2.0, 0.5))
 
 
-def test_a_source_that_is_not_listed_is_told_so_in_state(shared: Daemon, fresh: Bus) -> None:
+def test_a_source_that_is_not_listed_is_reported_in_state(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint, source="stranger") as robot:
         before = fresh.count("command_unknown_source")
         with pytest.raises(NotDrivenError, match=r"commands\.sources"):

@@ -123,7 +123,9 @@ def test_a_daemon_that_runs_is_asked_how_it_is(tmp_path: Path) -> None:
     assert code in (0, 1)  # the far peer itself holds the pty
 
 
-def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_told(tmp_path: Path) -> None:
+def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_reported(
+    tmp_path: Path,
+) -> None:
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, words=("--port", str(peer.path))) as daemon:
         peer.awaits(b"ap00.00")
         kept = tmp_path / "daemon.states"
@@ -157,7 +159,9 @@ def test_a_daemon_that_was_started_with_listen_and_id_is_asked_by_them(tmp_path:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="makes a process namespace")
-def test_of_a_daemon_on_another_machine_only_what_it_says_of_itself_is_told(tmp_path: Path) -> None:
+def test_of_a_daemon_on_another_machine_only_what_it_says_of_itself_is_reported(
+    tmp_path: Path,
+) -> None:
     apart = ("unshare", "--pid", "--fork", "--kill-child")
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path, before=apart) as daemon:
         peer.awaits(b"ap00.00")

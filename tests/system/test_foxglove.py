@@ -406,7 +406,7 @@ def test_services_answer_in_the_daemon_s_words(viewer: Viewer, bus: Bus) -> None
 
 
 @SLOW
-def test_parameters_are_the_live_settings_and_errors_are_told(viewer: Viewer, bus: Bus) -> None:
+def test_parameters_are_the_live_settings_and_errors_are_reported(viewer: Viewer, bus: Bus) -> None:
     assert viewer.get()["limits.linear_speed"] == 1.0
     assert viewer.set({"limits.linear_speed": 2}) == {"limits.linear_speed": 2.0}
     assert bus.get("config")["limits"]["linear_speed"] == 2.0
@@ -459,7 +459,7 @@ def test_who_drives_in_vain_is_told_why_until_it_is_over(viewer: Viewer, bus: Bu
 
 
 @SLOW
-def test_what_is_no_command_is_told(viewer: Viewer) -> None:
+def test_input_that_is_not_a_command_is_reported(viewer: Viewer) -> None:
     send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
     send(b'{"linear": {"x": 1}}')
     viewer.status("refused: needs both `linear` and `angular`")
@@ -469,7 +469,7 @@ def test_what_is_no_command_is_told(viewer: Viewer) -> None:
 
 
 @SLOW
-def test_who_publishes_too_seldom_is_told(viewer: Viewer) -> None:
+def test_a_publisher_that_sends_too_seldom_is_reported(viewer: Viewer) -> None:
     send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
     until_told = time.monotonic() + 30.0
     while not viewer.statuses and time.monotonic() < until_told:
@@ -566,7 +566,7 @@ def test_what_a_process_that_stood_has_held_back_moves_nobody(shared: Daemon, bu
 
 
 @SLOW
-def test_a_daemon_that_is_gone_is_told_and_waited_for(tmp_path: Path) -> None:
+def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     daemon = Daemon(tmp_path, endpoint=endpoint)
     with daemon, Shows(daemon) as own, Viewer(own.port) as viewer:

@@ -118,7 +118,7 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, stan
             end = await guided.ended()
             assert (end["ended"], end["meaning"]) == (1, "failure")
             assert "a key was pressed" in end["text"]
-            assert "writes nothing" in end["text"]
+            assert "writes no file" in end["text"]
             await other.says(lambda said: said.get("running") == "")
 
     run(story)
@@ -360,7 +360,7 @@ def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
     assert commands(page) == []
 
 
-def test_a_port_that_the_daemon_has_is_told_with_how_to_end_it(tmp_path: Path) -> None:
+def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(tmp_path: Path) -> None:
     with Program(acsard("sim"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
 

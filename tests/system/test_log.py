@@ -43,7 +43,9 @@ def test_who_calls_is_told_by_the_name_he_gives_himself(shared: Daemon, bus: Bus
     assert by(shared, "deactivate") == ["unnamed (native)"]
 
 
-def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(shared: Daemon, bus: Bus) -> None:
+def test_a_put_on_stop_is_reported_with_the_session_that_stamped_it(
+    shared: Daemon, bus: Bus
+) -> None:
     stops = len(shared.events("stop"))
     with connect(shared.endpoint) as robot:
         key, stamp = robot.key("stop"), robot.session.new_timestamp()
@@ -54,7 +56,7 @@ def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(shared: Daemon, 
 
 
 @pytest.mark.slow
-def test_a_day_is_told_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) -> None:
+def test_a_day_is_described_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) -> None:
     with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         bus.put("cmd/app", {"linear": {"x": 0.5}})

@@ -187,7 +187,7 @@ def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
     assert b"ready" in told[-1]
 
 
-def test_named_robots_are_not_waited_for_once_each_is_told(robots: Robots) -> None:
+def test_named_robots_are_not_waited_for_once_each_is_reported(robots: Robots) -> None:
     both, missing = (robots.tool("fleet", "--once", who=f"{ONE},{o}") for o in (TWO, "robot9"))
     assert 1.5 * both.seconds < missing.seconds
     assert len(re.findall(r"^robot\d +ready .* waiting for a command", both.out, re.M)) == 2
@@ -229,7 +229,7 @@ def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> No
 
 
 @pytest.mark.slow
-def test_a_named_robot_that_is_not_there_is_said(robots: Robots) -> None:
+def test_a_named_robot_that_is_absent_is_reported(robots: Robots) -> None:
     ended = robots.tool("fleet", "--once", who=f"{ONE},robot9")
     assert re.search(r"^robot9 +- .* not there$", ended.out, re.M)
     assert robots.tool("fleet", "--once", who="robot8,robot9").code == 69
@@ -289,7 +289,7 @@ def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_nobody_there_is_said_with_69(tmp_path: Path) -> None:
+def test_nobody_there_is_reported_with_69(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with zenoh.open(client_config(endpoint, "router")):
         nobody = Robots(tmp_path, endpoint, {})

@@ -98,7 +98,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     until(lambda: bus.state()["mode"] == "stopped", 5.0, "it stops")
     page.shows("mode", "STOPPED")
     page.shows("reason", "press Release")
-    assert "stopped by a page at the robot at" in browser.text("reason")
+    assert "stopped by a page on the robot itself at" in browser.text("reason")
     # A person who still holds the stick does not drive when another person clears.
     browser.touch("End")
     browser.tap("clear")
@@ -137,7 +137,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.touch("End")
 
 
-def test_what_a_button_could_not_is_said_once(page: Phone) -> None:
+def test_what_a_button_could_not_is_reported_once(page: Phone) -> None:
     page.browser.tap("tab-set")
     page.browser.js("document.getElementById('reset').click()")
     page.shows("set-told", "pose is x 0")
@@ -685,7 +685,7 @@ PERSON = """import('/page/words.js').then(({person}) => [
 def test_a_sender_has_the_name_that_a_person_knows(page: Phone) -> None:
     assert page.browser.js(PERSON) == [
         "you",
-        "another page at the robot",
+        "another page on the robot itself",
         "phone",
         "another page of phone",
         "a program without a name",
@@ -728,9 +728,9 @@ def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(page: 
 
     def look() -> None:
         browser = page.browser
-        page.shows("reason", "Driven by another page at the robot.")
-        page.shows("who", "another page at the robot")
-        page.shows("hint", "another page at the robot drives: you can when they release.")
+        page.shows("reason", "Driven by another page on the robot itself.")
+        page.shows("who", "another page on the robot itself")
+        page.shows("hint", "another page on the robot itself drives: you can when they release.")
         assert greyed(browser)
         browser.push(0, 0, "Start")
         browser.push(0, 90)

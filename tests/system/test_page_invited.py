@@ -95,7 +95,9 @@ def test_an_invitation_outlives_a_network_that_fails(stranger: Stranger) -> None
     assert browser.js("location.hash") == ""
 
 
-def test_an_invitation_that_is_not_valid_is_told_and_nobody_knocks_on(stranger: Stranger) -> None:
+def test_an_invitation_that_is_not_valid_is_reported_and_nobody_knocks_on(
+    stranger: Stranger,
+) -> None:
     before = stranger.tries
     stranger.opens("x" * 43)
     stranger.knocks_no_more(before, 3)  # the invitation, the socket, and the reason
@@ -103,7 +105,7 @@ def test_an_invitation_that_is_not_valid_is_told_and_nobody_knocks_on(stranger: 
     assert stranger.browser.js("location.hash") == ""
 
 
-def test_a_token_that_has_ended_is_told_as_that_and_a_new_link_in_its_tab_lets_in(
+def test_a_token_that_has_ended_is_reported_as_such_and_a_new_link_in_its_tab_lets_in(
     stranger: Stranger,
 ) -> None:
     stranger.opens(stranger.server.invite("viewer", "lent"))

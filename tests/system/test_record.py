@@ -102,7 +102,7 @@ Robot.step = step
 
 
 @pytest.mark.slow
-def test_a_fault_of_the_daemons_own_is_told_and_what_came_into_that_step_is_in_the_file(
+def test_a_fault_of_the_daemon_is_reported_and_the_input_of_that_step_is_recorded(
     tmp_path: Path,
 ) -> None:
     (bug := tmp_path / "bug").mkdir()
@@ -148,7 +148,7 @@ def test_an_orderly_end_is_whole_and_only_the_service_and_its_group_read_it(
 
 
 @pytest.mark.soak
-def test_a_full_disk_is_said_and_costs_only_records(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_costs_only_records(tmp_path: Path) -> None:
     full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes per file
     with recording(tmp_path, before=full) as (daemon, bus):
         with bus.commanding(0.3):
@@ -162,7 +162,7 @@ def test_a_full_disk_is_said_and_costs_only_records(tmp_path: Path) -> None:
         assert replayed(tmp_path, path) > 0
 
 
-def test_a_directory_that_cannot_be_made_is_said_and_the_robot_runs(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_is_reported_and_the_robot_runs(tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, words=["--record", "/proc/nowhere"]) as daemon,
         Bus(daemon.endpoint) as bus,

@@ -77,7 +77,7 @@ def disk(where: Path, *options: str) -> Iterator[Path]:
 
 @contextmanager
 def both(where: Path, record: Path, **how: object) -> Iterator[tuple[Daemon, Bus, Bus]]:
-    """A daemon that records there, its bus, and the bus of a daemon that records nothing."""
+    """A daemon that records to the bad disk, its bus, and the bus of a daemon without recording."""
     other = where / "other"
     other.mkdir()
     with (
@@ -123,7 +123,7 @@ def lived_again(where: Path, record: Path) -> None:
     assert sum(replayed(where, path) for path in found) > 50
 
 
-def test_a_disk_that_is_full_is_said_and_costs_only_records(tmp_path: Path) -> None:
+def test_a_disk_that_is_full_is_reported_and_costs_only_records(tmp_path: Path) -> None:
     with disk(tmp_path, "size=256k") as path:
         ballast = path / "ballast"
         ballast.write_bytes(bytes(220 * 1024))
@@ -241,7 +241,7 @@ def test_for_want_of_inodes_one_recording_goes_and_no_other_where_that_does_not_
         ring.close()
 
 
-def test_a_directory_that_is_read_only_is_said_and_costs_only_records(tmp_path: Path) -> None:
+def test_a_directory_that_is_read_only_is_reported_and_costs_only_records(tmp_path: Path) -> None:
     with disk(tmp_path, "size=1m", "ro") as path:
         with both(tmp_path, path / "record") as (daemon, bus, beside):
             says(bus, "Read-only file system")

@@ -81,7 +81,7 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
 
 
 @pytest.mark.slow
-def test_the_port_can_be_lost_and_found_again_and_again(tmp_path: Path, peer: Peer) -> None:
+def test_the_port_can_be_lost_and_found_many_times(tmp_path: Path, peer: Peer) -> None:
     with (
         Daemon(tmp_path, peer.path) as daemon,
         Bus(daemon.endpoint) as bus,

@@ -70,7 +70,7 @@ def test_it_goes_whole(where: Path, number: signal.Signals) -> None:
         until(lambda: gone(inner), 5.0, "nothing of it is left")
 
 
-def test_a_taken_address_is_told_and_tried_again(where: Path) -> None:
+def test_a_taken_address_is_reported_and_tried_again(where: Path) -> None:
     endpoint = free_tls_endpoint()
     host, _, port = endpoint.removeprefix("tls/").rpartition(":")
     with (

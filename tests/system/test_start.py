@@ -62,7 +62,7 @@ def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -
     assert position["y"] == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_port_that_is_missing_at_the_start_is_said_and_picked_up_when_it_appears(
+def test_a_port_that_is_missing_at_the_start_is_reported_and_picked_up_when_it_appears(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "mcu"

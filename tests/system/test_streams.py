@@ -62,7 +62,7 @@ def test_control_goes_on_when_a_stream_was_closed_before_the_start(
 
 
 def drives_and_leaves(daemon: Daemon, peer: Peer) -> None:
-    """Check that it drives, and ends as usual."""
+    """Check that the robot drives, and that the tool ends as usual."""
     with alive_at(daemon.endpoint, daemon) as alive:
         until(alive.try_recv, 5.0, "the alive token")
     with Bus(daemon.endpoint) as bus:

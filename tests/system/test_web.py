@@ -168,7 +168,7 @@ def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus) -> No
     assert bus.state()["mode"] == "stopped"
 
 
-def test_programs_ask_call_and_are_told_what_there_is(page: Page, bus: Bus) -> None:
+def test_programs_query_call_and_list_the_interface(page: Page, bus: Bus) -> None:
     async def story() -> None:
         async with aiohttp.ClientSession(page.here) as session:
             async with session.get("/api/state") as answer:

@@ -329,7 +329,9 @@ def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
         run(story)
 
 
-def test_what_is_no_message_is_told_once_a_second_and_a_flood_ends(table: Table, bus: Bus) -> None:
+def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flood_ends(
+    table: Table, bus: Bus
+) -> None:
     async def story() -> None:
         async with hands(table.page) as ours:
             for _ in range(1200):

@@ -191,7 +191,7 @@ def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
         run(lambda: story(daemon))
 
 
-def test_a_bus_that_is_gone_is_told_and_the_key_comes_when_it_is_back(
+def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
     inside: Inside, tmp_path: Path
 ) -> None:
     async def story(daemon: Daemon) -> None:

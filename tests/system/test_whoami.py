@@ -87,7 +87,7 @@ def test_the_verb_says_role_certificate_and_what_that_may(robot: Robot) -> None:
 
 
 @pytest.mark.slow
-def test_a_certificate_of_no_list_is_told_so_with_77(robot: Robot) -> None:
+def test_a_certificate_in_no_list_is_reported_with_77(robot: Robot) -> None:
     ended = robot.tool("unlisted", "whoami")
     assert ended.code == 77
     assert SILENCE in ended.out
@@ -176,7 +176,9 @@ def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
 
 
 @pytest.mark.slow
-def test_a_certificate_that_ends_while_one_follows_is_told(robot: Robot, tmp_path: Path) -> None:
+def test_a_certificate_that_ends_while_a_client_follows_is_reported(
+    robot: Robot, tmp_path: Path
+) -> None:
     told = None
     # the longer time is for a busy machine that takes the shorter one to start
     for lasts in (7.0, 60.0):
@@ -286,7 +288,7 @@ def test_the_keyboard_of_who_may_not_drive_is_told_before_a_key_is_pressed(
     ],
     ids=["clear", "set_pose", "config"],
 )
-def test_what_a_viewer_may_not_ask_is_told_with_the_role_it_takes(
+def test_what_a_viewer_may_not_ask_is_reported_with_the_role_it_takes(
     robot: Robot, words: tuple[str, ...], least: str
 ) -> None:
     ended = robot.tool("viewer", *words)

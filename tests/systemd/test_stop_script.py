@@ -199,7 +199,7 @@ def test_a_port_that_takes_nothing_does_not_hold_it_up(tmp_path: Path, wire: Wir
     assert ended.seconds < 1.0
 
 
-def test_a_device_that_is_no_port_is_said(tmp_path: Path) -> None:
+def test_a_device_that_is_not_a_port_is_reported(tmp_path: Path) -> None:
     ended = stop(config(tmp_path, '[mcu]\nport = "/dev/null"\n'))
     assert ended.code == 0
     assert "cannot set up all of /dev/null" in ended.err

@@ -78,7 +78,9 @@ class Sensor:
         end = time.monotonic() + FIRST_S
         while not self.receive(lambda message, now: None, 0.0):
             if time.monotonic() > end:
-                raise GuideError(f"{what} does not arrive on {self.key}")
+                raise GuideError(
+                    f"{what} does not arrive on {self.key}: does its sender run, with this key?"
+                )
             time.sleep(LOOK_S)
 
     def _decoded(self, sample: zenoh.Sample) -> Any:
@@ -91,7 +93,10 @@ class Sensor:
                 continue
             self._decoders = self._decoders[at : at + 1]
             return message
-        raise GuideError(f"the messages on {self.key} cannot be read: {'; '.join(errors)}")
+        raise GuideError(
+            f"the messages on {self.key} cannot be read ({'; '.join(errors)}): do they have "
+            "another type?"
+        )
 
 
 class RobotOnBus:
@@ -139,7 +144,7 @@ class RobotOnBus:
             )
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
-            text = f"{driver.halted}{end} The tool commanded zero, and writes nothing"
+            text = f"{driver.halted}{end} The tool commanded zero, and writes no file"
             if driver.disturbed or (driver.silent and self._returns()):
                 raise DisturbedError(driver.halted, text)
             raise GuideError(text)

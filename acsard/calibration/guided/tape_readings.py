@@ -165,8 +165,8 @@ def _starting_parameters(
             by_wheels = predicted(steps_, "turned", base, start).value
             if not 0.1 < by_wheels / reading.value < 10.0:
                 raise RefusedError(
-                    f"by the wheels the robot turned by {math.degrees(by_wheels):.0f} deg, by your "
-                    f"measurement {math.degrees(reading.value):.0f}: start again, and let it turn "
+                    f"the wheels report {math.degrees(by_wheels):.0f} deg, but you measured "
+                    f"{math.degrees(reading.value):.0f} deg: start again, and let it turn "
                     "one full circle to the left"
                 )
             start[INVERSE_TRACK] *= reading.value / by_wheels
@@ -206,8 +206,8 @@ def _solved(
         if float(np.abs(step).max()) < SMALL:
             return parameters, normal
     raise RefusedError(
-        "the measurements contradict each other: is each number in its unit, and of the end that "
-        "the question names? Start again"
+        "the measurements contradict each other: is each number in its unit, and was it measured "
+        "at the end that the question names? Start again"
     )
 
 
@@ -251,7 +251,7 @@ CREDIBLE = 0.85, 3.0
 """Credible ratios of effective track to wheel separation. Outside them, a reading must be wrong."""
 
 Answers = dict[tuple[str, str], float]
-"""The person's answers in m and rad, by the names of the leg and of the question.
+"""The person's answers in m and rad, keyed by the names of leg and question.
 
 The name of the leg is "" for questions that were asked before the first leg.
 """
@@ -279,9 +279,9 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 
 
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
-    """Return the ratio of effective track to wheel separation that a `turned` reading shows.
+    """Compute the ratio of effective track to wheel separation from a `turned` reading.
 
-    It is an approximation for the next legs. Raises `GuideError` if it is not credible.
+    The ratio is an approximation for the next legs. Raises `GuideError` if it is not credible.
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)

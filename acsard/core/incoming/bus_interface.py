@@ -91,7 +91,7 @@ class GatewayFollower:
         """Count the events that are new in a report.
 
         Returns:
-            The end of the TLS certificate by the wall clock, ns; None if it is unknown.
+            Wall-clock time at which the TLS certificate ends, ns; None if it is unknown.
         """
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)

@@ -71,7 +71,7 @@ class Bindings:
         """
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Return the certificate that the sender is bound to, or None if it may use this one."""
+        """Return the certificate that the sender id is bound to, or None if this one may use it."""
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
             return bound
@@ -158,7 +158,7 @@ class Receiver:
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
         if not arrival.put:
-            raise DecodeError("not_a_put", "a DELETE is not a command")
+            raise DecodeError("not_a_put", "a DELETE is not a command: send a PUT")
         if len(arrival.payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
         identity = identify(arrival)
@@ -203,11 +203,15 @@ class Receiver:
         linear, angular = got.linear, got.angular
         if not isinstance(got.twist, UnsetType):
             if not (isinstance(linear, UnsetType) and isinstance(angular, UnsetType)):
-                raise DecodeError("wrong_shape", "a twist both inside and outside `twist`")
+                raise DecodeError(
+                    "wrong_shape", "vectors inside and outside `twist`: send one twist"
+                )
             linear, angular = got.twist.linear, got.twist.angular
             header = None if isinstance(got.header, UnsetType) else got.header
         elif not isinstance(got.header, UnsetType):
-            raise DecodeError("wrong_shape", "a header without `twist`: put the twist inside it")
+            raise DecodeError(
+                "wrong_shape", "`header` without `twist`: put both vectors into `twist`"
+            )
         if isinstance(linear, UnsetType) or isinstance(angular, UnsetType):
             raise DecodeError("wrong_shape", "needs both `linear` and `angular`")
         axes = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
@@ -233,7 +237,7 @@ class Receiver:
             raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
         twist = self._kinematics.twist(WheelSpeeds(*velocity))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
-            raise DecodeError("not_finite", "wheel speeds too large for a number")
+            raise DecodeError("not_finite", "wheel speeds too large to compute a twist")
         return twist, got.header, twist == REST and any(velocity)
 
     @staticmethod

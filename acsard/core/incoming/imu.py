@@ -85,7 +85,8 @@ class GyroFollower:
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
             raise DecodeError(
-                "second_sender", f"{who[:MOST_WHO]} sends as well, but the gyro is {self._followed}"
+                "second_sender",
+                f"{who[:MOST_WHO]} also sends, but the daemon follows {self._followed}",
             )
         before, self._followed, self._heard_ns = self._followed, who, now_ns
         return other and before != ""
@@ -97,7 +98,7 @@ def reading(arrival: Arrival) -> GyroSample:
     Orientation and acceleration are ignored.
     """
     if not arrival.put:
-        raise DecodeError("not_a_put", "a DELETE is not a sample")
+        raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
         raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
     got: Imu | _Reading
@@ -116,7 +117,7 @@ def reading(arrival: Arrival) -> GyroSample:
         raise DecodeError("wrong_shape", f"a variance of {variances[8]:g}")
     if max(map(abs, numbers[:3])) > MAX_RATE or variances[8] > MAX_RATE**2:
         raise DecodeError(
-            "out_of_range", f"over {MAX_RATE:g} rad/s, or a variance above the square of that"
+            "out_of_range", f"over {MAX_RATE:g} rad/s, or a variance above its square: send rad/s"
         )
     stamp_ns = got.header.stamp.to_ns()
     return GyroSample(arrival.arrived_ns, stamp_ns if stamp_ns > 0 else None, rate.z, variances[8])

@@ -187,7 +187,7 @@ class Timeline:
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
         """Take a read of `size` bytes that completes `lines` lines.
 
-        Behind the last line `following` bytes came.
+        `following` is the number of bytes that came after the last line.
         """
         before, end_ns = self._end_ns, at.mono_ns
         if following:
@@ -206,7 +206,7 @@ class Timeline:
     def spoilt(self) -> None:
         """Note that the next line of the read is bad.
 
-        A prompted board still made it as a reply.
+        For a prompted board a bad line still counts as the reply to a command.
         """
         self._rest -= 1
         if not self._style.speaks:

@@ -159,7 +159,7 @@ class Heard(Struct):
 
     @property
     def counted(self) -> str:
-        """The number of bytes or lines and the last bad one, as text."""
+        """Text with the number of received lines and the last bad line; bytes if no line ended."""
         if not self.size:
             return "nothing was received"
         if not self.lines:
@@ -186,7 +186,7 @@ class Heard(Struct):
 
 
 class SilenceDiagnosis:
-    """The diagnosis while the link is not up; `heard` is its last complete interval."""
+    """Diagnoses, in intervals of `PATIENCE_NS`, why the link is not up."""
 
     def __init__(self) -> None:
         self.heard: Heard | None = None
@@ -250,7 +250,7 @@ class UnansweredLines:
 
 
 def damaged(link: Link, check: Negotiation) -> bool:
-    """Return whether the check is being asked for because replies came damaged."""
+    """Return whether the daemon asks for the checked link because replies were damaged."""
     return link.damaged and check.asking
 
 
@@ -295,7 +295,7 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event for a newly agreed check, as a warning if it is less than was asked for."""
+    """Return the event for a newly agreed line form, a warning if the board lacks part of it."""
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the serial lines are {check.in_force}"
     if check.state == "plain":

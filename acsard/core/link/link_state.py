@@ -71,7 +71,7 @@ class Link:
         self._heard_ns: int | None = None
 
     def sign(self, sign: Sign) -> None:
-        """Apply a sign by the table. Every sign except "trusted" resets the count of good lines."""
+        """Change the state by `TABLE`. Every sign except "trusted" resets the good-line count."""
         self.state = TABLE.get((self.state, sign), self.state)
         if sign == "trusted":
             return
@@ -131,7 +131,7 @@ class Link:
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Update the state for silence or trust.
+        """Take the link down after silence, or bring it up after enough good lines.
 
         `may_rise` is False if the link must not come up now.
         """

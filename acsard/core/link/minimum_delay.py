@@ -27,10 +27,14 @@ class MinimumDelay:
         """Lateness of the last event over the minimum delay."""
 
     def add(self, ours: float, theirs: float) -> float:
-        """Take an event, `ours` after the last one by our clock and `theirs` by the other.
+        """Take an event and return its lateness over the minimum so far.
 
-        Return its lateness over the minimum so far. A negative result makes it the new minimum.
-        Drift is subtracted afterwards.
+        A negative result makes this event the new minimum. The lateness includes the drift of the
+        clocks since the last event.
+
+        Args:
+            ours: time since the last event by our clock.
+            theirs: time since the last event by the other clock.
         """
         later = self.late + ours - theirs
         self.measure(ours, theirs)

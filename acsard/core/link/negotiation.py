@@ -307,7 +307,7 @@ class Negotiation:
     # Lines that come back.
 
     def echoed(self, line: bytes) -> bool:
-        """Return whether the line is, or earlier lines were, an echo of a question.
+        """Return whether this line or an earlier one was an echo of the daemon's own question.
 
         After an echo no received line is believed until the port is reopened.
         """
@@ -327,7 +327,7 @@ class Negotiation:
         return self.echoes
 
     def heard_plain(self) -> None:
-        """Note a whole plain line while asking.
+        """Note a whole plain line while the daemon asks for the checked link.
 
         The board is awake, so from now on its silence is an answer too.
         """

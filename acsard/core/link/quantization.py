@@ -33,7 +33,7 @@ RECUR = 3
 """Number of steps of a block that must reach a size. One damaged line makes two."""
 
 LEARNED_FROM = 100
-"""Changes of a wheel's speed before a lattice is searched."""
+"""Changes of a wheel's speed before a quantization step is searched."""
 
 MOST_SEEN = 256
 """Different speeds remembered, which bounds a search."""
@@ -45,7 +45,7 @@ OWED_FOR = 3000
 """Lines after which the owed correction is dropped, because it belongs to another place."""
 
 LONGEST_WAIT = 128 * LEARNED_FROM
-"""Largest number of changes between two searches of speeds without a lattice: minutes of
+"""Largest number of changes between two searches of speeds without a step: minutes of
 driving."""
 
 LOOK = 50
@@ -55,7 +55,7 @@ LONG = 100
 """Checks over which the mean period is taken."""
 
 STRAYS = 4
-"""Speeds off the lattice that end it. Each check forgives one, because 2 % may be damaged."""
+"""Speeds off the step that refute it. Each check forgives one, because 2 % may be damaged."""
 
 ROUND_PERIOD = 0.006
 """Relative error of a period against its round number. A ceramic resonator has 0.5 %."""
@@ -164,7 +164,7 @@ class WheelCounter:
                 self._search = Search(self._seen)
 
     def go_on(self) -> bool:
-        """Continue the search, if one runs; return whether it has just found a lattice."""
+        """Continue the search, if one runs; return whether it has just found a step."""
         if self._search is None:
             return False
         if not self._search.go_on():
@@ -192,7 +192,7 @@ class WheelCounter:
         return whole * self.angle + speed * missing
 
     def owed(self, period: float) -> float:
-        """Return the rounding error until the counts were known, rad. Call it once."""
+        """Return and reset the rounding errors of the lines before the counts were known, rad."""
         told, self._told = self._told or {}, None
         return math.fsum(
             times * (round(speed / self.quantum) * self.angle - speed * period)
@@ -248,7 +248,7 @@ class CountRecovery:
         return tuple([wheel.counts for wheel in self._wheels])
 
     def look(self, line: Feedback) -> Feedback:
-        """Return the line with its counted angles, if its speeds show any, and its steps."""
+        """Return the line with each wheel's counted angle and quantization step, where known."""
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if line.turned is None and own > 0.0:
             counted = self._counted(speeds, own)
@@ -339,7 +339,7 @@ class CountRecovery:
         return True
 
     def _settle(self) -> None:
-        """Find the counts per turn and the period that explain the lattices."""
+        """Find the counts per turn and the period that explain the quantization steps."""
         found = [i for i, w in enumerate(self._wheels) if w.lattice and not w.counts]
         if not found or self._lines < LOOK:
             return

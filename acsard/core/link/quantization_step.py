@@ -2,7 +2,7 @@
 
 A firmware that divides counts by its period reports only multiples of q = 2 pi / (counts T), in two
 decimals. The search finds the largest q of which nearly all speeds are multiples. It rejects a q
-that chance could have produced. Speeds that a filter has smoothed lie on no lattice of this kind.
+that chance could have produced. Speeds that a filter has smoothed are not multiples of any step.
 (A mean over M periods has a step that is M times as fine, as if it counted in M-ths.)
 
 Some speed V is j q for a whole j, so the candidates are V / j for j = 1, 2 and so on. The first
@@ -21,16 +21,16 @@ ROUNDING = 0.0052
 """Largest rounding error of a speed in two decimals, rad/s."""
 
 FINEST = 4 * ROUNDING
-"""Finest step that is searched, rad/s. Half of all speeds lie on a finer lattice by chance."""
+"""Finest step that is searched, rad/s. Half of all speeds fit a finer step by chance."""
 
 DEVIATION = 0.01 / math.sqrt(12)
 """Standard deviation of the rounding to two decimals, rad/s."""
 
 STRAYS = 0.005
-"""Share of the speeds that may lie off the lattice, because of damaged lines."""
+"""Share of the speeds that need not be multiples of the step, because of damaged lines."""
 
 BY_CHANCE = 1e-5
-"""Highest probability that chance has produced an accepted lattice."""
+"""Highest probability that chance has produced an accepted step."""
 
 STEEP = 1.0
 """rad/s. A wheel's speed alternates by this much from line to line only because of its encoder, so
@@ -48,7 +48,7 @@ LEAST_DOUBT = 0.02
 
 
 class Quantization(Struct, frozen=True):
-    """A lattice of speeds that are multiples of `quantum`.
+    """The quantization of speeds that are multiples of `quantum`.
 
     The standard deviation of `quantum` is `deviation`. Both are in rad/s.
     """
@@ -65,7 +65,7 @@ class Quantization(Struct, frozen=True):
 
 
 class Search:
-    """The search for the lattice of some speeds, in slices.
+    """The search for the quantization of some speeds, in slices.
 
     It is not a generator, because a robot's whole state must be serializable at any moment
     (`recording/state.py`).
@@ -74,7 +74,7 @@ class Search:
     def __init__(self, seen: Mapping[float, int]) -> None:
         """Start; `seen` maps speeds above 0, rad/s, to the number of their occurrences."""
         self.found: Quantization | None = None
-        """The result when the search is over: the lattice, or None if there is none."""
+        """The result when the search is over; None if the speeds are not quantized."""
         self._seen = seen
         self._speeds: list[float] = []
         self._spare = self._part = self._tried = 0
@@ -122,7 +122,7 @@ class Search:
 
 
 def _anchor(speeds: list[float], seen: Mapping[float, int], spare: int) -> float:
-    """Return the largest speed that is not one of the few that may lie off the lattice."""
+    """Return the largest speed, without the few that need not be multiples of the step."""
     above = 0
     for speed in reversed(speeds):
         above += seen[speed]
@@ -132,7 +132,7 @@ def _anchor(speeds: list[float], seen: Mapping[float, int], spare: int) -> float
 
 
 def _fitted(seen: Mapping[float, int], rough: float, spare: int, tries: int) -> Quantization | None:
-    """Return the lattice near `rough` by least squares, or None if it fails the closer tests."""
+    """Return the quantization near `rough` by least squares, None if it fails the closer tests."""
     squares = products = 0.0
     points = set()
     for speed in seen:

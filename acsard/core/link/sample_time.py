@@ -131,9 +131,10 @@ class FreeRunningTimes:
         """Slot of the last placed line, None before the first one by the present clock."""
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Return the number of missing lines before this read's last line, -1 for one too many.
+        """Return the number of lines that were lost before the last line of this read.
 
-        `at_ns` is when that line was complete. `drained` means that the kernel held no more data.
+        The result is -1 if there was one line too many. `at_ns` is the time at which the last line
+        was complete. `drained` means that the kernel held no more data.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -431,7 +432,7 @@ class PromptedTimes:
 
     @property
     def thinks(self) -> bool:
-        """Whether the board's own delay varies, more than a scheduler or an adapter causes."""
+        """Whether the reply delay varies more than this computer or its USB adapter can cause."""
         return self._thinking > THINKS and not self._batched
 
     @property

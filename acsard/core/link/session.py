@@ -142,10 +142,10 @@ class McuSession:
         return feedback
 
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
-        """Return the line with these speeds, in the form in force, or None if none is due.
+        """Return the line with these speeds, plain or checked, or None if no line is due.
 
-        While the MCU does not answer, and while the session asks it for the check, only stops
-        leave. The first stop leaves at once, because the MCU may still obey the line before.
+        While the MCU does not answer, and while the session asks for the checked link, every line
+        is a stop. The first stop goes at once, because the MCU may still obey the line before.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)

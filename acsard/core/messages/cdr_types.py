@@ -61,7 +61,7 @@ def number_code(kind: inspect.Type) -> str:
         case inspect.IntType():
             extra = kind.extra if isinstance(kind, inspect.Metadata) else None
             if not extra or "cdr" not in extra:
-                raise TypeError("an int without its width")
+                raise TypeError('an int needs its width: Meta(extra={"cdr": code})')
             return str(extra["cdr"])
     return ""
 

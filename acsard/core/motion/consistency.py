@@ -51,13 +51,13 @@ class ConsistencyChecks:
         multiplier = kinematics.multipliers[2]
         self._track = LearnedTrack(multiplier) if odometry.learned_track else None
         self._by_wheels = 0.0
-        """Turn of the last line by the wheels, rad."""
+        """Turn of the last line according to the wheels, rad."""
         self.turn: Turn | None = None
-        """Turn of the last line by the gyro, None if the wheels provide it."""
+        """Turn of the last line according to the gyro; None if the wheels provide the turn."""
         self.on_trial = False
         """Whether the gyro corrects the wheels' turn of the last line when it is proved."""
         self.slips = False
-        """Whether the wheels slip, by each other or by the gyro."""
+        """Whether the wheels slip: they contradict each other or the gyro."""
         self.events: list[Event] = []
         """Events of the last line, for the log."""
 
@@ -99,9 +99,9 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Note that the turn of lines during the gyro's trial has changed by `turn` rad.
+        """Note that the wheels' turn during the gyro's trial was corrected by `turn` rad.
 
-        Return the part of this change that the gyro has already corrected.
+        Return the part of this correction that the gyro has already made.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 

@@ -49,7 +49,7 @@ class _Held:
 
 
 class EventThrottle:
-    """The waiting events, and when each name may have its next line."""
+    """The events that wait for a log line, and the time of the next line for each event name."""
 
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
@@ -57,7 +57,7 @@ class EventThrottle:
         """Time at which the lines of a name so far are paid for, at a second each."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Take events; return the lines to write now, from these and from those that waited."""
+        """Take new events; return the events to log now, among these and the waiting ones."""
         if not (events or self._held):
             return ()
         for event in events:

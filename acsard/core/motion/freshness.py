@@ -162,7 +162,7 @@ class _Clock:
         self._before: int | None = None
         """Delay before the first adjustment that showed since the clock was last prompt."""
         self._shown = 0
-        """How far the adjustments went that showed since then, ns."""
+        """Sum of the visible clock adjustments since then, ns."""
         self._paused = False
         """Its sender has paused since then, so any adjustment may have happened."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns

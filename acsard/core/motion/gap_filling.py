@@ -71,8 +71,8 @@ class Rolling:
         """Start. After `quiet` s without feedback the daemon commands rest."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
-        """Durations of the implausible lines, s: of those without counts, of the gaps before these,
-        and of those with counts."""
+        """Durations, s: of implausible lines without counts, of the gaps before them, and of
+        implausible lines with counts."""
         self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:

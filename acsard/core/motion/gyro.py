@@ -79,8 +79,8 @@ class Turn(Struct, frozen=True, gc=False):
     angle: float
     variance: float
     rate: float
-    """The present turn rate by the gyro, rad/s. The angle may include late samples, so it is not dt
-    times this rate."""
+    """The turn rate that the gyro measures, rad/s. The angle may include late samples, so it is not
+    dt times this rate."""
     rate_variance: float
     wheels: float | None = None
     """The angle that the wheels would report for this turn, including their skid, rad."""
@@ -134,7 +134,7 @@ class Gyro:
 
     @property
     def learned(self) -> Track | None:
-        """The effective track by the gyro, None until the robot has turned for a while."""
+        """The effective track that the gyro shows, None until the robot has turned for a while."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
             return self._learned
@@ -153,7 +153,7 @@ class Gyro:
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
         """Return the turn until a line of the time `at_ns`, or None if the wheels must provide it.
 
-        `wheels` is the turn by the wheels in rad over `dt` s. `still` means that all four wheels
+        `wheels` is the turn from the wheels in rad over `dt` s. `still` means that all four wheels
         stood. After a gap `dt` is 0, and the turn is that of the whole gap.
         """
         self.events, self.owes = [], False

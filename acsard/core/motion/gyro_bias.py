@@ -21,7 +21,7 @@ UNLIKELY = 5.0
 """Number of standard deviations from the bias above which a sample is not noise."""
 
 SLACK = 0.01
-"""Deviation that is allowed in addition, rad/s, because a robot that stands may vibrate."""
+"""Additional allowed deviation, rad/s, because a robot that stands may vibrate."""
 
 LEAST_NOISE = 1e-5
 """Smallest standard deviation of a sample, rad/s. A gyro that repeats one value is coarse."""

@@ -70,7 +70,7 @@ CERTAIN = 3.0
 
 
 class Match:
-    """Compares the turns of wheels and gyro, feedback line by feedback line."""
+    """Compares the robot's turn according to wheels and gyro, feedback line by feedback line."""
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
@@ -87,7 +87,7 @@ class Match:
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
-        """The present rate by the wheels, and that at the start of the block."""
+        """The turn rate from the wheels now, and at the start of the block."""
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
 

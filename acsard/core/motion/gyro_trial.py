@@ -20,11 +20,11 @@ unequal tyres the wheels report a turn on a straight, so below `LEAST_RATE` a gy
 nothing is not called dead."""
 
 PROPORTIONS = (0.25, 2.5)
-"""Range of the robot's turn per turn by the wheels, at any skid."""
+"""Range of the robot's true turn divided by the turn from the wheels, for any skidding."""
 
 PROVED, REFUTED = 0.1, 0.4
-"""Turn to one side by the wheels, rad, in which a gyro is proven or refuted. Refuting takes more,
-because the gyro may be late."""
+"""Turn to one side according to the wheels, rad, in which a gyro is proven or refuted. Refuting
+takes more, because the gyro may be late."""
 
 REFUTED_S = 0.3
 """Seconds of turning before a gyro is refuted. No gyro is as late as that."""
@@ -45,7 +45,7 @@ class Trial:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """Turn by the wheels, duration and turn by the gyro in the present stretch: rad, s, rad."""
+        """Turn from the wheels, duration, and turn from the gyro in this stretch: rad, s, rad."""
         self._fast = self._fast_gyro = 0.0
         """Turns by wheels and gyro over the stretches that were fast enough to call a gyro dead,
         rad."""
@@ -56,9 +56,10 @@ class Trial:
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Take a line: the turns by wheels and gyro, rad, in its `dt` s.
+        """Take the robot's turn of one line according to wheels and gyro, rad in `dt` s.
 
-        Without a certain bias the only possible verdict is "in degrees".
+        `certain` is False while the gyro's bias is uncertain. The only verdict is then "in
+        degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro

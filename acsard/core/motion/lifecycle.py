@@ -126,7 +126,9 @@ class Lifecycle:
                 raise RefusedError(_not_in_force(number, still, "srv/clear"))
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
-            raise RefusedError("a stop or a fault came at the same time or later: call it again")
+            raise RefusedError(
+                "a stop or a fault came at the same time or later: call srv/clear again"
+            )
         if latches.fault is None:
             self._latch(stop=None)
             return "cleared; each sender must send a zero before it drives"
@@ -140,8 +142,8 @@ class Lifecycle:
         """Switch the robot on; return True if it was off.
 
         Args:
-            number: The latch that the sender has seen, 0 if `auto_activate` is False and no client
-                has switched the robot off, None if the request names none.
+            number: The number of the latch that the sender has seen; None if the request has none.
+                0 stands for a robot that is off only because `auto_activate` is False.
             asked_ns: Monotonic time at which the request arrived.
             now: Both clocks at this step.
         """
@@ -156,7 +158,9 @@ class Lifecycle:
             if number is None:
                 self._require_seen(latch, self._off_ns, asked_ns, "srv/activate")
             if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
-                raise RefusedError(f"{latch.why} at the same time or later: call it again")
+                raise RefusedError(
+                    f"{latch.why} at the same time or later: call srv/activate again"
+                )
         self._dormant = False
         self._latch(inactive=None)
         return True

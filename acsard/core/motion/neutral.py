@@ -130,5 +130,5 @@ class Sender:
 
 
 def is_zero(command: Command) -> bool:
-    """Return whether the command asks for rest, not for wheel speeds that cancel out."""
+    """Return whether the command asks for rest. Wheel speeds that cancel out are not rest."""
     return command.twist == REST and not command.cancelled

@@ -54,7 +54,7 @@ class Step(Struct, frozen=True, gc=False):
     pieces: tuple[Motors, ...]
     """How far the wheels turned in it, rad."""
     gyro: Turn | None
-    """The turn by a gyro, None without one."""
+    """The turn that a gyro measured, None without a gyro."""
     speeds: WheelSpeeds
     """The speeds in the line."""
     turn: float
@@ -131,7 +131,7 @@ class Odometry:
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, as certain as at the start.
 
-        The wheel angles continue.
+        The wheel angles do not change.
         """
         self._path.set(pose)
         self._steps.clear()
@@ -157,13 +157,13 @@ class Odometry:
         self._rolling.skip(feedback)
 
     def fold(self, feedback: Feedback, commanded: WheelSpeeds | None = None) -> Estimate:
-        """Advance by one feedback line: by its counts, else by its speeds times dt.
+        """Advance the pose by one feedback line: by its counts, else by its speeds times dt.
 
-        After a gap without counts only the uncertainty advances. At rest nothing does: a count back
-        and forth waits until its direction is clear. If a gyro provides the turn since the line
-        before, the wheels provide only the distance. `commanded` is the commanded wheel speeds, by
-        which a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines
-        are recomputed.
+        After a gap without counts only the uncertainty grows. At rest the pose stays: a single
+        count is added only when its direction is clear. If a gyro provides the turn since the line
+        before, the wheels provide only the distance. Wheels that contradict `commanded`, the
+        commanded wheel speeds, are faulty. The other wheel of the side replaces a faulty wheel,
+        also in the lines before.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
@@ -256,7 +256,7 @@ class Odometry:
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
     ) -> list[tuple[float, float]]:
-        """Return the arcs for these wheel angles, m and rad: (4) to (7) are linear.
+        """Return the arcs (m, rad) for these wheel angles; equations (4) to (7) are linear.
 
         A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
         one.

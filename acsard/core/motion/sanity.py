@@ -194,7 +194,7 @@ class Sanity:
         return ""
 
     def watch(self, sent: WheelSpeeds, seen: WheelSpeeds, dt: float) -> str:
-        """Return the fault that `dt` s more of these speeds show, with the wheel's name, or "".
+        """Add `dt` s with these speeds; return the fault that they prove, naming the wheel, or "".
 
         `sent` is the commanded speeds and `seen` the reported ones, rad/s.
         """

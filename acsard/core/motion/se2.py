@@ -6,7 +6,7 @@ vector (x, y, yaw).
 
 Errors are expressed in axes that are parallel to those of odom, with the origin at the robot. When
 the robot moves, an error in these axes changes only by the lever arm of the displacement
-(`seen_from`). In the axes of base_link it would change by the adjoint of the step.
+(`seen_from`). In the axes of base_link it would change by the adjoint of the robot's displacement.
 
 A covariance is that of such a vector. E[...] is an expected value, ' transposes, and [a, b] is the
 Lie bracket of two errors.
@@ -48,7 +48,7 @@ def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector
 
 
 def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
-    """Return xx, xy and yy of E[[a, b] [a, b]'].
+    """Return xx, xy and yy of the covariance of the Lie bracket [a, b].
 
     The errors a and b are independent and have the covariances `p` and `q`.
     """
@@ -60,9 +60,9 @@ def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
 
 
 def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
-    """Return E[[e, [e, b]] b'] plus its transpose, for independent errors e and b.
+    """Return E[[e, [e, b]] b'] plus its transpose, with Lie brackets of independent errors e and b.
 
-    The error b has the covariance `p`. `a` is E[e e_yaw]: the column of yaw in the covariance of e.
+    The error b has the covariance `p`. `a` is the yaw column of the covariance of e.
     """
     x, y, yaw = a
     return PoseCovariance(

@@ -83,7 +83,7 @@ class SecondOrder:
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
 
     def carry(self, dx: float, dy: float) -> None:
-        """Transform the correlations with x after the robot has moved by `dx`, `dy` m in odom."""
+        """Update E[M_i x'] after the robot has moved by `dx`, `dy` m in odom."""
         self._with_x = [(seen_from(a, dx, dy), seen_from(b, dx, dy)) for a, b in self._with_x]
 
     def compose(

@@ -120,9 +120,10 @@ class Suspect:
         self._followed = 0.0
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
-        """Return whether the wheel shows a sign, after a line of `dt` s.
+        """Return whether the wheel shows a sign of a fault, after a line of `dt` s.
 
-        `own` and `other` are the turns of both wheels and `count` is the angle of a count, rad.
+        `own` and `other` are the angles by which this wheel and its partner turned in the line, and
+        `count` is the angle of an encoder count, rad.
         `same` means that the wheel repeats the speed of the line before.
         """
         sign = self._sign(own, other, same, count)

@@ -136,10 +136,10 @@ class PoseUncertainty:
         self._publish()
 
     def show_count(self, angle: float) -> None:
-        """Take the angle of an encoder count that feedback lines show, rad.
+        """Take the angle of one encoder count, as detected in the feedback lines, rad.
 
-        It is ignored if the counts are configured. From now on the pose consists of whole counts,
-        so the position of the start within a count is unknown as well.
+        A configured count angle takes precedence. From now on the pose is computed from whole
+        counts, so the position of the start within a count is unknown as well.
         """
         if self._configured or angle <= 0.0:
             return

@@ -223,8 +223,8 @@ class WheelFaults:
     ) -> bool:
         """Take a line: the turned angles, rad, in `dt` s, and its speeds.
 
-        `commanded` is the commanded speeds, rad/s; `turn` is the turn that the wheels would report
-        by a trusted gyro, rad. Return whether a wheel is ignored from now on; then call
+        `commanded` is the commanded speeds, rad/s; `turn` is the turn of the wheels that agrees
+        with a trusted gyro, rad. Return whether a wheel is ignored from now on; then call
         `was_faulty` for the lines before.
         """
         if self.events:

@@ -43,7 +43,7 @@ LAG_S = 0.03
 """Allowed delay of one motor behind the other, s."""
 
 LEAST = 0.002
-"""Allowed difference in addition, rad, for the two decimals and for backlash."""
+"""Additional allowed difference, rad, for the two decimals and for backlash."""
 
 UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
@@ -97,9 +97,9 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the angle of one wheel divided by that of the other, for wheels that agree.
+        """Return the usual ratio of the angles of this side's two wheels.
 
-        If `front` is true, the result is front / rear, otherwise rear / front.
+        If `front` is true, the ratio is front / rear, otherwise rear / front.
         """
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]

@@ -93,7 +93,7 @@ class Faults:
         return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
 
     def having(self, fault: NamedFault) -> Fault:
-        """Return the `with` block of a fault from the configuration or the command line."""
+        """Return the context manager of a fault that the configuration or command line names."""
         block: Fault = getattr(self, fault.name)(*fault.values)
         return block
 

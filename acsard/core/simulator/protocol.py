@@ -62,7 +62,7 @@ def plain_only(line: bytes) -> Command | None:
 
 
 def prefix(line: bytes) -> Command | None:
-    """Decode a line like firmware that checks the four values and ignores the text after them."""
+    """Decode a line as a firmware would that ignores the text after the four values."""
     return _plain(line[:PLAIN])
 
 
@@ -129,7 +129,8 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
-    `counts` are the encoder counts per wheel turn, and `sample` says whether it has sample fields.
+    `counts` are the encoder counts per wheel turn. `sample` says whether the firmware can add
+    sample fields to its replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

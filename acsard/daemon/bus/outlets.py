@@ -143,7 +143,7 @@ class Outlets:
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
-        """Let the thread send the messages in the slots and end. Wait at most `timeout` s."""
+        """End the thread after it has sent the waiting messages. Wait at most `timeout` s."""
         self._leaving = True
         self._bell.ring()
         self._thread.join(timeout)

@@ -244,7 +244,7 @@ export class Guide {
 export function worded(words) {
   return words
     .replace('then type "lifted".', "then tick this.")
-    .replace(" q or Ctrl-C quits, here and later:", " Stop and quit ends it, here and later:")
+    .replace(" q or Ctrl-C quits at any time:", " Stop and quit ends the check at any time:")
     .replace("Press SPACE", "Press NOW")
     .replace("Enter alone:", "Left empty:")
     .replace("any key stops it", "any key or the button stops it");

@@ -135,7 +135,7 @@ function mode(name, words) {
 /** Show that the robot's computer answers but has reported nothing about the robot yet. */
 export function waiting() {
   mode("waiting", "WAITING");
-  text("reason", "for the robot: nothing is heard of it yet");
+  text("reason", "for the robot: nothing is received from it yet");
   doubted("");
 }
 

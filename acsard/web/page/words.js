@@ -59,7 +59,7 @@ export function yaw(q) {
 export function person(sender, own = "") {
   const [, name, certificate] = sender.match(/^(?:(.*)\/)?[0-9a-f]{16}(?: \[(.*)\])?$/) ?? [null, sender];
   if (own && sender === own) return "you";
-  if (name === "here") return "another page at the robot";
+  if (name === "here") return "another page on the robot itself";
   if (name && own && name === own.replace(/\/[^/]*$/, "")) return `another page of ${name}`;
   return name || certificate || "a program without a name";
 }
@@ -73,7 +73,7 @@ export function reason(state, elsewhere) {
 
 /** Return a sentence with senders in a person's words. The log keeps their digits, which tell two of one name apart. */
 export function named(text) {
-  return text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page at the robot");
+  return text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page on the robot itself");
 }
 
 /** Replace service names by button names, of this page or of the own page of the robot `elsewhere`, and times in UTC

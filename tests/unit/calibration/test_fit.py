@@ -70,7 +70,7 @@ def test_without_a_block_is_what_a_fit_without_it_gives() -> None:
     )
 
 
-def test_parameters_can_be_told_apart_by_the_normal_equations_of_the_three() -> None:
+def test_the_normal_equations_of_the_three_parameters_are_well_conditioned() -> None:
     found = fitted(np.random.default_rng(5), 0.0, 0.05)
     assert np.linalg.cond(found.marginal()) < 3
 

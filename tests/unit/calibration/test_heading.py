@@ -101,7 +101,7 @@ def test_no_row_spans_a_gap_of_the_gyro() -> None:
 
 
 @pytest.mark.parametrize("wrapped", [True, False])
-def test_degrees_are_told_from_radians(wrapped: bool) -> None:
+def test_degrees_are_distinguished_from_radians(wrapped: bool) -> None:
     drive = usual()
     yaw = np.degrees(drive.yaw)
     yaw = (yaw + 180) % 360 - 180 if wrapped else yaw

@@ -124,7 +124,7 @@ def test_runs_are_told_apart_by_any_name() -> None:
         (b"t left right yaw_rate\n1 2 3 4\n", "no commas between"),
         (b"t,left,right,left,x,y\n1,2,3,4,5,6\n", "left exists twice"),
         (LOG_HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is not a number'),
-        (LOG_HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, the header 4"),
+        (LOG_HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, but the header 4"),
         (b"SQLite format 3\0\0\0", "not text"),
     ],
 )
@@ -145,14 +145,14 @@ def test_many_bad_rows_refuse_the_file() -> None:
         read(LOG_HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" * 4)
 
 
-def test_what_is_no_measurement_counts_as_missing_and_is_told() -> None:
+def test_a_value_that_is_not_a_measurement_counts_as_missing_and_is_reported() -> None:
     table = read(LOG_HEADER + b"1,1e300,inf,nan\n2,1,1,1\n")
     assert np.isnan(table.columns["left"][0])
     assert np.isnan(table.columns["right"][0])
     assert len(table.notes) == 2
 
 
-def test_columns_that_are_not_used_are_told() -> None:
+def test_columns_that_are_not_used_are_reported() -> None:
     assert read(b"t,left,right,yaw_rate,volts\n1,2,3,4,5\n").notes == ('columns not used: "volts"',)
 
 
@@ -216,13 +216,13 @@ def test_what_others_write_is_the_same_table(how: str) -> None:
         (b"%time,field.left,field.right\n1,2,3\n", "is time it? rename it t"),
     ],
 )
-def test_what_cannot_be_read_is_told_with_what_to_do(data: bytes, words: str) -> None:
+def test_an_unreadable_log_is_reported_with_the_remedy(data: bytes, words: str) -> None:
     with pytest.raises(LogError, match=r".") as refused:
         read(data)
     assert words in str(refused.value)
 
 
-def test_a_unit_that_is_not_known_is_told() -> None:
+def test_a_unit_that_is_not_known_is_reported() -> None:
     notes = read(LOG_HEADER.replace(b"left", b"left (m/s)") + b"1,2,3,4\n").notes
     assert "column left has the unknown unit (m/s)" in notes[0]
 

@@ -100,7 +100,7 @@ def odometry(robot: Drive) -> Drive:
 
 @pytest.mark.variations(2)
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True)])
-def test_what_was_made_of_the_same_wheels_is_told(gyro: bool, places: bool) -> None:
+def test_what_was_made_of_the_same_wheels_is_reported(gyro: bool, places: bool) -> None:
     log = table(odometry(DRIVE), gyro=gyro, places=places)
     assert any("computed from the same wheels" in note for note in calibrated(log).notes)
     usual_log = table(DRIVE, gyro=gyro, places=places)
@@ -145,7 +145,7 @@ def test_multipliers_that_cannot_be_written_are_refused() -> None:
         in_range(np.array([12.0, 1.0, 1.0]))
 
 
-def test_what_is_unusual_is_told() -> None:
+def test_what_is_unusual_is_reported() -> None:
     told = list(
         remarks({"yaw_rate": 0.6}, 0.2, np.ones(5), np.array([5.0, 2, 2]), BASE, sized=True)
     )

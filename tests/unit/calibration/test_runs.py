@@ -54,7 +54,7 @@ def test_a_run_with_too_few_rows_is_left_out_and_told() -> None:
     assert any("fewer than 20 rows of wheel speeds are left out: 1 of" in note for note in notes)
 
 
-def test_rows_without_a_time_are_told() -> None:
+def test_rows_without_a_time_are_reported() -> None:
     assert any("have no time" in n for n in of([*rows(0), ",1,1,1,", ",1,1,1,"])[2])
 
 
@@ -72,7 +72,7 @@ def test_stamps_in_ns_and_us_since_1970_are_told_from_seconds(per_second: float)
 
 
 @pytest.mark.parametrize("form", ["{:g}", "{:.0f}"])
-def test_times_that_were_rounded_away_are_told(form: str) -> None:
+def test_times_that_were_rounded_away_are_reported(form: str) -> None:
     lines = [f"{form.format(1.7e9 + i / 100)},{i},{i},{i}," for i in range(3000)]
     with pytest.raises(LogError, match="write it with 3 decimals"):
         of(lines)
@@ -109,13 +109,13 @@ FOUR = "t,fr,fl,rl,rr,yaw_rate\n"
         ("9,9,0.1,9", "rl hardly turns while fl does"),
     ],
 )
-def test_front_and_rear_that_contradict_each_other_are_told(wheels: str, words: str) -> None:
+def test_front_and_rear_that_contradict_each_other_are_reported(wheels: str, words: str) -> None:
     text = FOUR + "".join(f"{i / 100},{wheels},0\n" for i in range(500))
     with pytest.raises(LogError, match=words):
         runs(read(text.encode()))
 
 
-def test_front_and_rear_that_differ_are_told() -> None:
+def test_front_and_rear_that_differ_are_reported() -> None:
     text = FOUR + "".join(f"{i / 100},9,9,9,7,0\n" for i in range(500))
     assert any("fr and rr differ by 22%" in n for n in runs(read(text.encode())).notes)
 
@@ -189,7 +189,7 @@ def test_what_happens_in_many_runs_is_one_note_with_its_sum() -> None:
     )  # fmt: skip
 
 
-def test_a_position_of_the_way_is_none_of_the_rest_after_it() -> None:
+def test_a_repeated_position_of_the_drive_is_not_taken_for_the_rest_after_it() -> None:
     """The logger repeats positions of 1 Hz in every row.
 
     The rows after the stop therefore still hold the last position of the drive.

@@ -103,7 +103,7 @@ SUBSETS = 20
                             for kind in ("constant track", "squares"))],
 )  # fmt: skip
 def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> None:
-    """The truth of a track that grows is the one that serves best at the drive's turn rates.
+    """The truth of a track that grows is the constant that fits best at the drive's turn rates.
 
     Each run of a set of squares has its own ratio of left to right, because it slips differently.
     """
@@ -248,7 +248,7 @@ def test_a_tape_measures_the_wheels_of_a_robot_whose_track_is_right() -> None:
 
 
 @so_many
-def test_bias_and_time_offset_are_told(count: int) -> None:
+def test_bias_and_time_offset_are_reported(count: int) -> None:
     for c, _ in robots("gyro", count):
         assert c.gyro_bias == pytest.approx(0.01, abs=0.002)
         assert c.delays["yaw_rate"] == pytest.approx(0.02, abs=0.012)
@@ -370,7 +370,7 @@ def test_order_repetition_standstill_and_epoch_change_nothing() -> None:
     assert np.allclose(plain.values, other.values, atol=1e-9)
 
 
-def test_gaps_and_jumps_are_told_and_cost_little() -> None:
+def test_gaps_and_jumps_are_reported_and_cost_little() -> None:
     made = usual()
     kept = np.sin(made.t / 7) > -0.6
     jumped = made.place + np.where(made.place_t > 40, 30 - 20j, 0)

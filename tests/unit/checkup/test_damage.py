@@ -36,7 +36,7 @@ def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
         ("comma_latched", "FAIL"),
     ],
 )
-def test_firmware_that_takes_parts_is_told(fault: str, verdict: str) -> None:
+def test_firmware_that_takes_parts_is_reported(fault: str, verdict: str) -> None:
     robot = Robot(fault, "no_watchdog", trailing_comma=True)
     with robot.board() as board:
         dialect.check(board)
@@ -45,7 +45,7 @@ def test_firmware_that_takes_parts_is_told(fault: str, verdict: str) -> None:
     assert robot.later() == [0.0] * 4
 
 
-def test_firmware_that_reads_a_last_number_that_is_cut_is_told() -> None:
+def test_firmware_that_reads_a_last_number_that_is_cut_is_reported() -> None:
     def scanned(line: bytes) -> protocol.Command | None:
         """Parse as `sscanf` does: it reads the last number as far as it goes."""
         got = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)

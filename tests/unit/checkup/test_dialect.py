@@ -27,7 +27,7 @@ def test_the_rate_it_speaks_at_is_found_and_used(rate: Any) -> None:
         assert board.baud_rate == rate
 
 
-def test_garbage_is_told_from_silence() -> None:
+def test_garbage_is_distinguished_from_silence() -> None:
     for fault, word in (("mute", "nothing"), ("noise", "other bytes"), ("partial_line", "pieces")):
         with Robot(fault).board(rest=False) as board, pytest.raises(StoppedError) as end:
             dialect.baud(board)
@@ -57,7 +57,7 @@ def test_the_identification_is_kept_and_missed_without_fault() -> None:
         (("unpadded", "trailing_comma"), "unpadded, trailing comma"),
     ],
 )
-def test_the_form_of_its_replies_is_told(faults: tuple[str, ...], figure: str) -> None:
+def test_the_form_of_its_replies_is_reported(faults: tuple[str, ...], figure: str) -> None:
     with Robot(*faults).board() as board:
         assert dialect.replies(board).figure == figure
 

@@ -13,7 +13,7 @@ from tests.each import each
 from tests.unit.checkup.robots import Busy, Robot, Starved
 
 
-def test_the_most_since_a_moment_is_told() -> None:
+def test_the_most_since_a_moment_is_reported() -> None:
     lateness = Lateness()
     for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (LEAST_S / 2, 4.0)):
         lateness.look(late_s, now_s)

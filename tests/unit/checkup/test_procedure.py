@@ -192,7 +192,7 @@ def test_a_wheel_mounted_the_other_way_round_is_a_sign_in_the_map(motor: int) ->
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(("one", "other"), list(combinations(range(4), 2)))
-def test_two_swapped_wheels_are_a_map(one: int, other: int) -> None:
+def test_two_swapped_wheels_give_a_changed_wheel_map(one: int, other: int) -> None:
     checked = check("plain_only", f"swapped_wheels={MOTORS[one]}:{MOTORS[other]}", person=True)
     assert checked.failed == ["wheel map"]
     assert checked.changes[f"mcu.wheels.{WHEELS[one]}"] == f"+{MOTORS[other]}"
@@ -741,7 +741,7 @@ def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
         ("bias=a:1.5", "motor a (front right)"),
     ],
 )
-def test_a_fault_beyond_what_the_lateness_explains_is_told(
+def test_a_fault_beyond_what_the_lateness_explains_is_reported(
     computer: type[Busy], fault: str, name: str
 ) -> None:
     checked = Checked(computer(fault, late_s=0.03, every=3))

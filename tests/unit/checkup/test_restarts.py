@@ -157,7 +157,7 @@ def test_a_watchdog_that_restarts_the_whole_board_is_named() -> None:
     assert "sent nothing for" in checked["restarts"].text
 
 
-def test_a_board_that_does_not_come_back_is_said_not_to_have() -> None:
+def test_a_board_that_does_not_come_back_is_reported() -> None:
     class Dies(Robot):
         dead = False
 

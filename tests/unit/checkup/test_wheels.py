@@ -76,7 +76,7 @@ def test_a_wheel_seen_twice_is_no_map() -> None:
     assert "rear left" in finding.text
 
 
-def test_a_motor_a_fifth_weak_is_told_with_its_share() -> None:
+def test_a_motor_a_fifth_weak_is_reported_with_its_share() -> None:
     finding = encoder_finding(MCU, seen(2, 2, 2.4, -2.45))
     assert "20% slower than the commanded 3 rad/s" in finding.text
     assert "faster" in encoder_finding(MCU, seen(2, 2, 3.3, -3.3)).text

@@ -128,7 +128,7 @@ def test_a_refusal_has_what_was_told_of_the_log(
     assert "1 cell of yaw_rate" in json.loads(capsys.readouterr().out)["notes"][0]
 
 
-def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_missing_log_is_reported(tmp_path: Path) -> None:
     args = parser(["calibrate"]).parse_args(["calibrate", "--log", str(tmp_path / "none.csv")])
     with pytest.raises(MendableError, match="correct --log"):
         args.main(args)

@@ -114,7 +114,7 @@ def test_what_the_simulator_shows_is_not_offered_for_a_robot_s_file(
 def test_nor_is_it_written_there_and_that_is_said_before_anything_is_checked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(UsageError, match=r"would not be changed: .*/dev/acsar_mcu"):
+    with pytest.raises(UsageError, match=r"cannot change .*/dev/acsar_mcu"):
         called(tmp_path, "--port", "sim", "--yes", "--write", text=REAL)
     assert capsys.readouterr().out == ""
     assert (tmp_path / "acsard.toml").read_text() == REAL
@@ -217,7 +217,7 @@ def test_a_port_that_is_not_there_is_66(tmp_path: Path, words: list[str]) -> Non
     assert end.value.code == 66
 
 
-def test_a_person_is_asked_until_the_answer_is_one(
+def test_a_person_is_asked_until_the_answer_is_valid(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n RL \n"))

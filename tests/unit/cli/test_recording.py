@@ -56,7 +56,7 @@ def log(capsys: pytest.CaptureFixture[str], where: Path, *words: str) -> tuple[i
     return code, told.out, told.err
 
 
-def test_the_list_has_a_line_each_and_says_what_happened(
+def test_the_list_has_a_line_for_each_recording_with_its_events(
     where: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, out, _ = log(capsys, where)
@@ -103,7 +103,7 @@ def test_where_nothing_was_ever_recorded_it_says_what_records(
     assert "acsard run --record DIRECTORY" in err
 
 
-def test_a_story_is_told_in_order_as_sentences_or_json(
+def test_a_timeline_is_in_order_as_sentences_or_json(
     where: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, out, err = log(capsys, where, "show", "1")
@@ -417,7 +417,7 @@ def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
     assert min(ends[Exit.OK], ends[Exit.FAILURE]) > HARMED / 2, ends
 
 
-def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_there_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert log(capsys, tmp_path)[:2] == (0, f"no recordings in {tmp_path}\n")
     code, _, err = log(capsys, tmp_path, "show")
     assert (code, "no recording in" in err) == (1, True)

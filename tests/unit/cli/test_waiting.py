@@ -75,7 +75,7 @@ def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
     return said
 
 
-def test_what_ceases_is_explained_once_for_each_silence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_silence_is_explained_once(capsys: pytest.CaptureFixture[str]) -> None:
     with explained(lambda: "", lambda: "its certificate has ended", 0.01) as heard:
         for _ in range(2):
             heard()

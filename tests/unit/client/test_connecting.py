@@ -52,7 +52,7 @@ def test_certificates_that_one_may_not_read_are_a_permission_error(shared: Path)
     assert str(shared / "ca.pem") in done.stdout
 
 
-def test_a_directory_without_certificates_is_said_and_not_taken_for_a_missing_daemon(
+def test_a_directory_without_certificates_is_reported_and_not_taken_for_a_missing_daemon(
     tmp_path: Path,
 ) -> None:
     with (

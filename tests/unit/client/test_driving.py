@@ -311,7 +311,7 @@ def test_so_does_one_that_publishes_seldom_when_its_clock_is_set_back_on_the_way
     assert world.sent.count(0.5) in (100, 101)
 
 
-def test_a_daemon_of_another_version_is_told_from_a_dead_one(
+def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)

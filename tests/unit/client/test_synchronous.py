@@ -100,7 +100,7 @@ def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
 
 
 @pytest.mark.parametrize("name", ["odm", "statte"])
-def test_a_key_that_there_is_not_is_the_one_reason_that_is_told(
+def test_a_key_that_there_is_not_is_the_one_reason_that_is_reported(
     session: Session, name: str
 ) -> None:
     with pytest.raises(NoAnswerError) as raised:

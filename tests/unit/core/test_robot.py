@@ -736,7 +736,7 @@ def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
     late = (Request("clear", 7, asked_ns=asked_ns, latch=latch),)
     out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=late))
     assert (out.mode, out.answers[0].success) == ("stopped", False)
-    assert "call it again" in out.answers[0].message
+    assert "call srv/clear again" in out.answers[0].message
     bench.now_ns += 10 * MS
     again = (Request("clear", 8, asked_ns=bench.now_ns, latch=latch),)
     assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=again)).answers[0].success
@@ -768,7 +768,7 @@ def test_a_stop_that_comes_ahead_of_its_query_and_with_it_is_one_event() -> None
 # logged events
 
 
-def test_a_command_that_is_refused_is_told_with_its_reason_and_who_sent_it() -> None:
+def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
     (event,) = Bench().linked().step(REST, source="nobody").events
     assert (event.name, event.level) == ("command_refused", "warning")
     assert event.text == "unknown_source: source nobody: not one of commands.sources"
@@ -781,7 +781,7 @@ def test_a_command_that_is_refused_is_told_with_its_reason_and_who_sent_it() -> 
     assert second.text.startswith("100 x malformed; the last: ")
 
 
-def test_missed_periods_are_told_with_their_number() -> None:
+def test_missed_periods_are_reported_with_their_number() -> None:
     bench = Bench().linked()
     bench.now_ns += 50 * MS
     out = bench.robot.step(Inputs(bench.now, True, True, 1, missed=4))
@@ -803,7 +803,7 @@ def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> No
     assert sum(event.count for event in lines) > 900
 
 
-def test_over_one_line_in_a_hundred_that_cannot_be_true_is_told_with_what_to_do() -> None:
+def test_over_one_line_in_a_hundred_that_cannot_be_true_is_reported_with_what_to_do() -> None:
     bench, told = Bench().linked(), Counter[str]()
     for i in range(2000):
         bench.reply = bench.codec.encode(WheelSpeeds(99.0, 0.0, 0.0, 0.0) if i % 50 == 0 else STILL)
@@ -1297,7 +1297,7 @@ def test_wheels_that_turn_against_their_command_are_a_fault() -> None:
     assert bench.mode() == "fault"
 
 
-def test_wheels_that_turn_without_a_command_are_told_and_counted() -> None:
+def test_wheels_that_turn_without_a_command_are_reported_and_counted() -> None:
     bench = Bench(fault_time=0.3).linked()
     bench.reply = bench.codec.encode(WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     told = [one.name for _ in range(100) for one in bench.step().events]
@@ -1306,7 +1306,7 @@ def test_wheels_that_turn_without_a_command_are_told_and_counted() -> None:
     assert bench.mode() == "ready"
 
 
-def test_a_wheel_that_stands_while_the_others_roll_is_told_and_counted() -> None:
+def test_a_wheel_that_stands_while_the_others_roll_is_reported_and_counted() -> None:
     bench = Bench().driving()
     bench.reply = bench.codec.encode(replace(ROLLING, front_left=0.0))
     told = [one.name for _ in range(200) for one in bench.step(GO).events]
@@ -1381,7 +1381,7 @@ def test_the_latches_of_a_robot_are_those_of_its_last_step() -> None:
     assert bench.robot.latches.stop
 
 
-def test_lines_that_are_not_answered_are_told() -> None:
+def test_lines_that_are_not_answered_are_reported() -> None:
     bench = Bench().linked()
     told: list[str] = []
     for number in range(1100):

@@ -162,7 +162,7 @@ def test_an_old_stop_in_a_directory_that_cannot_be_written_keeps_its_name(
     assert "No space left" in file.trouble
 
 
-def test_a_user_without_a_home_is_told_so_and_the_robot_starts_stopped(
+def test_without_a_home_directory_the_robot_starts_stopped_and_says_why(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def nowhere() -> Path:
@@ -176,7 +176,7 @@ def test_a_user_without_a_home_is_told_so_and_the_robot_starts_stopped(
     file.close()
 
 
-def test_a_directory_of_an_unknown_user_is_told_and_the_robot_starts_stopped() -> None:
+def test_a_directory_of_an_unknown_user_is_reported_and_the_robot_starts_stopped() -> None:
     file = LatchFile(config(Path("~nobody-has-this-name/acsard")), {})
     latches = asyncio.run(file.start(NOW))
     file.close()
@@ -184,7 +184,7 @@ def test_a_directory_of_an_unknown_user_is_told_and_the_robot_starts_stopped() -
     assert "control.state_directory: " in latches.stop.why
 
 
-def test_each_place_goes_before_the_next_one() -> None:
+def test_the_latch_file_is_in_the_first_place_that_is_set() -> None:
     service, user = {"STATE_DIRECTORY": "/var/lib/acsard:/var/lib/b"}, {"XDG_STATE_HOME": "/u"}
     assert place(config(Path("/mine")), service | user) == Path("/mine") / NAME
     assert place(Config(), service | user) == Path("/var/lib/acsard") / NAME
@@ -502,7 +502,7 @@ def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
     assert "cannot start another thread" in file.trouble
 
 
-def test_a_thread_that_has_ended_is_told(tmp_path: Path, started: Started) -> None:
+def test_a_thread_that_has_ended_is_reported(tmp_path: Path, started: Started) -> None:
     file, _ = started(tmp_path)
     file.close()
     assert file.trouble.startswith("the thread that keeps a stop over a restart has ended")

@@ -59,7 +59,9 @@ def test_a_namespace_is_before_the_names_of_ros_and_a_tree_that_is_off_has_none(
 
 @each("form", FORMATS)
 @each("message", [TWIST, STAMPED])
-def test_a_twist_is_told_with_the_time_it_came(form: Format, message: Twist | TwistStamped) -> None:
+def test_a_twist_is_reported_with_the_time_it_came(
+    form: Format, message: Twist | TwistStamped
+) -> None:
     told = read(encode(message, form))
     assert told == TwistStamped(Header(Time(9, 1), "base_link"), TWIST)
 

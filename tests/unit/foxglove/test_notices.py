@@ -78,7 +78,7 @@ def test_the_first_moment_is_no_news() -> None:
     assert told.told == WHY
 
 
-def test_it_is_told_once_and_taken_back_when_over() -> None:
+def test_the_condition_is_reported_once_and_taken_back_when_over() -> None:
     told = Objections()
     changes = [told.look(WHY if n < 20 else "", n * OBJECTS_NS) for n in range(30)]
     assert changes.count(True) == 2
@@ -87,7 +87,7 @@ def test_it_is_told_once_and_taken_back_when_over() -> None:
     assert told.told == ""
 
 
-def test_another_reason_is_told_at_once() -> None:
+def test_another_reason_is_reported_at_once() -> None:
     told = Objections()
     told.look(WHY, 0)
     told.look(WHY, OBJECTS_NS)

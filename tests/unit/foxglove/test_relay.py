@@ -34,7 +34,7 @@ def test_who_opens_the_log_gets_all_that_is_still_known() -> None:
 
 
 @each(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
-def test_each_is_told_once(before: int, now: int) -> None:
+def test_each_is_reported_once(before: int, now: int) -> None:
     news = News()
     news.of(events(before))
     assert names(news, events(now)) == [f"mode{n}" for n in range(before, now)]

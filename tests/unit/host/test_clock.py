@@ -55,7 +55,7 @@ def test_an_instant_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) ->
     assert (at.mono_ns % 1000, at.wall_ns) == (0, WALL_NS + 1_000)
 
 
-def test_a_sleep_is_told_once_and_the_next_one_too() -> None:
+def test_a_sleep_is_reported_once_and_the_next_one_too() -> None:
     slept = [5 * MOMENT_NS]
     asleep = Asleep(lambda: slept[0])
     assert not asleep.was()

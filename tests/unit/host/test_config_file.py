@@ -54,7 +54,7 @@ def test_a_file_that_would_not_check_is_left_as_it_was(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_what_the_library_cannot_do_is_said(
+def test_what_the_library_cannot_do_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(text: str) -> None:
@@ -76,7 +76,7 @@ def test_a_link_stays_one(tmp_path: Path) -> None:
     assert "trailing_comma = true" in (tmp_path / "real.toml").read_text()
 
 
-def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(MendableError):
         change(tmp_path / "none.toml", KEYS)
 

@@ -143,12 +143,14 @@ def test_ready_is_said_in_one_datagram(manager: Manager) -> None:
     assert manager.heard() == [{"READY": "1"}]
 
 
-def test_stopping_is_said_with_why(manager: Manager) -> None:
+def test_stopping_is_reported_with_why(manager: Manager) -> None:
     systemd(manager).stopping()
     assert manager.heard() == [{"STOPPING": "1", "STATUS": "ramping to zero"}]
 
 
-def test_waiting_asks_for_more_time_than_passes_until_it_is_said_again(manager: Manager) -> None:
+def test_waiting_asks_for_more_time_than_passes_until_it_is_reported_again(
+    manager: Manager,
+) -> None:
     systemd(manager).waiting("waits for the router")
     assert manager.heard() == [
         {"EXTEND_TIMEOUT_USEC": "30000000", "STATUS": "waits for the router"}

@@ -59,7 +59,7 @@ def test_a_daemon_on_this_machine_has_its_clock() -> None:
     assert list(clocks(seen(-3.0, here=True))) == []
 
 
-def test_stamps_that_were_replaced_are_told() -> None:
+def test_stamps_that_were_replaced_are_reported() -> None:
     (finding,) = clocks(seen(0.0, stamps_replaced=12))
     assert "12 commands" in finding.text
 
@@ -177,7 +177,7 @@ def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_bo
     assert "mcu check" not in finding.mend
 
 
-def test_a_wheel_that_is_left_out_is_told() -> None:
+def test_a_wheel_that_is_left_out_is_reported() -> None:
     *_, finding = found({}, {}, wheel_fault="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")
 
@@ -186,7 +186,7 @@ DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
 """Line counters after 40 days at 100 Hz."""
 
 
-def test_after_months_what_is_wrong_now_is_told_and_no_old_accident() -> None:
+def test_after_months_what_is_wrong_now_is_reported_and_no_old_accident() -> None:
     (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 40})
     assert finding.level == "ok"
     assert "lost 40 times" in finding.text
@@ -198,7 +198,7 @@ def test_after_months_what_is_wrong_now_is_told_and_no_old_accident() -> None:
     assert "10 malformed" in finding.text
 
 
-def test_a_link_that_went_is_told_with_how_often() -> None:
+def test_a_lost_link_is_reported_with_the_number_of_losses() -> None:
     assert not gone({"lines": 9})
     (finding,) = found({}, {"link_lost": 4})
     assert finding.level == "warning"

@@ -33,7 +33,7 @@ def test_root_without_the_capability_is_held_to_the_limit(
     ("policy", "level"),
     [(os.SCHED_OTHER, "warning"), (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, "ok")],
 )
-def test_of_a_daemon_that_runs_what_it_has_is_told(
+def test_of_a_daemon_that_runs_what_it_has_is_reported(
     policy: int, level: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getscheduler", lambda _: policy)

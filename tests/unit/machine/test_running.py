@@ -28,7 +28,7 @@ def test_a_daemon_that_runs_with_the_file_has_it() -> None:
     assert "pid 77" in finding.text
 
 
-def test_each_key_that_is_otherwise_is_told_with_both_values() -> None:
+def test_each_key_that_is_otherwise_is_reported_with_both_values() -> None:
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
     assert [one.words(key) for key, one in differences(runs, FILE).items()] == [
         'mcu.port = "/dev/pts/3", not "sim"',
@@ -73,7 +73,7 @@ def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:
     assert "mcu.port" not in by_set.text
 
 
-def test_a_source_that_only_the_file_has_is_told() -> None:
+def test_a_source_that_only_the_file_has_is_reported() -> None:
     runs = replace(FILE, commands=replace(FILE.commands, sources=FILE.commands.sources[1:]))
     assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in differences(runs, FILE)
 

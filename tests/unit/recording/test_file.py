@@ -223,7 +223,7 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_with_a_message(
         told = str(refused.value)
         assert (str(path) in told, told.isprintable()) == (True, True)
         if not tail:
-            lacks = "complete second" if size >= config_end else "its beginning is missing"
+            lacks = "has no steps" if size >= config_end else "its beginning is missing"
             assert lacks in told
 
 

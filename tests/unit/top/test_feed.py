@@ -126,7 +126,7 @@ def test_a_put_on_a_wildcard_is_no_state(robot: Robot) -> None:
     assert feed.seen().state is None
 
 
-def test_a_state_of_another_version_is_told_as_that(robot: Robot) -> None:
+def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.state = DecodeError("bad", "unknown field")
     with pytest.raises(ReplyError, match="another version"):
@@ -134,7 +134,7 @@ def test_a_state_of_another_version_is_told_as_that(robot: Robot) -> None:
     assert feed.seen().undecodable == 1
 
 
-def test_a_silence_is_told_sooner_once_a_state_has_arrived(robot: Robot) -> None:
+def test_a_silence_is_reported_sooner_once_a_state_has_arrived(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.now += FIRST_S - 0.01
     assert not feed.seen().silent

@@ -24,7 +24,7 @@ def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> N
     assert len(told(resting)) == 1
 
 
-def test_another_reason_is_told_at_once_but_never_more_than_two_lines_a_second() -> None:
+def test_another_reason_is_reported_at_once_but_never_more_than_two_lines_a_second() -> None:
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
     found = told([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
     assert [state.mode for state in found] == ["driving", "stopped", "driving"]

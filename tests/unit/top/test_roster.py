@@ -40,7 +40,7 @@ def test_robots_are_in_the_order_of_their_names() -> None:
         (replace(ROW, state=None, here=False), "not there"),
     ],
 )
-def test_who_is_gone_or_silent_is_told(row: Row, words: str) -> None:
+def test_a_robot_that_is_gone_or_silent_is_reported(row: Row, words: str) -> None:
     assert table([row], 120)[1].endswith(words)
 
 

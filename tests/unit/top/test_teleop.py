@@ -66,14 +66,14 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
     assert shown[-len(HELP) :] == list(HELP)
 
 
-def test_keys_that_do_not_drive_are_told() -> None:
+def test_keys_that_do_not_drive_are_reported() -> None:
     why = "app has the same priority and came first: wait until it is silent"
     seen = replace(SEEN, objection=why)
     assert why in " ".join(" ".join(texts(seen, 40)).split())
     assert why in told(news(seen, 40))
 
 
-def test_a_silence_is_told_with_its_length() -> None:
+def test_a_silence_is_reported_with_its_length() -> None:
     silent = replace(SEEN, age=7.0, silent=True)
     for seen in (silent, replace(silent, state=None)):
         assert "nothing received from the daemon for 7 s" in " ".join(texts(seen, 80))
@@ -82,7 +82,7 @@ def test_a_silence_is_told_with_its_length() -> None:
 
 
 @each("mode", list(Mode))
-def test_the_mode_is_said_once(mode: Mode) -> None:
+def test_the_mode_is_reported_once(mode: Mode) -> None:
     seen = of(mode=mode.value, reason=f"{mode.value}: because")
     assert texts(seen, 80)[1].split() == [mode.value.upper(), "because"]
     assert news(seen, 80)[0].startswith(f"{mode.value}: because; ")

@@ -121,7 +121,7 @@ def test_samples_of_a_gyro_that_do_not_count_are_among_the_rejects() -> None:
     assert "gyro second sender 1,200, out of range 3" in line_with("rejected", seen)
 
 
-def test_the_link_is_told_with_its_port() -> None:
+def test_the_link_is_reported_with_its_port() -> None:
     assert line_with("link ").startswith("link up on /dev/acsar ─")
     long = "/dev/serial/by-id/usb-Arduino__www.arduino.cc__0043_7543331393435190A0A1-if00"
     assert "on usb-Arduino__www.arduino.cc" in line_with(

@@ -137,7 +137,7 @@ def test_names_are_told_from_ports_and_loopback_from_names() -> None:
     ]  # fmt: skip
 
 
-def test_an_ipv4_address_is_itself_by_a_socket_for_both() -> None:
+def test_a_mapped_ipv4_address_is_shown_as_ipv4() -> None:
     told = ("::ffff:192.168.1.7", "192.168.1.7", "::1", "fe80::ffff:1", "")
     assert [unmapped(one) for one in told] == ["192.168.1.7", "192.168.1.7", "::1", *told[3:]]
 

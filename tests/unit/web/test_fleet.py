@@ -67,7 +67,7 @@ async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
             await asyncio.sleep(0.01)
 
 
-def test_a_robot_is_told_with_its_version_and_seconds_and_as_gone_when_its_token_is(
+def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when_its_token_is(
     session: zenoh.Session,
 ) -> None:
     def say() -> None:

@@ -111,7 +111,7 @@ def test_a_port_that_is_taken_is_told_or_passed_over() -> None:
             assert one.port > wished.port
 
 
-def test_https_without_a_certificate_is_told_and_http_needs_none(tmp_path: Path) -> None:
+def test_https_without_a_certificate_is_reported_and_http_needs_none(tmp_path: Path) -> None:
     away, here = listens("https://0.0.0.0:8443"), listens("http://127.0.0.1:8080")
     require_certificate([here], "")
     with pytest.raises(CertificateError, match="tls init"):

@@ -54,7 +54,7 @@ def test_a_robot_that_is_not_heard_is_down_and_tells_no_old_speed() -> None:
     assert not any(name == "acsard_linear_speed_mps" for name, _ in got)
 
 
-def test_without_feedback_no_speed_is_told() -> None:
+def test_without_feedback_no_speed_is_reported() -> None:
     unknown = replace(STATE, link="down", linear=None, angular=None, wheels=[])
     got = parsed(text("acsar", unknown, True, 0, {}, {}))
     assert not any("speed" in name for name, _ in got)

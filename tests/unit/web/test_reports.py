@@ -119,7 +119,7 @@ def test_what_fails_says_why_and_is_tried_anew_when_it_is_asked_for_again(
     run(story)
 
 
-def test_a_program_that_is_not_there_is_told() -> None:
+def test_a_program_that_is_not_there_is_reported() -> None:
     async def story() -> None:
         told = await become(Reports(("/nowhere/acsard",)), A, "ready", "failed")
         assert "No such file" in told.text

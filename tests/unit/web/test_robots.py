@@ -96,7 +96,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
     return World(monkeypatch)
 
 
-def test_a_robot_that_falls_silent_is_told_within_its_time(world: World) -> None:
+def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> None:
     found = world.told(10.0, lambda t: world.state() if t < 5.0 else None)
     (_, here), (at, gone) = found
     assert here == ""
@@ -120,7 +120,7 @@ def test_a_storage_that_answers_for_a_daemon_that_died_does_not_hide_it(world: W
     assert [bool(gone) for _, gone in found] == [False, True]
 
 
-def test_a_daemon_of_another_version_is_told_as_that(world: World) -> None:
+def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
     ((at, gone),) = world.told(10.0, lambda t: UNREADABLE)
     assert "another version" in gone
     assert at <= FIRST_S + 2 * LOOK_S

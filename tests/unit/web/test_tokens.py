@@ -79,7 +79,7 @@ def test_who_invites_beside_a_service_is_told_that_it_does_not_know_the_token(
     assert Vault(service, "robot1").unknown_to(service) == ""
 
 
-def test_those_that_count_are_told_at_once(tmp_path: Path) -> None:
+def test_those_that_count_are_reported_at_once(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     _, first = vault.invite("viewer", "tv", 1)
     _, second = vault.invite("operator", "phone", 1)

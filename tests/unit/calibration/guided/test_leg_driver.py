@@ -274,7 +274,7 @@ def test_a_gyro_that_sees_less_than_the_wheels_do_is_no_disobedience() -> None:
     assert world.run(5.0).driver.phase is Phase.DONE
 
 
-def test_wheels_that_never_come_to_rest_are_told() -> None:
+def test_wheels_that_never_come_to_rest_are_reported() -> None:
     world = World(Leg("", "", (Move(0.5, 0.3),))).until_moving()
     for _ in range(500):
         world.now += TICK

@@ -93,7 +93,7 @@ def test_no_track_makes_it_longer_than_it_may_be(way: str, separation: float) ->
 
 
 @each_way
-def test_what_it_improves_is_told(way: str) -> None:
+def test_what_it_improves_is_reported(way: str) -> None:
     for _, found, _, _ in robots(way, FEW):
         worth = found.improvement
         # Only a heading sensor or a tape measures a turn itself.

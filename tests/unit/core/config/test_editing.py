@@ -71,7 +71,7 @@ def test_windows_line_ends_stay() -> None:
     assert "\r\r" not in after
 
 
-def test_what_the_library_cannot_do_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_library_cannot_do_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(text: str) -> None:
         raise NonExistentKey("mcu")
 

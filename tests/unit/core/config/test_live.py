@@ -158,7 +158,9 @@ def test_limits_beyond_what_feedback_may_say_are_refused() -> None:
         ),
     ],
 )
-def test_what_cannot_be_set_is_said_with_what_to_do(key: str, value: object, words: str) -> None:
+def test_a_setting_that_cannot_be_set_is_reported_with_the_remedy(
+    key: str, value: object, words: str
+) -> None:
     (line,) = problems({key: value})
     assert words in line
     assert len(line) < 300

@@ -130,7 +130,7 @@ def test_a_stop_of_exactly_the_longest_is_accepted_and_a_softer_one_is_not() -> 
     assert line.startswith("limits.linear_stop_deceleration = 0.49: braking from full speed")
 
 
-def test_a_stop_that_is_both_too_soft_and_softer_than_the_ramp_is_told_once() -> None:
+def test_a_stop_that_is_both_too_soft_and_softer_than_the_ramp_is_reported_once() -> None:
     soft = LimitsConfig(linear_deceleration=0.2, linear_stop_deceleration=0.1)
     (line,) = problems(Config(limits=soft))
     assert line.endswith("write 0.5 or more")
@@ -149,7 +149,7 @@ def test_feedback_must_leave_room_for_what_the_limits_ask(wheel_speed: float, go
     assert (found == []) is good
 
 
-def test_the_most_that_a_line_can_say_is_room_enough() -> None:
+def test_the_largest_speed_of_a_line_is_enough_for_any_limit() -> None:
     fast = LimitsConfig(linear_speed=10.0, wheel_speed=99.99, linear_deceleration=3.0)
     top = FeedbackConfig(wheel_speed=99.99)
     assert problems(Config(limits=fast, feedback=top)) == []

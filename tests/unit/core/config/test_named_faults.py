@@ -83,13 +83,15 @@ def test_a_file_may_have_any_of_them() -> None:
 
 
 @each(("text", "words"), REFUSED)
-def test_what_is_no_fault_is_told_with_its_key_and_place(text: str, words: str) -> None:
+def test_a_name_that_is_not_a_fault_is_reported_with_its_key_and_place(
+    text: str, words: str
+) -> None:
     (told,) = problems(f'["ftdi", "{text}"]')
     assert told.startswith(f'sim.faults[1] = "{text}": ')
     assert words in told
 
 
-def test_every_mistake_is_told() -> None:
+def test_every_mistake_is_reported() -> None:
     told = problems('["mut", "ftdi", "stalls=5"]')
     assert [line.partition(" ")[0] for line in told] == ["sim.faults[0]", "sim.faults[2]"]
 

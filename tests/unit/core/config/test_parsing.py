@@ -121,7 +121,7 @@ def test_the_command_line_wins_over_the_file() -> None:
     assert config.robot.id == "r2"
 
 
-def test_a_mistake_on_the_command_line_is_told_like_one_in_the_file() -> None:
+def test_a_mistake_on_the_command_line_is_reported_like_one_in_the_file() -> None:
     (line,) = problems_of(b"", {"mcu": {"baud_rate": 1200}})
     assert line.startswith("mcu.baud_rate = 1200: expected one of 9600, 19200")
 
@@ -317,7 +317,7 @@ def test_many_mistakes_at_once_give_a_line_each() -> None:
     assert all(sum(line.startswith(start) for line in found) == 1 for start in starts)
 
 
-def test_all_contradictions_are_told_at_once() -> None:
+def test_all_contradictions_are_reported_at_once() -> None:
     found = problems_of(
         """
         [mcu]
@@ -334,7 +334,7 @@ def test_all_contradictions_are_told_at_once() -> None:
     assert len(found) == 6
 
 
-def test_rules_between_keys_are_told_with_the_mistakes_of_other_keys() -> None:
+def test_rules_between_keys_are_reported_with_the_mistakes_of_other_keys() -> None:
     found = problems_of(
         """
         colour = 1

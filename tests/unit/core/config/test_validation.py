@@ -120,7 +120,7 @@ def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(bad: float) -
     assert len(problems_of({"first": {"name": "x", "length": bad}})) == 1
 
 
-def test_every_mistake_is_told_at_once() -> None:
+def test_every_mistake_is_reported_at_once() -> None:
     found = problems_of({"toes": 9, "wood": "elm", "legs": [{}, {"nam": 1}], "x": 0})
     starts = (
         "x = 0",

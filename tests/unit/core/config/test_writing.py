@@ -35,7 +35,7 @@ def test_what_is_printed_means_the_same_configuration(text: bytes) -> None:
     assert parse(printed(config).encode()) == config
 
 
-def test_what_is_printed_again_is_the_same_text() -> None:
+def test_a_printed_configuration_is_printed_the_same_again() -> None:
     text = printed(parse(CONFIGS[4]))
     assert printed(parse(text.encode())) == text
 

@@ -82,7 +82,7 @@ class Daemon:
         return events
 
 
-def test_a_router_that_is_missing_from_the_start_is_told_and_counted() -> None:
+def test_a_router_that_is_missing_from_the_start_is_reported_and_counted() -> None:
     daemon = Daemon()
     (event,) = daemon.hears((), (A,))
     assert (event.name, event.level) == ("router_missing", "warning")
@@ -101,7 +101,7 @@ def test_a_router_that_came_is_told_by_its_name() -> None:
     assert daemon.told.status == RoutersStatus((A,), ())
 
 
-def test_of_two_routers_only_the_one_that_went_is_told() -> None:
+def test_of_two_routers_only_the_one_that_went_is_reported() -> None:
     daemon = Daemon()
     assert [e.name for e in daemon.hears((A, B), ())] == ["router_found"]
     (event,) = daemon.hears((A,), (B,))
@@ -109,7 +109,7 @@ def test_of_two_routers_only_the_one_that_went_is_told() -> None:
     assert A not in event.text
 
 
-def test_a_peer_in_a_routers_place_is_told_once_with_what_it_means() -> None:
+def test_a_peer_in_a_routers_place_is_reported_once_with_what_it_means() -> None:
     told, counters = RouterFollower(), Counter[str]()
     events: list[Event] = []
     told.receive(RoutersStatus((A,)), counters, events)  # the type of this peer is not known yet

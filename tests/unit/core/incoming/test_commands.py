@@ -366,7 +366,7 @@ TOLD = {
 @each("surplus", [*range(9), 16, 24, 200])
 @each("fill", [b"\x00", b"\xff"])
 @each("header", ORDERS)
-def test_surplus_bytes_of_any_length_make_no_other_command_where_the_type_is_told(
+def test_surplus_bytes_of_any_length_make_no_other_command_where_the_type_is_given(
     header: bytes, fill: bytes, surplus: int
 ) -> None:
     more = fill * surplus

@@ -118,7 +118,7 @@ def test_counts_bridge_no_gap_in_which_they_could_have_wrapped() -> None:
     assert not bench.timeline.restarted
 
 
-def test_a_restarted_clock_is_told_and_is_a_gap() -> None:
+def test_a_restarted_clock_is_reported_and_is_a_gap() -> None:
     bench = Bench()
     bench.line(900, 0, 0, 0)
     found = bench.line(0, 0, 0, 0, ms=10, mcu_ms=-500)
@@ -197,7 +197,7 @@ def test_stamps_of_lines_that_lay_in_the_kernel_are_a_period_apart() -> None:
     assert {f.at.wall_ns - f.at.mono_ns for f in found} == {7}
 
 
-def test_missing_lines_are_bridged_and_no_gap() -> None:
+def test_missing_lines_are_filled_and_are_not_a_gap() -> None:
     bench = reporting(Bench(counts=0))
     for ms in range(0, 310, 10):
         bench.timeline.left(bench.now_ns + ms * MS)

@@ -51,7 +51,7 @@ HEARD: dict[str, tuple[bytes, Look, str]] = {
 }  # fmt: skip
 
 
-def test_a_board_that_only_prints_noise_is_told_with_what_it_said() -> None:
+def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
     bench = Bench().open()
     texts = []
     for tick in range(500):
@@ -86,7 +86,7 @@ def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
         (136, 0.25, "at least every 0.25 s", "mcu.reply_period"),
     ],
 )
-def test_lines_too_far_apart_are_told_and_no_setting_that_would_be_refused(
+def test_lines_too_far_apart_are_reported_and_no_setting_that_would_be_refused(
     apart: int, longest: float, told: str, untold: str
 ) -> None:
     bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
@@ -137,7 +137,7 @@ def test_a_board_that_does_not_answer_steps_in_time_is_silent() -> None:
     assert after(*[49] * 3).late_s == 0.0
 
 
-def test_a_computer_that_did_not_run_is_told_with_how_long() -> None:
+def test_a_host_stall_is_reported_with_its_length() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
         told = after(*steps).words("stale")
         assert told.startswith("this computer did not run for 0.80 s")
@@ -211,7 +211,7 @@ def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = 
     return [event.text for event in events if event is not None]
 
 
-def test_a_fifth_lost_is_told_once_with_its_figures() -> None:
+def test_a_fifth_lost_is_reported_once_with_its_figures() -> None:
     (text,) = events_of(5)
     assert f"only {WINDOW * 4 // 5} of {WINDOW} lines were answered" in text
     assert "`acsard mcu check`" in text
@@ -225,7 +225,7 @@ def test_a_board_known_to_report_by_its_own_clock_and_no_link_are_not_judged() -
     assert events_of(5, period=0.1) == events_of(5, linked=False) == []
 
 
-def test_it_is_told_again_after_the_link_was_lost() -> None:
+def test_it_is_reported_again_after_the_link_was_lost() -> None:
     answered, events = UnansweredLines(0.0), []
     for sent in range(3 * WINDOW):
         events.append(answered.look(sent, sent // 2, sent != WINDOW + 10))

@@ -51,7 +51,7 @@ def test_it_does_not_rise_against_a_reason() -> None:
     assert bench.good() == "up"
 
 
-def test_lines_further_apart_than_quiet_are_told_and_make_no_link() -> None:
+def test_lines_further_apart_than_quiet_are_reported_and_make_no_link() -> None:
     bench = Bench()
     bench.good(2, ms=101)
     assert bench.link.sparse_s == 0.0  # a single silence proves nothing
@@ -70,7 +70,7 @@ def test_silence_makes_it_stale_and_good_lines_bring_it_back() -> None:
     assert bench.good() == "up"
 
 
-def test_bad_lines_alone_do_not_take_it_down_but_are_told() -> None:
+def test_bad_lines_alone_do_not_take_the_link_down_but_are_reported() -> None:
     bench = Bench()
     bench.good(GOOD_LINES)
     assert [bench.link.bad() for _ in range(BAD_LINES + 1)].index(True) == BAD_LINES - 1

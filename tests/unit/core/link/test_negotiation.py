@@ -241,7 +241,7 @@ def test_a_new_opening_forgets_who_was_there() -> None:
     assert bench.check.state == "plain"
 
 
-def test_a_plain_question_that_did_not_leave_says_nothing_of_the_one_before() -> None:
+def test_a_plain_question_that_was_not_sent_does_not_answer_the_one_before() -> None:
     bench = Bench()
     plain, question, again = bench.ask(200)
     assert [kind(line) for line in (plain, question, again)] == ["plain", "checked", "plain"]

@@ -206,7 +206,7 @@ def test_a_filter_behind_coarse_counts_leaves_of_a_step_its_share(share: float) 
     assert steps_after([0.0, *speeds]).size > 0.4 * share * quantum
 
 
-def test_one_damaged_line_is_no_step_of_an_encoder() -> None:
+def test_one_damaged_line_does_not_change_the_quantization_step() -> None:
     steps = steps_after(fine_speeds(2 * BLOCK + 8))
     steps_after([40.0, 12.0], steps)
     assert steps.size < 0.5

@@ -144,7 +144,7 @@ def test_more_than_one_period_in_a_hundred_missed_in_the_last_minute_is_a_warnin
     }
 
 
-def test_what_was_missed_an_hour_ago_is_told_and_no_warning_any_more() -> None:
+def test_what_was_missed_an_hour_ago_is_reported_and_no_warning_any_more() -> None:
     one = row("control loop", snapshot=seen(counters={"missed_periods": 100_000}))
     assert (one.level, values(one)["missed_periods"]) == (OK, "100000")
 

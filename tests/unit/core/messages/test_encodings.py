@@ -76,7 +76,7 @@ def test_what_is_no_ros_message_has_no_cdr_form(value: object) -> None:
 
 @each("cls", [dict, Info, RobotState])
 @each("encoding", ["", "application/cdr"])
-def test_what_is_no_ros_message_is_not_read_from_cdr_either(
+def test_a_type_that_is_not_a_ros_message_is_not_decoded_from_cdr(
     cls: type[object], encoding: str
 ) -> None:
     with pytest.raises(DecodeError) as caught:
@@ -288,7 +288,9 @@ def test_every_finite_twist_comes_back_bit_for_bit(twist: Twist, form: Format) -
         (b'{"linear":\n}', "line 2, column 1: invalid character"),
     ],
 )
-def test_what_is_no_json_is_told_with_its_line_and_column(payload: bytes, says: str) -> None:
+def test_text_that_is_not_json_is_reported_with_its_line_and_column(
+    payload: bytes, says: str
+) -> None:
     with pytest.raises(DecodeError) as refused:
         Decoder(Twist).decode("application/json", payload)
     assert (refused.value.reason, str(refused.value)) == ("malformed", says)

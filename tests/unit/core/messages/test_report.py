@@ -637,7 +637,7 @@ def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
         ("not believed", 1),
     ],
 )
-def test_what_the_gyro_does_is_said_and_how_bad_that_is(does: GyroDoes, level: int) -> None:
+def test_what_the_gyro_does_is_reported_and_how_bad_that_is(does: GyroDoes, level: int) -> None:
     state, (row,) = with_gyro(GyroStatus(does))
     assert (state.gyro, row.level, row.message) == (does, level, WORDS[does])
     assert {pair.key for pair in row.values} == {"delay_s"}
@@ -699,7 +699,7 @@ DAY_NS = 86400 * 10**9
         (-2, 2, "expired 2 days ago"),
     ],
 )
-def test_a_certificate_that_ends_is_said_in_time(days: int, level: int, words: str) -> None:
+def test_a_certificate_that_ends_is_reported_in_time(days: int, level: int, words: str) -> None:
     config = replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls"))
     made = Report(config, START, OUTPUTS.now.wall_ns + days * DAY_NS)
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)

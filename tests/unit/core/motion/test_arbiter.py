@@ -236,7 +236,7 @@ def test_the_sender_that_was_neutral_drives_while_another_of_its_source_was_not(
         assert bench.choice().twist == BACK
 
 
-def test_of_two_senders_of_a_source_the_first_is_followed_alone_and_the_other_is_told() -> None:
+def test_of_two_senders_of_a_source_the_first_is_followed_alone_and_the_other_is_reported() -> None:
     bench = Bench(HIGH, armed=False)
     for sender in ("a", "b"):
         bench.send(HIGH, REST, sender)

@@ -105,7 +105,7 @@ def test_the_mode_it_starts_in_is_no_event() -> None:
     assert CommandEvents(Mode.WAITING).changes(Mode.WAITING, NOBODY, "no link") == []
 
 
-def test_another_mode_is_told_once_with_why() -> None:
+def test_another_mode_is_reported_once_with_why() -> None:
     told = CommandEvents(Mode.WAITING)
     assert told.changes(Mode.READY, NOBODY, "waiting for a command") == [
         Event("mode", "waiting for a command", kind="waiting -> ready")
@@ -113,7 +113,7 @@ def test_another_mode_is_told_once_with_why() -> None:
     assert told.changes(Mode.READY, NOBODY, "another reason") == []
 
 
-def test_who_begins_to_drive_is_told_with_the_mode_and_as_the_commander() -> None:
+def test_a_new_commander_is_reported_with_the_mode_and_as_the_commander() -> None:
     mode, commander = CommandEvents(Mode.READY).changes(
         Mode.DRIVING, by("app", "joe"), "driving: by app"
     )
@@ -121,7 +121,7 @@ def test_who_begins_to_drive_is_told_with_the_mode_and_as_the_commander() -> Non
     assert commander == Event("commander", "", by="app (joe)", kind="nobody -> app (joe)")
 
 
-def test_another_commander_is_told_with_the_one_before() -> None:
+def test_another_commander_is_reported_with_the_one_before() -> None:
     told = CommandEvents(Mode.READY)
     told.changes(Mode.DRIVING, by("app", "joe"), "")
     (source,) = told.changes(Mode.DRIVING, by("nav", "joe"), "")
@@ -144,7 +144,7 @@ def test_who_sends_to_a_stopped_robot_commands_nothing() -> None:
     assert told.changes(Mode.STOPPED, choice, "stopped") == []
 
 
-def test_who_sends_speeds_that_must_wait_is_told_once_it_lasts() -> None:
+def test_a_source_whose_speeds_must_wait_is_reported_once_it_lasts() -> None:
     told = CommandEvents(Mode.READY)
     early = Choice("nav", None, Wait("neutral", "nav", 1.0, ros=True), sender="joe")
     assert told.changes(Mode.READY, early, "") == []
@@ -162,7 +162,7 @@ def test_who_sends_speeds_that_must_wait_is_told_once_it_lasts() -> None:
     assert len(told.changes(Mode.READY, late, "")) == 1
 
 
-def test_who_is_held_up_by_zeros_is_told_once_however_often_he_pauses() -> None:
+def test_a_source_held_up_by_zeros_is_reported_once_however_often_it_pauses() -> None:
     told = CommandEvents(Mode.READY)
     told.changes(Mode.DRIVING, by("app", "joe"), "")
 

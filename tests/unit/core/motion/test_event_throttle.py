@@ -32,7 +32,7 @@ def test_nothing_is_nothing() -> None:
     assert told([], 3.0) == []
 
 
-def test_what_happens_once_is_told_at_once_as_it_is() -> None:
+def test_what_happens_once_is_reported_at_once_as_it_is() -> None:
     event = Event("fault", "a wheel is dead", "error")
     assert EventThrottle().lines([event], 5) == (event,)
 
@@ -82,7 +82,7 @@ def test_an_event_may_count_for_many() -> None:
     assert (line.text, line.count) == ("29 x missed: 29 in a row", 29)
 
 
-def test_news_is_told_at_once_until_it_comes_too_often() -> None:
+def test_news_is_reported_at_once_until_it_comes_too_often() -> None:
     lines = told([mode()], 10.0)
     assert [line.count for line in lines[:BURST]] == [1] * BURST
     assert len(lines) == BURST + 9

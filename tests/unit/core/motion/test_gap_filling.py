@@ -66,7 +66,7 @@ def test_counts_go_before_the_speed() -> None:
     assert (rolled.turned, rolled.pieces, rolled.seen) == (turned, (), turned)
 
 
-def test_counts_of_a_line_passed_over_behind_a_silence_are_told_once() -> None:
+def test_counts_of_a_line_passed_over_behind_a_silence_are_reported_once() -> None:
     """The line has no duration of its own, because the silence before it covers that time."""
     rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
     rolling.skip(Feedback(AT, FOUR, 0.0, gap=0.5, turned=turned))

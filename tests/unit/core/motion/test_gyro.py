@@ -283,7 +283,7 @@ def test_for_a_moment_without_samples_it_turns_on_as_it_did() -> None:
     assert bench.told == pytest.approx(bench.true, abs=1e-6)
 
 
-def test_wheels_that_slip_are_told_and_the_gyro_is_believed() -> None:
+def test_wheels_that_slip_are_reported_and_the_gyro_is_believed() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
     bench.run(20.0, stirring)

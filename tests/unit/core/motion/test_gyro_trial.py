@@ -39,7 +39,7 @@ def test_it_is_named_by_what_it_says_of_the_wheels_turn(
 
 
 @given(st.floats(0.15, 4.0), st.floats(0.3, 2.4), st.floats(0.0, 0.25))
-def test_a_good_one_is_never_refuted_however_late_it_tells(
+def test_a_good_gyro_is_never_refuted_however_late_it_reports(
     rate: float, share: float, late_s: float
 ) -> None:
     trial, seen = Trial(), set()

@@ -25,7 +25,7 @@ def told(track: LearnedTrack) -> str | None:
     return None if track.event is None else track.event.kind
 
 
-def test_until_something_is_learned_the_configured_one_is_used_and_nothing_is_told() -> None:
+def test_until_something_is_learned_the_configured_one_is_used_and_nothing_is_reported() -> None:
     track = LearnedTrack(1.0)
     track.look(None)
     track.look(Track(1.6, 2 * CERTAIN))

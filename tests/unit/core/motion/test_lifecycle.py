@@ -263,7 +263,7 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
 
 
-def test_a_stop_that_comes_with_the_first_step_is_none_from_the_start() -> None:
+def test_a_stop_in_the_first_step_is_not_older_than_the_start() -> None:
     life = ready()
     life.begin(at(10.0))
     stop(life, 10.0)
@@ -400,7 +400,7 @@ def test_a_second_clear_of_the_same_fault_does_not_release_the_stop_under_it() -
 def test_a_clear_that_arrived_before_the_fault_does_not_release_it() -> None:
     life = ready()
     life.fault("a wheel is dead", at(3.0))
-    with pytest.raises(RefusedError, match="call it again"):
+    with pytest.raises(RefusedError, match="call srv/clear again"):
         life.clear(None, ns(2.0), at(3.1))
     life.clear(None, ns(4.0), at(4.0))
     assert mode(life) is Mode.READY

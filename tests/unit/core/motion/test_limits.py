@@ -390,7 +390,7 @@ def test_with_jerk_an_acceleration_that_is_lowered_on_the_way_holds_at_once() ->
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_with_jerk_what_braked_hard_through_zero_speeds_up_no_faster_than_it_may(
+def test_with_jerk_a_reversal_speeds_up_no_faster_than_the_limit(
     sign: float,
 ) -> None:
     harder = msgspec.structs.replace(JERKY, linear_deceleration=2.51)

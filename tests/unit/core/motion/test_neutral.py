@@ -222,7 +222,7 @@ def test_a_source_that_was_never_neutral_does_not_drive() -> None:
         bench.wait(50)
 
 
-def test_a_new_arbiter_asks_for_neutral_unasked() -> None:
+def test_a_new_arbiter_requires_a_zero_first() -> None:
     arbiter = Arbiter(CommandsConfig(sources=(HIGH,)))
     assert arbiter.accept(Command("high", GO, 0)) == ""
     assert arbiter.choose(0).twist is None

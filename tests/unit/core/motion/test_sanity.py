@@ -302,7 +302,7 @@ def pushed(sanity: Sanity, speed: float, seconds: float) -> tuple[list[str], lis
 
 
 @pytest.mark.parametrize("speed", [2.4, -2.4, 20.0, -20.0])
-def test_wheels_turned_by_hand_are_told_once_a_second_and_never_a_fault(speed: float) -> None:
+def test_wheels_turned_by_hand_are_reported_once_a_second_and_never_a_fault(speed: float) -> None:
     for sanity in (Sanity(FeedbackConfig()), driven(10.0), driven(-10.0)):
         sanity.watch(STILL, STILL, DT)
         faults, told = pushed(sanity, speed, 3.5)
@@ -314,7 +314,7 @@ def test_nothing_is_told_before_the_first_line() -> None:
     assert Sanity(FeedbackConfig()).turned == ""
 
 
-def test_a_push_is_told_again_after_exactly_one_second() -> None:
+def test_a_push_is_reported_again_after_exactly_one_second() -> None:
     sanity, told = Sanity(FeedbackConfig()), []
     for step in range(1, 12):
         sanity.watch(STILL, noisy(TEN, step), 0.125)
@@ -323,7 +323,7 @@ def test_a_push_is_told_again_after_exactly_one_second() -> None:
     assert told == [0.25, 1.25]
 
 
-def test_one_wheel_turned_by_hand_is_told_too() -> None:
+def test_one_wheel_turned_by_hand_is_reported_too() -> None:
     sanity = driven(10.0)
     told = [sanity.watch(STILL, STILL, DT)]
     for step in range(30):

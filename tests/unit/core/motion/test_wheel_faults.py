@@ -352,7 +352,7 @@ def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
         ("reversed", 400, 4.0, 0.04), ("reversed", 96, 4.0, 0.1), ("reversed", 20, 20.0, 0.08),
     ],
 )  # fmt: skip
-def test_how_soon_a_lie_is_out_is_a_matter_of_counts_and_speed(
+def test_the_time_to_find_a_wrong_wheel_depends_on_counts_and_speed(
     kind: str, counts: int, speed: float, within: float
 ) -> None:
     """Speeds are those of the wheels in rad/s; 20 rad/s are 1 m/s."""
@@ -436,7 +436,7 @@ def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float
     "count", [10, pytest.param(300, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])]
 )
 @pytest.mark.parametrize(("counts", "share"), [(3200, 0.95), (400, 0.7)])
-def test_slip_of_a_tenth_is_told_within_a_fifth_of_a_second(
+def test_slip_of_a_tenth_is_reported_within_a_fifth_of_a_second(
     counts: int, share: float, count: int
 ) -> None:
     rng = np.random.default_rng(5)
@@ -453,7 +453,7 @@ def test_slip_of_a_tenth_is_told_within_a_fifth_of_a_second(
         pytest.param(400, 4.0, 1.5, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
-def test_how_soon_slip_is_told_is_a_matter_of_counts_and_speed(
+def test_the_time_to_report_slip_depends_on_counts_and_speed(
     counts: int, speed: float, within: float
 ) -> None:
     """Speeds are those of the wheels in rad/s."""

@@ -116,7 +116,7 @@ def test_a_device_that_vanishes_inside_any_call_of_the_opening_is_a_lost_device(
     close(open_raw(path, 115200), wait_s=5.0)  # the failed attempt left nothing open or locked
 
 
-def test_a_device_that_is_no_tty_is_told_so() -> None:
+def test_a_device_that_is_not_a_tty_is_reported() -> None:
     with pytest.raises(OSError, match="ioctl") as refused:
         open_raw("/dev/null", 115200)
     assert refused.value.errno == errno.ENOTTY
