@@ -50,6 +50,6 @@ def test_each_name_of_the_set_is_in_the_code() -> None:
 
 def test_the_page_lists_the_set_and_nothing_else() -> None:
     page = (ROOT / "deploy/systemd/README.md").read_text(encoding="utf-8")
-    table = page.partition("| what | event |")[2].partition("\n\n")[0]
+    table = page.partition("| meaning | event |")[2].partition("\n\n")[0]
     cells = [row.split("|")[2] for row in table.splitlines()[2:]]
     assert re.findall(r"`(\w+)`", "".join(cells)) == list(NAMES)
