@@ -397,8 +397,8 @@ FAULTS = (
         "session gap",
         "a gap of the feedback asks no sender for a zero",
         SESSION,
-        "since_ns >= LONG_GAP_NS:",
-        "since_ns >= 1000 * LONG_GAP_NS:",
+        "before_ns >= LONG_GAP_NS:",
+        "before_ns >= 1000 * LONG_GAP_NS:",
     ),
     fault(
         "session reopened",

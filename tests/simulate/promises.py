@@ -86,6 +86,8 @@ class Witness:
         self.shared_clocks: frozenset[str] = frozenset()
         """Clocks that several senders of the plan stamp by."""
         self.churns = False
+        self.stalled_ns = -NS
+        """End of the host's last stall: the daemon reads what came during it in the next steps."""
         self.stops: list[int] = []
         """Arrivals of the stops that no clear has released."""
         self.offs: list[int] = []
@@ -271,7 +273,7 @@ class Witness:
     def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
         """Judge the mode and the words for it; `fed_ns` is when the board was last heard."""
         if mode == "driving" and fed_ns >= 0:
-            if at_ns - fed_ns > self.quiet_ns + 2 * self.period_ns + MARGIN_NS:
+            if self._silent(at_ns, fed_ns):
                 text = f"last heard {fed_ns / NS:.3f} s"
                 raise BrokenError("a silent board is not driven", at_ns, text)
             if self.blocked_ns is not None and at_ns - self.blocked_ns > BLOCKED_NS:
@@ -327,7 +329,7 @@ class Witness:
         if at_ns - made_ns > self.period_ns + MARGIN_NS:
             text = f"{line!r} was made at {made_ns / NS:.3f} s"
             raise BrokenError("no line leaves later than it was made", at_ns, text)
-        if at_ns - fed_ns > self.quiet_ns + 2 * self.period_ns + MARGIN_NS:
+        if self._silent(at_ns, fed_ns):
             raise BrokenError(
                 "a silent board gets zeros", at_ns, f"last heard {fed_ns / NS:.3f} s: {line!r}"
             )
@@ -346,9 +348,17 @@ class Witness:
         self._wished(at_ns, wheels, before, grows, line)
         self.last, self.last_ns, self.cut = wheels, made_ns, False
 
+    def _silent(self, at_ns: int, fed_ns: int) -> bool:
+        """Return whether the daemon must know that the board is silent."""
+        tolerance_ns = 2 * self.period_ns + MARGIN_NS
+        stalled = self.stalled_ns <= at_ns < self.stalled_ns + tolerance_ns
+        return at_ns - fed_ns > self.quiet_ns + tolerance_ns and not stalled
+
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
         """Return the wheel speeds of a line, None for a question to the board or a torn line."""
         match = LINE.match(line)
+        if match is not None and not line.endswith(b"\n"):
+            return None  # only its end is missing: the board may obey it, and the daemon says no
         if match is None:
             if line.endswith(b"\n") and line[:1] in b"abcd#":
                 raise BrokenError("every line is whole", at_ns, repr(line))

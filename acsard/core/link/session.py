@@ -349,10 +349,10 @@ class McuSession:
     ) -> Feedback:
         """Return the feedback of a good line; `size` is the bytes behind it, then its own."""
         self.good_lines += 1
-        self._heard_ns = read_at.mono_ns
+        before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
+        if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:
+            self.restarted = True  # also if the board or the port had started anew meanwhile
         since_ns = self._link.good(read_at.mono_ns)
-        if since_ns is not None and since_ns >= LONG_GAP_NS:
-            self.restarted = True
         silent = since_ns is None or since_ns > self.quiet_ns
         feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)
         more = self._timeline.leaps - self.rejects.get("count_leap", 0)

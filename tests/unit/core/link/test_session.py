@@ -422,6 +422,28 @@ def test_a_session_restarts_with_the_first_line_after_a_long_gap() -> None:
     assert not bench.session.restarted
 
 
+@pytest.mark.parametrize("begins", ["board", "port"])
+def test_a_new_session_whose_first_line_comes_late_restarts_with_it_again(begins: str) -> None:
+    """A zero that was sent while nobody was heard must not arm its sender."""
+    bench = Bench().up()
+    if begins == "port":
+        bench.open().wait(10)
+    else:
+        bench.wait(10, BOOTED)
+    assert bench.session.restarted
+    bench.wait(LONG_GAP_NS / MS)
+    assert not bench.session.restarted
+    bench.wait(0, GOOD)
+    assert bench.session.restarted
+
+
+def test_the_first_line_ever_does_not_restart_the_session() -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    bench.wait(2000, GOOD)
+    assert not bench.session.restarted
+
+
 def test_a_session_does_not_restart_after_a_short_gap() -> None:
     bench = Bench().up()
     bench.wait(999.999, GOOD)
