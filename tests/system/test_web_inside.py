@@ -319,6 +319,6 @@ def test_a_page_of_a_listed_origin_opens_the_socket_and_exchanges_no_link(shared
             url = server.make_url("/token")
             async with session.post(url, json={"token": "x"}, headers=told) as answer:
                 assert answer.status == 403
-                assert "origin" in (await answer.json())["error"]
+                assert "another site" in (await answer.json())["error"]
 
     run(story)

@@ -127,7 +127,7 @@ def test_who_means_all_robots_by_a_certificate_of_no_list_is_told_how_to_find_ou
 ) -> None:
     ended = robot.tool("unlisted", "call", "stop", "--id", "*")
     assert (ended.code, ended.out) == (69, "")
-    assert "`acsard whoami --id robot1` says so" in ended.err
+    assert "`acsard whoami --id robot1` shows the role" in ended.err
 
 
 @pytest.mark.slow

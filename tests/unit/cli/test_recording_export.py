@@ -140,7 +140,8 @@ def spin_and_curve(world: World) -> None:
 def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = replace(Config(), odometry=replace(Config().odometry, gyro=True))
+    wide = replace(Config().drive, wheel_separation_multiplier=1.1)
+    config = replace(Config(), drive=wide, odometry=replace(Config().odometry, gyro=True))
     tape = Tape()
     world = World(config, recorder=tape)
     spin_and_curve(world)
