@@ -104,7 +104,6 @@ def filmed(tmp_path: Path) -> Iterator[Filmed]:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
-@pytest.mark.xdist_group("pages")
 def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_within_a_second(
     filmed: Filmed,
 ) -> None:

@@ -22,7 +22,6 @@ from tests.system.test_calibrate import RIDES_S, SKIDDING
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.xdist_group("pages"),
     pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
 ]
 

@@ -14,7 +14,6 @@ from tests.system.harness import Bus, Daemon, until
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.xdist_group("pages"),
     pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
 ]
 

@@ -15,7 +15,7 @@ from tests.system.browser import Page, hands, run
 from tests.system.chromium import CHROMIUM, PHONE, browsing
 from tests.system.harness import Bus, Daemon, Tables, client_config, free_endpoint, until
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+pytestmark = pytest.mark.slow
 
 OURS, THEIRS = "robot1", "robot2"
 
