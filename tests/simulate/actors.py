@@ -379,7 +379,7 @@ class Run:
         product, witness = self.product, self.witness
         product.end(event["way"])
         self._take_answers()
-        before_ns = max(witness.stops, default=None)
+        before_ns = max(witness.stops, default=None) if product.disk.keeps_stop else None
         for call, arrived_ns, _ in self._calls.values():
             witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
         self._calls.clear()
@@ -445,12 +445,14 @@ class Run:
         for name, _ in self.active:
             witness.troubles[name] = true_ns
         if seen.followed_ns is not None:
-            self.reports.follows(true_ns, seen.followed_ns)
+            clock = self.reports.follows(true_ns, seen.followed_ns)
+            if clock:
+                witness.ages.clocks[clock].followed = True
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
-            if seen.link == "up":  # without a link the daemon believes no line, and only ramps down
+            if seen.link == "up":  # the daemon that has lost the link believes no line
                 self.echo.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset

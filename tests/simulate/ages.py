@@ -19,9 +19,6 @@ MARGIN_NS = 30_000_000
 EARLY_NS = 60_000_000
 """A delay that falls by more than this is a backlog that pours in."""
 
-PROVEN_NS = 9 * NS
-"""A proof of a new clock compares at most eight halves of 1 s."""
-
 BURST_NS = 1_000_000
 """Messages within this time count as one, with the lowest of their delays."""
 
@@ -55,10 +52,8 @@ class Clock:
         self.least_ns: int | None = None
         self.recent: deque[tuple[int, int]] = deque()
         self.stamp_ns = 0
-        self.even_ns, self.even_age = 0, 0
-        """Since when the delays have been about this one."""
-        self.proven = False
-        """They have been for so long that the daemon must have believed them."""
+        self.followed = False
+        """The robot has followed one of its commands, so the daemon knows its delays."""
         self.loose = False
         """It was adjusted or its sender paused: the pages promise nothing about its age."""
 
@@ -99,12 +94,9 @@ class Ages:
         clock.stamp_ns = message.stamp_ns
         recent = clock.recent
         silent = bool(recent) and arrived_ns - recent[-1][0] > 19 * NS // 10
-        if silent and foreign and not clock.proven:
+        if silent and foreign and not clock.followed:
             clock.least_ns = None  # the proof begins again, and the pages promise no more
         least = clock.least_ns
-        if silent or abs(age - clock.even_age) > EARLY_NS // 3:
-            clock.even_ns, clock.even_age = arrived_ns, age
-        clock.proven |= arrived_ns - clock.even_ns > PROVEN_NS
         clock.least_ns = age if least is None else min(least, age)
         while recent and recent[0][0] < arrived_ns - 3 * NS:
             recent.popleft()

@@ -100,6 +100,11 @@ class Disk:
         """Return whether the file lacks the newest latches."""
         return self._written != self._newest
 
+    @property
+    def keeps_stop(self) -> bool:
+        """Return whether the file holds a stop."""
+        return self._written.stop is not None
+
     def fill(self, full: bool) -> None:
         """Begin or end a time in which nothing can be written; the daemon tries again by itself."""
         self.full = full

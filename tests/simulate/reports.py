@@ -47,13 +47,14 @@ class Reports:
         while len(self._order) > KEPT:
             del self._arrived[self._order.popleft()]
 
-    def follows(self, at_ns: int, followed_ns: int | None) -> None:
-        """Judge the command that the robot follows: none older than one that it has followed."""
-        if followed_ns is None:
-            return
+    def follows(self, at_ns: int, followed_ns: int) -> str:
+        """Judge the command that the robot follows: none older than one that it has followed.
+
+        Return its clock, or "" if the order of that clock says nothing.
+        """
         known = self._arrived.get(followed_ns)
         if known is None:
-            return
+            return ""
         clock, number = known
         newest = self._followed.get(clock, number)
         if number < newest:
@@ -62,6 +63,7 @@ class Reports:
                 f"number {number} of {clock} is followed after number {newest}",
             )  # fmt: skip
         self._followed[clock] = number
+        return clock
 
 
 def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -> None:
