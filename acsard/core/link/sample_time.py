@@ -350,6 +350,11 @@ LEAST = 0.002
 CREEP = 0.05
 """Rise of the soonest delay per reply, in distances of two lines, by which it is forgotten."""
 
+LATE = 1.25
+"""Distances of two lines by which the soonest delay of the last replies may lie above the least
+one. Above it, replies were lost. One distance is too little: a delay may rise by almost as much for
+good."""
+
 RARE = 0.002
 """Share of lost replies. Below it, a line that another one follows closely does not count as
 lost."""
@@ -562,8 +567,8 @@ class PromptedTimes:
         soonest = max(float(self._soonest), self._least)
         if left:
             self._soon = min(self._soon + CREEP * self._apart, at - left[0])
-            if self._soon - soonest > self._apart:
-                # Each of the last replies is late by more than a line, so replies were lost that
+            if self._soon - soonest > LATE * self._apart:
+                # All of the last replies are late by more than a line, so replies were lost that
                 # the spread had hidden.
                 delay = self._delay = self._soon = soonest
                 wide = self._spread = 0.0
