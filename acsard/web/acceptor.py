@@ -39,11 +39,15 @@ HANDSHAKE_S, HANDSHAKES = 3.0, 32
 """Time limit for a TLS handshake, and maximum number of handshakes at once."""
 
 HURRIED_S = 0.3
-"""Time limit for a TLS handshake while others wait. A client that falls silent in its handshake
-must not keep a phone waiting for `HANDSHAKE_S`."""
+"""Time limit for a TLS handshake of the most crowded network while others wait. Clients that fall
+silent in their handshakes must not keep a phone waiting for `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit from the accept to the head of the first request; the connection is cut after that."""
+
+HEAD_BYTES = 131072
+"""Bytes of a connection's first request after which it is cut if they are still only headers.
+Headers that never end would fill the memory."""
 
 UNREAD_S = 5.0
 """Time limit for a client that does not read its answers, or whose network is lost. The kernel ends
@@ -201,7 +205,12 @@ class Acceptor:
         """Return whether a handshake may start, after the oldest one was cut if it is too slow."""
         if len(self._starting) < HANDSHAKES:
             return True
-        oldest, begun = next(iter(self._starting.items()))
+        # A client with a slow network must not go for those of a crowded network.
+        networks = Counter(one.network for one in self._starting)
+        most = max(networks.values())
+        oldest, begun = next(
+            item for item in self._starting.items() if networks[item[0].network] == most
+        )
         if now < begun + HURRIED_S:
             if self._hurry is not None:
                 self._hurry.cancel()
@@ -231,6 +240,8 @@ class _Connection(asyncio.Protocol):
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
+        self._head: int | None = 0
+        """Bytes of the first request's head, None once it is complete."""
         self._inner: asyncio.Protocol | None = None
 
     def enter(self) -> None:
@@ -304,7 +315,8 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self) -> None:
-        """Cancel the time limit for the first request."""
+        """Cancel the limits of the first request."""
+        self._head = None
         if self._timer is not None:
             self._timer.cancel()
 
@@ -321,6 +333,11 @@ class _Connection(asyncio.Protocol):
         self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
+        if self._head is not None:
+            self._head += len(data)
+            if self._head > HEAD_BYTES:
+                self._acceptor.crowded(self)
+                return
         if self._inner is not None:
             self._inner.data_received(data)
 

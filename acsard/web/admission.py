@@ -54,7 +54,7 @@ REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 
 PREFLIGHT = {
     "Access-Control-Allow-Methods": "GET, HEAD, POST",
-    "Access-Control-Allow-Headers": "Authorization, Content-Type",
+    "Access-Control-Allow-Headers": "Authorization, Content-Type, If-None-Match",
     "Access-Control-Max-Age": "600",
 }
 """Headers of the answer to a browser that asks what a page of another origin may send."""
@@ -195,6 +195,7 @@ class Admission:
             response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"
         if self._listed(request):
             response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
+            response.headers["Access-Control-Expose-Headers"] = "ETag, Age-Ms, Waited-Ms"
 
 
 def asked_of(request: web.Request) -> Asked:

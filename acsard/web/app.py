@@ -190,7 +190,11 @@ class Page:
             raise RefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
-                max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False, protocols=[PROTOCOL]
+                max_msg_size=MAX_BYTES,
+                heartbeat=HEARTBEAT_S,
+                compress=False,
+                protocols=[PROTOCOL],
+                autoping=False,  # `Viewer` limits the rate of pings too
             )
             await served.prepare(request)
             _limit_buffer(request)

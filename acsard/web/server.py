@@ -23,7 +23,7 @@ from acsard.daemon.bus.tls import CERTIFICATE, KEY, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import BEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
-from acsard.web.acceptor import Acceptor, Reader
+from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.calls import Calls
@@ -42,6 +42,9 @@ TIDY_S, TELL_S = 1.0, 1.0
 
 NICE = 5
 """Niceness when the daemon starts this server: the daemon must come first."""
+
+FIELD_BYTES, FIELDS = 4096, 64
+"""Maximum size of the request line and of a header, bytes, and maximum number of headers."""
 
 IDLE_S = 20.0
 """Time limit for an idle HTTP connection between two requests."""
@@ -98,7 +101,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     )  # fmt: skip
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
-        shutdown_timeout=LEAVE_S,
+        shutdown_timeout=LEAVE_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
+        max_headers=FIELDS, read_bufsize=READ_BYTES,
     )  # fmt: skip
     async with AsyncExitStack() as stack:
         await runner.setup()

@@ -122,6 +122,17 @@ class Outgoing:
         with suppress(ConnectionError):
             await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
 
+    def cut(self) -> None:
+        """End the connection at once, without a reason."""
+        self._closing = True
+        if self._transport is not None:
+            self._transport.abort()
+
+    async def pong(self, data: bytes) -> None:
+        """Answer a ping."""
+        with suppress(ConnectionError):
+            await self._socket.pong(data)
+
     async def _send(self, text: bytes) -> None:
         if not self._closing:  # no data may follow a close frame
             await self._socket.send_frame(text, aiohttp.WSMsgType.TEXT)

@@ -143,6 +143,9 @@ class Viewer:
         if message.type == aiohttp.WSMsgType.ERROR:  # aiohttp closes the connection after this
             self._counts.refuse("too_big", self.who.origin)
             return
+        if message.type in (aiohttp.WSMsgType.PING, aiohttp.WSMsgType.PONG):
+            self._ping(message)
+            return
         if message.type != aiohttp.WSMsgType.TEXT:
             self._out.refuse("message", "malformed", "messages must be JSON as text")
             return
@@ -161,6 +164,16 @@ class Viewer:
                 self._refuse(frame, f"more than {MESSAGES.hz:g} messages a second")
         if self._overruns >= OVERRUNS:
             self.end("too many messages")
+
+    def _ping(self, message: aiohttp.WSMessage) -> None:
+        """Answer a ping of the protocol. Pings and pongs count as messages."""
+        if not self._bucket.take(clock.mono_ns()):
+            self._overruns += 1
+            if self._overruns >= OVERRUNS:
+                self._counts.refuse("too_fast", self.who.origin)
+                self._out.cut()
+        elif message.type == aiohttp.WSMsgType.PING:
+            self._start(self._out.pong(message.data))
 
     def _obey(self, frame: Frame) -> None:
         self._guide.heard(self)

@@ -105,6 +105,16 @@ def test_a_page_without_this_module_says_reload_and_its_stick_is_grey(
         robot.alarms("STOP: the robot has confirmed it")
 
 
+def test_stop_latches_in_a_browser_that_lacks_a_function_of_2022(impatient: Robot) -> None:
+    old = "delete AbortSignal.timeout"
+    added = impatient.browser.ask("Page.addScriptToEvaluateOnNewDocument", source=old)
+    with impatient.without("link.js"):  # STOP goes by HTTP
+        until(lambda: impatient.mode == "stopped", 5.0, "stopped")
+    impatient.browser.ask(
+        "Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"]
+    )
+
+
 def test_stop_latches_as_soon_as_it_is_red_while_every_other_file_is_never_answered(
     impatient: Robot,
 ) -> None:

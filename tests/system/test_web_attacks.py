@@ -411,6 +411,36 @@ def test_an_address_has_room_for_twenty_pages(table: Table, bus: Bus) -> None:
         run(story)
 
 
+def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus) -> None:
+    """Clients without a token could fill the memory with headers."""
+    sent = 0
+    with (
+        table.attack("headers without an end", "cut off", "crowded"),
+        _opened(table.page) as greedy, suppress(ConnectionError),
+    ):  # fmt: skip
+        greedy.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        for number in range(200):
+            greedy.sendall(b"X-%d: " % number + b"x" * 3000 + b"\r\n")
+            sent += 3000
+            time.sleep(0.005)
+    assert sent < 300_000
+
+
+def test_a_viewer_that_floods_with_pings_is_cut_off(
+    table: Table, bus: Bus, tokens: dict[str, str]
+) -> None:
+    async def story() -> None:
+        async with hands(table.page, tokens["viewer"]) as theirs:
+            with suppress(ConnectionError):
+                for _ in range(30_000):
+                    await theirs.socket.ping()
+            await asyncio.wait_for(_drained(theirs), PATIENCE_S)
+            assert theirs.socket.closed
+
+    with table.attack("a flood of pings", "cut off", "too_fast"):
+        run(story)
+
+
 def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
     """A header of one byte a second, no bytes at all, and a body that is announced but not sent."""
     begun = time.monotonic()

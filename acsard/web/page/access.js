@@ -40,7 +40,7 @@ export async function refusal() {
 /** Return the JSON answer with its status, or status 0 if there was no answer. */
 async function asked(path, how, within, special = () => null) {
   try {
-    const answer = await fetch(path, { ...how, signal: AbortSignal.timeout(within) });
+    const answer = await fetch(path, { ...how, signal: expiring(within) });
     const told = special(answer) ?? (await answer.json());
     return { error: answer.ok ? "" : `${answer.status}`, status: answer.status, ...told };
   } catch {

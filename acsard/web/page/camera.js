@@ -55,7 +55,7 @@ export class Camera {
     const asked = performance.now();
     try {
       const headers = this.#tag ? { "If-None-Match": this.#tag } : {};
-      const answer = await fetch("api/camera", { headers, cache: "no-store", signal: AbortSignal.timeout(5000) });
+      const answer = await fetch("api/camera", { headers, cache: "no-store", signal: expiring(5000) });
       if (answer.status === 304) return "";
       if (!answer.ok) return (await answer.json()).error ?? `${answer.status}`;
       // The picture counts as old as if the way of the request had taken no time: a slow network ages pictures.

@@ -102,7 +102,7 @@ function said(told) {
 
 async function got(path) {
   try {
-    const answer = await fetch(path, { signal: AbortSignal.timeout(5000) });
+    const answer = await fetch(path, { signal: expiring(5000) });
     const told = await answer.json();
     return answer.ok ? told : { error: told.error ?? `${answer.status}` };
   } catch {

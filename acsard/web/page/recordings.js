@@ -69,7 +69,7 @@ export class Recordings {
 async function ask(name) {
   try {
     const way = `api/recordings/${encodeURIComponent(name)}/report`;
-    const answer = await fetch(way, { method: "POST", signal: AbortSignal.timeout(15000) });
+    const answer = await fetch(way, { method: "POST", signal: expiring(15000) });
     const told = await answer.json();
     return told.report ? told : { text: told.error };
   } catch {

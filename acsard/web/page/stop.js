@@ -83,11 +83,18 @@ class Stopping {
   }
 }
 
+/** Return a signal that ends a request after so many ms. Browsers before 2022 have no AbortSignal.timeout. */
+function expiring(ms) {
+  const controller = new AbortController();
+  setTimeout(() => controller.abort(), ms);
+  return controller.signal;
+}
+
 /** Send STOP by HTTP, without the WebSocket: the server may have refused it, or it may not be open yet. */
 async function posted() {
   try {
     const body = JSON.stringify({ robot: new URLSearchParams(location.search).get("robot") ?? undefined });
-    const answer = await fetch("api/srv/stop", { method: "POST", body, signal: AbortSignal.timeout(3000) });
+    const answer = await fetch("api/srv/stop", { method: "POST", body, signal: expiring(3000) });
     const told = await answer.json();
     return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
   } catch {
