@@ -309,7 +309,8 @@ class Run:
             case "tear":
                 product.tear(event["taken"])
             case "stall" | "stall in step":
-                self._stalled_ns = self.witness.stalled_ns = after_ns
+                self._stalled_ns = after_ns
+                self.witness.stalls(self.true_ns, after_ns)
                 if event["do"] == "stall":
                     product.stall(lasts_ns / NS)
                 else:

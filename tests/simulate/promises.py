@@ -86,8 +86,8 @@ class Witness:
         self.shared_clocks: frozenset[str] = frozenset()
         """Clocks that several senders of the plan stamp by."""
         self.churns = False
-        self.stalled_ns = -NS
-        """End of the host's last stall: the daemon reads what came during it in the next steps."""
+        self._stalled = -NS, -NS
+        """Begin and end of the host's last stall, or of several that follow each other."""
         self.stops: list[int] = []
         """Arrivals of the stops that no clear has released."""
         self.offs: list[int] = []
@@ -348,10 +348,18 @@ class Witness:
         self._wished(at_ns, wheels, before, grows, line)
         self.last, self.last_ns, self.cut = wheels, made_ns, False
 
+    def stalls(self, begun_ns: int, ended_ns: int) -> None:
+        """Note a stall of the host: the daemon reads what came during it in the steps behind it."""
+        before = self._stalled
+        if begun_ns <= before[1]:
+            begun_ns, ended_ns = before[0], max(before[1], ended_ns)
+        self._stalled = begun_ns, ended_ns
+
     def _silent(self, at_ns: int, fed_ns: int) -> bool:
         """Return whether the daemon must know that the board is silent."""
         tolerance_ns = 2 * self.period_ns + MARGIN_NS
-        stalled = self.stalled_ns <= at_ns < self.stalled_ns + tolerance_ns
+        begun_ns, ended_ns = self._stalled
+        stalled = begun_ns <= at_ns < ended_ns + tolerance_ns
         return at_ns - fed_ns > self.quiet_ns + tolerance_ns and not stalled
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
