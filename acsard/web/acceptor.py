@@ -205,7 +205,7 @@ class Acceptor:
         """Return whether a handshake may start, after the oldest one was cut if it is too slow."""
         if len(self._starting) < HANDSHAKES:
             return True
-        # A client with a slow network must not go for those of a crowded network.
+        # The most crowded network loses a handshake, so a slow client of another one keeps its own.
         networks = Counter(one.network for one in self._starting)
         most = max(networks.values())
         oldest, begun = next(

@@ -133,9 +133,7 @@ class Camera:
                     await self._read(session)
                 except (aiohttp.ClientError, TimeoutError, OSError, ValueError) as error:
                     self._trouble = f"the camera's stream cannot be read: {error or 'no answer'}"
-                    self._newest = (
-                        None  # clients are told the reason in the place of an old picture
-                    )
+                    self._newest = None  # clients get the reason instead of an old picture
                 await asyncio.sleep(AGAIN_S)
         self._newest = None  # the next client must not see a picture from before
 

@@ -102,8 +102,9 @@ class Fleet:
         return rows
 
     def sees(self, robot: str) -> bool:
-        """Return whether a robot exists: a viewer looks at the fleet or at the robot, and the bus
-        has its liveliness token or its state.
+        """Return whether a viewer sees that this robot exists.
+
+        It sees the robot's liveliness token in the fleet, or its state.
         """
         one, states = self._known.get(robot), self._robots.streams.followed(robot, STATE)
         return bool(one and one.here) or bool(states and states.number)

@@ -43,8 +43,9 @@ TIDY_S, TELL_S = 1.0, 1.0
 NICE = 5
 """Niceness when the daemon starts this server: the daemon must come first."""
 
-FIELD_BYTES, FIELDS = 4096, 64
-"""Maximum size of the request line and of a header, bytes, and maximum number of headers."""
+FIELD_BYTES, FIELDS = 8190, 64
+"""Maximum size of the request line and of a header, bytes, and maximum number of headers. A browser
+sends the cookies of all ports of the host in one header, so a lower limit could lock it out."""
 
 IDLE_S = 20.0
 """Time limit for an idle HTTP connection between two requests."""

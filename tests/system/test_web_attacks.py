@@ -10,6 +10,7 @@ import math
 import os
 import socket
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, contextmanager, suppress
 from pathlib import Path
@@ -409,6 +410,12 @@ def test_an_address_has_room_for_twenty_pages(table: Table, bus: Bus) -> None:
 
     with table.attack("the 21st page of an address", "503", "too_many"):
         run(story)
+
+
+def test_a_browser_with_many_cookies_of_other_ports_gets_the_page(table: Table) -> None:
+    asked = urllib.request.Request(table.page.here, headers={"Cookie": "other=" + "x" * 7000})
+    with urllib.request.urlopen(asked, timeout=PATIENCE_S) as answer:
+        assert answer.status == 200
 
 
 def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus) -> None:

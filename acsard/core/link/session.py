@@ -351,7 +351,7 @@ class McuSession:
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:
-            self.restarted = True  # also if the board or the port had started anew meanwhile
+            self.restarted = True  # even if the board or the port has already restarted
         since_ns = self._link.good(read_at.mono_ns)
         silent = since_ns is None or since_ns > self.quiet_ns
         feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)
