@@ -27,6 +27,7 @@ from acsard.daemon.latch_rules import (
     LatchFileError,
     at_start,
     decode,
+    doubted,
     encode,
     stopped,
     unreadable,
@@ -150,14 +151,14 @@ class LatchFile:
                 self._blind = True
                 latches = stopped(Latches(), unreadable(self.where, why), now)
             else:
-                latches = stopped(found, at_start(unwritable(self.where, why)), now)
+                latches = doubted(found, at_start(unwritable(self.where, why)), now)
             self.keep(latches)
         thread = threading.Thread(target=self._work, args=(now,), name="latches", daemon=True)
         try:
             thread.start()
         except RuntimeError as error:
             self._fail(f"this process cannot start another thread ({error})")
-            return stopped(latches, at_start(unwritable(self.where, self._failed)), now)
+            return doubted(latches, at_start(unwritable(self.where, self._failed)), now)
         self._thread = thread
         return latches
 
@@ -174,7 +175,7 @@ class LatchFile:
             trouble = self._replace(latches)
             if trouble and not self._abandoned:
                 self._fail(trouble)
-                latches = stopped(latches, at_start(unwritable(self.where, trouble)), now)
+                latches = doubted(latches, at_start(unwritable(self.where, trouble)), now)
                 self.keep(latches)
             return latches
 

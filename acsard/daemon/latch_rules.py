@@ -114,6 +114,26 @@ def stopped(latches: Latches, why: str, now: Instant, by: str = BY) -> Latches:
     return replace(latches, stop=Latch(number, now.wall_ns, by, why))
 
 
+def doubted(latches: Latches, why: str, now: Instant) -> Latches:
+    """Return the latches of a start with a latch file that cannot be written.
+
+    The previous process may have set latches that the file lacks. So the robot starts stopped, and
+    each latch of the file takes a new number: a `clear` or `activate` that names its old number may
+    have been sent before the latches that are lost.
+
+    Args:
+        latches: the latches in the file.
+        why: text of the stop, for a file without a stop.
+        now: time of the start.
+    """
+    found = latches.fault, latches.inactive, latches.stop
+    number = max(now.wall_ns // 1_000_000, *[latch.number + 1 for latch in found if latch], 0)
+    fault, inactive, stop = (
+        latch and replace(latch, number=number + place) for place, latch in enumerate(found)
+    )
+    return stopped(Latches(stop, fault, inactive, latches.lowered), why, now)
+
+
 class LatchKeeper(Protocol):
     """Keeps the latches over a restart. Only the method `wait` waits for the disk."""
 

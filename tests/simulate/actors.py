@@ -380,7 +380,6 @@ class Run:
         product, witness = self.product, self.witness
         product.end(event["way"])
         self._take_answers()
-        before_ns = max(witness.stops, default=None) if product.disk.keeps_stop else None
         for call, arrived_ns, _ in self._calls.values():
             witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
         self._calls.clear()
@@ -389,9 +388,9 @@ class Run:
 
         def start() -> None:
             self.resumed_ns = product.now_ns
-            if product.disk.full and not witness.stops:
-                # It stands until a clear, perhaps by the stop from before that is in doubt.
-                witness.stops.append(self.true_ns if before_ns is None else before_ns)
+            if product.disk.full:
+                # It stands until a clear by somebody who looked after the start.
+                witness.stops.append(self.true_ns)
             product.start()
             self.liveness.event()
             self._linked = False

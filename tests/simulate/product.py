@@ -27,6 +27,7 @@ from acsard.daemon.latch_rules import (
     LatchFileError,
     at_start,
     decode,
+    doubted,
     encode,
     stopped,
     unreadable,
@@ -100,11 +101,6 @@ class Disk:
         """Return whether the file lacks the newest latches."""
         return self._written != self._newest
 
-    @property
-    def keeps_stop(self) -> bool:
-        """Return whether the file holds a stop."""
-        return self._written.stop is not None
-
     def fill(self, full: bool) -> None:
         """Begin or end a time in which nothing can be written; the daemon tries again by itself."""
         self.full = full
@@ -139,7 +135,7 @@ class Disk:
         self._newest = self._written = found
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
-            self._newest = stopped(found, at_start(self.trouble), now)
+            self._newest = doubted(found, at_start(self.trouble), now)
         return self._newest
 
 

@@ -15,6 +15,7 @@ from acsard.daemon.latch_rules import (
     Handover,
     LatchFileError,
     decode,
+    doubted,
     encode,
     stopped,
 )
@@ -150,6 +151,26 @@ def test_a_wall_clock_that_was_never_set_gives_a_stop_the_number_0(wall_ns: int)
 
 def test_a_stop_that_is_latched_already_stays() -> None:
     assert stopped(ALL, "the file cannot be read", NOW) is ALL
+
+
+def test_each_latch_of_a_file_that_cannot_be_written_takes_a_new_number() -> None:
+    made = doubted(ALL, "the file cannot be written", NOW)
+    old = {latch.number for latch in (ALL.stop, ALL.fault, ALL.inactive) if latch}
+    new = [latch.number for latch in (made.fault, made.inactive, made.stop) if latch]
+    assert len(new) == 3
+    assert new == sorted(new)
+    assert min(new) > max(old)
+    for before, after in ((ALL.stop, made.stop), (ALL.fault, made.fault)):
+        assert before
+        assert after
+        assert replace(after, number=before.number) == before
+    assert made.lowered == ALL.lowered
+
+
+def test_a_file_without_a_stop_that_cannot_be_written_starts_the_robot_stopped() -> None:
+    made = doubted(Latches(), "the file cannot be written", NOW)
+    assert made.stop
+    assert made.stop.why == "the file cannot be written"
 
 
 class Keeper:
