@@ -23,6 +23,9 @@ MOST_HELD = 1500
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
 
+PROOF_NS = 2 * NS
+"""A new sender shows a steady delay for this time before its commands count."""
+
 LOOKED_AT_NS = 3 * NS // 20
 """A sender that was silent for longer has paused."""
 
@@ -35,6 +38,8 @@ class Liveness:
         self._event_ns = 0
         self._since: dict[str, int] = {}
         """Since when each lawful sender has wished a speed without a pause."""
+        self._began: dict[str, int] = {}
+        """Time of the first command behind each lawful sender's last silence."""
         self._latest: dict[str, tuple[int, str]] = {}
         self._lawful: set[str] | None = None
 
@@ -53,10 +58,11 @@ class Liveness:
         before_ns, _ = self._latest.get(name, (0, ""))
         if wish.arrived_ns - before_ns > LOOKED_AT_NS:
             self._since.pop(name, None)
+            self._began[name] = wish.arrived_ns
         if wish.armed_ns <= self._event_ns or not (wish.v or wish.w):
             self._since.pop(name, None)
         else:
-            self._since.setdefault(name, wish.arrived_ns)
+            self._since.setdefault(name, max(wish.arrived_ns, self._began.get(name, 0) + PROOF_NS))
         self._latest[name] = wish.arrived_ns, sample.identity
 
     def _keeps_rules(self, sender: dict[str, Any]) -> bool:
