@@ -449,10 +449,11 @@ class Run:
             if clock:
                 witness.ages.clocks[clock].followed = True
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
-        witness.cut |= seen.link != "up"
+        witness.linked = seen.link == "up"
+        witness.cut |= not witness.linked
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
-            if seen.link == "up":  # the daemon that has lost the link believes no line
+            if witness.linked:  # the daemon that has lost the link believes no line
                 self.echo.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset

@@ -101,6 +101,8 @@ class Witness:
         """Since when the kernel takes no line."""
         self.braking: tuple[int, tuple[float, ...]] | None = None
         """When a robot that must not move was first seen to move, and its wheel speeds."""
+        self.linked = True
+        """The daemon says that the link to the board is up."""
         self.cut = False
         """The link was lost since the last line, so the speed starts over from zero."""
         self.pending = False
@@ -329,6 +331,8 @@ class Witness:
         if at_ns - made_ns > self.period_ns + MARGIN_NS:
             text = f"{line!r} was made at {made_ns / NS:.3f} s"
             raise BrokenError("no line leaves later than it was made", at_ns, text)
+        if not self.linked:
+            raise BrokenError("only a linked board is driven", at_ns, f"{line!r}")
         if self._silent(at_ns, fed_ns):
             raise BrokenError(
                 "a silent board gets zeros", at_ns, f"last heard {fed_ns / NS:.3f} s: {line!r}"

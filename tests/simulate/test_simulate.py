@@ -113,6 +113,7 @@ def witnessed() -> Witness:
         (lambda w: w.stops.append(NS // 2), "nothing moves after a stop"),
         (lambda w: w.offs.append(NS // 2), "nothing moves after being switched off"),
         (lambda w: w.step(NS, "fault", "it is broken somehow"), "no fault without a cause"),
+        (lambda w: setattr(w, "linked", False), "only a linked board is driven"),
         (lambda w: w.step(NS, "ready", ""), "every state has a reason"),
         (
             lambda w: w.line(NS, b"ap99.00,bp99.00,cp99.00,dp99.00\r\n", NS, NS),
