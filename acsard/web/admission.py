@@ -1,9 +1,9 @@
 """Admission of requests, from the socket to the handler of a row in the table.
 
-Each request passes `Admission` in this order: the client's place (`who.py`), the origin of the web
-page that sent it, its token, its request rate, and the role that the row asks for. Only then does
-the handler see the request, and with it the caller's identity (a `Who`). A path that no row has
-takes a token as well, so a stranger does not learn which paths exist.
+Each request passes `Admission` in this order: the client's place (`callers.py`), the origin of the
+web page that sent it, its token, its request rate, and the role that the row asks for. Only then
+does the handler see the request, and with it the caller's identity (a `Who`). A path that no row
+has takes a token as well, so a stranger does not learn which paths exist.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def _raw(schema: Described) -> Any:
 
 
 def _value(key: str, kind: str) -> type[Struct]:
-    """Return the type of the messages that `to_browser.Following` builds for a key."""
+    """Return the type of the messages that `socket_sender.Following` builds for a key."""
     return msgspec.defstruct(
         VALUE + key.replace("/", "."),
         [

@@ -1,7 +1,7 @@
 """The messages that `/ws` sends to a page or a program. This module is pure.
 
 Each message is one JSON object, identified by its first field. Messages of subscribed keys are
-built in to_browser.py instead, because their values are already JSON.
+built in socket_sender.py instead, because their values are already JSON.
 """
 
 from __future__ import annotations

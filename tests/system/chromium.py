@@ -201,14 +201,14 @@ class Browser:
         return list(self.js(_PRESSED.replace("LEAST", str(FINGER_PX - 0.5))))
 
     def obstacles(self) -> list[Any]:
-        """Return the serious obstacles for a screen reader that axe finds: grade, rule, element."""
+        """Return the obstacles for a screen reader that axe finds: grade, rule, element."""
         if not self.js("'axe' in window"):
             self.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
-        found = self.js(
+        found: list[Any] = self.js(
             "axe.run().then(told =>"
             " told.violations.map(one => [one.impact, one.id, one.nodes[0].html]))"
         )
-        return [one for one in found if one[0] in ("serious", "critical")]
+        return found
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         """Send a touch event (Start, Move, End or Cancel) with the fingers that are down."""

@@ -14,6 +14,8 @@ export class Camera {
   #trouble = "";
   #shows = false;
   #runs = false;
+  /** Whether the page has a connection. Without one, each request might be a guess of a token that has ended. */
+  connected = false;
 
   constructor(figure) {
     this.#figure = figure;
@@ -43,7 +45,7 @@ export class Camera {
     this.#runs = true;
     while (this.#shows) {
       const begun = performance.now();
-      this.#trouble = document.hidden ? "the page is hidden" : await this.#fetched();
+      this.#trouble = document.hidden ? "the page is hidden" : !this.connected ? "no connection" : await this.#fetched();
       const pause = this.#trouble ? AGAIN : LEAST - (performance.now() - begun);
       if (pause > 0) await new Promise((done) => setTimeout(done, pause));
     }

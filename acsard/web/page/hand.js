@@ -18,8 +18,8 @@ export const FROZEN = 1000; // after a longer gap the page stood still, and the 
 /** What keeps the robot from driving in a mode, and the remedy. */
 const BARS = {
   inactive: "Switched off. Press Switch on first.",
-  stopped: "Stopped. Press Release first.",
-  fault: "Fault. Press Release first.",
+  stopped: "Stopped. Press Release STOP first.",
+  fault: "Fault. Press Release fault first.",
   shutdown: "The robot's daemon is ending.",
 };
 const NEVER = ["inactive", "stopped", "fault", "shutdown"];
@@ -30,14 +30,25 @@ export function boarded(state) {
   return state.link === "up";
 }
 
-/** Return why a push of the stick by `sender` would not move the robot, in words, or "". A push takes over from
- *  another source, which has a lower priority, but not from another sender of this one. */
+/** Return why a push of the stick by `sender` would not move the robot, in words, or "". A push takes over from a
+ *  source of a lower priority, but not from another sender of this one. */
 export function still(state, source, sender) {
   if (!state) return "Nothing is received from the robot.";
   if (BARS[state.mode]) return BARS[state.mode];
   if (!boarded(state)) return "No board: nothing can drive.";
-  const taken = state.mode === "driving" && state.source === source && state.sender && state.sender !== sender;
-  return taken ? `${person(state.sender, sender)} drives: you can when they release.` : "";
+  const ours = state.sources.find((one) => one.name === source);
+  if (!ours) return `This robot takes no commands from a page: ${source} is not one of its sources.`;
+  const driver = driving(state, source, sender);
+  if (state.source === source) return driver && `${driver} drives: you can when they release.`;
+  const above = driver && state.sources.find((one) => one.name === state.source)?.priority >= ours.priority;
+  return above ? `${driver} drives and has priority: you can when they release.` : "";
+}
+
+/** Return who drives instead of `sender`, in words, or "". */
+export function driving(state, source, sender) {
+  if (state?.mode !== "driving") return "";
+  if (state.source === source) return state.sender && state.sender !== sender ? person(state.sender, sender) : "";
+  return state.sender ? `${person(state.sender, sender)} (${state.source})` : state.source;
 }
 
 /** Return why the robot does not follow `sender`, in words, or "" if it does. */

@@ -4,14 +4,14 @@ import { barred, hint, invited, permit, refusal } from "./access.js";
 import { Camera } from "./camera.js";
 import { Drive, SOURCE } from "./drive.js";
 import { Guide } from "./guide.js";
-import { boarded, objection, still } from "./hand.js";
+import { boarded, driving, objection, still } from "./hand.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Minute } from "./plots.js";
 import { Recordings } from "./recordings.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { figure, milliseconds, named, person, said as clickable, signed, yaw } from "./words.js";
+import { RELEASE, figure, milliseconds, named, person, said as clickable, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const { stopping, alarm } = window; // of stop.js, which has run before
@@ -79,9 +79,19 @@ function followed(key, rate, wanted) {
 
 async function asked(verb, payload) {
   const told = await link.call(verb, payload);
+  answered(told);
+}
+
+function answered(told) {
   complains = !told.ok;
   alarm(told.ok ? "" : words(told.text)); // the alarm is visible in every view
   said(told.ok ? told : { ok: true, text: "" });
+}
+
+/** Release what this page shows. Without a state it has shown nothing, and the call would release anything. */
+function released(verb) {
+  if (state) return asked(verb, { latch: state.latch });
+  answered({ ok: false, text: "nothing is received from the robot, so this page does not know what it would release" });
 }
 
 async function set(payload) {
@@ -143,6 +153,7 @@ function looked() {
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
   views.freshness(old, lasts(), link.way, none, seen, Boolean(state) && !boarded(state));
   if (state && performance.now() - heard > lasts()) views.unheard(silent);
+  releasable();
   readied();
   camera.look(performance.now());
   if (old > 2 * lasts()) drive.release("released: nothing is received from the robot");
@@ -172,7 +183,15 @@ function readied() {
   drive.barred = link.open ? still(fresh ? state : null, SOURCE, hello?.sender) : "No connection.";
   const off = !drive.allowed || Boolean(drive.barred);
   $("stick").setAttribute("aria-disabled", String(off));
-  views.text("hint", (drive.allowed && drive.barred) || hint(hello, OTHER));
+  const driver = driving(state, SOURCE, hello?.sender);
+  const over = driver && `${driver} drives. Hold and push to take over.`;
+  views.text("hint", (drive.allowed && (drive.barred || over)) || hint(hello, OTHER));
+}
+
+/** Show the button that ends the mode, only while this page shows the mode. */
+function releasable() {
+  const fresh = state && performance.now() - heard <= lasts();
+  $("clear").hidden = Boolean(OTHER) || !fresh || !(state.mode in RELEASE);
 }
 
 function stated({ detail }) {
@@ -188,7 +207,7 @@ function stated({ detail }) {
   // The daemon's stop does not end a running check, so it confirms STOP only if none is running.
   if (LATCHED.includes(state.mode) && !guide.going) stopping.heard(heard - link.lag);
   views.banner(state, Boolean(hello?.barred.clear), OTHER, hello?.sender);
-  $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
+  releasable();
   readied();
   map.lose(!boarded(state));
   const who = state.sender ? person(state.sender, hello?.sender) : state.source;
@@ -298,7 +317,7 @@ link.addEventListener("gone", ({ detail }) => {
   views.text("reason", silent);
 });
 link.addEventListener("up", () => {
-  tried = true;
+  tried = camera.connected = true;
   if (complains) alarm("");
   complains = false;
   views.waiting();
@@ -306,10 +325,12 @@ link.addEventListener("up", () => {
 link.addEventListener("down", ({ detail }) => {
   drive.release("released: the connection is lost");
   tried = true;
+  camera.connected = false;
   heard = -Infinity;
   views.lost(detail.reason || (state ? "this page connects again" : "")); // the text shown before is outdated
   state = drive.state = wished = null;
   for (const name of ["speed-command", "turn-command"]) views.text(name, "command –");
+  releasable();
   readied();
 });
 
@@ -322,8 +343,11 @@ document.querySelector("nav").addEventListener("keydown", (event) => {
   $(`tab-${view}`).focus();
 });
 // The daemon refuses if a stop or a "deactivate" came after the state that this person sees.
-$("clear").addEventListener("click", () => (stopping.over(), asked("clear", { latch: state?.latch })));
-$("activate").addEventListener("click", () => asked("activate", { latch: state?.latch }));
+$("clear").addEventListener("click", () => {
+  stopping.over();
+  released(state?.mode === "inactive" ? "activate" : "clear");
+});
+$("activate").addEventListener("click", () => released("activate"));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));
 $("nearer").addEventListener("click", () => map.zoom(1.4));
@@ -352,6 +376,9 @@ setInterval(looked, 100);
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
 const post = stopping.send;
 stopping.send = () => (link.open ? link.call("stop", undefined, OTHER) : post());
+stopping.after = (told) => {
+  if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched behind the fault: Release fault leads to STOPPED" });
+};
 stopping.before = () => {
   drive.release();
   guide.leave();

@@ -1,7 +1,8 @@
 // The map: path, robot with the direction that it faces, and a grid with its scale in metres. Dragging moves it,
-// wheel and pinch zoom it, ◎ follows the robot again. It has x to the right, or the robot's front up.
+// wheel and pinch zoom it, "Centre map" follows the robot again. It has x to the right, or the robot's front up.
 
 const MOST = 20000;
+const WORDS = 24; // height of the words of the pose below the map, px
 
 export class PathMap {
   #canvas;
@@ -127,9 +128,12 @@ export class PathMap {
     if (!width) return;
     const look = colours();
     const angle = this.#angle;
+    // The middle of the part between the buttons and the words of the pose.
+    const tools = this.#canvas.nextElementSibling;
+    const middle = (tools.offsetTop + tools.offsetHeight + height - WORDS) / 2;
     const at = (x, y) => {
       const [right, up] = rotated(x - this.#centre[0], y - this.#centre[1], angle);
-      return [width / 2 + right * this.#zoom, height / 2 - up * this.#zoom];
+      return [width / 2 + right * this.#zoom, middle - up * this.#zoom];
     };
     this.#grid(paper, width, height, look, at);
     paper.strokeStyle = look("--accent");
@@ -158,7 +162,7 @@ export class PathMap {
     paper.strokeStyle = look("--line");
     paper.lineWidth = 1;
     paper.beginPath();
-    const far = Math.hypot(width, height) / 2 / this.#zoom; // from the middle to a corner, m
+    const far = Math.hypot(width, height) / this.#zoom; // the lines reach every corner, m
     const [[left, right], [low, high]] = this.#centre.map((middle) => [middle - far, middle + far]);
     for (let n = Math.ceil(left / step); n * step <= right; n++) {
       paper.moveTo(...at(n * step, low));

@@ -9,6 +9,8 @@
 const URGENT = 30000; // ms after the press, by the clock that gets there first: one may be set, the other may sleep
 const PAUSE = 300; // ms between two attempts
 const SLOW = 10000; // ms after which a page that is not complete says so
+const BARRED = [401, 403]; // HTTP statuses of a page without a valid invitation
+const NOT_HERE = "STOP needs an invitation to this page: use the robot's own switch";
 const UNSURE = "STOP was not confirmed: look at the robot, and press STOP again";
 const RELOAD = "A part of this page did not load, so only STOP works here. Reload the page.";
 
@@ -19,8 +21,11 @@ class Stopping {
   #since = Infinity; // time of the press, by performance.now()
   #arrived = false;
   #whole = false; // the modules of the page run
+  #unsure = false; // the alarm says that a STOP was not confirmed
   /** Called at each press before the stop is sent. */
   before = () => {};
+  /** Called with the answer that confirms a stop. */
+  after = () => {};
 
   /** `send()` sends one request and resolves to {ok, text, lost}; `lost` means that there was no answer.
    *  `tell(words)` shows a message to the operator. */
@@ -34,7 +39,7 @@ class Stopping {
     const last = Date.now() + URGENT;
     this.#since = performance.now();
     this.#waits = true;
-    this.#arrived = false;
+    this.#arrived = this.#unsure = false;
     try {
       this.before();
     } catch (error) {
@@ -54,13 +59,17 @@ class Stopping {
   /** Note that the robot reported itself as stopped at the time `at`. This counts as the answer if the answer
    *  was lost. */
   heard(at) {
-    if (at > this.#since) this.#arrived = true;
+    if (at <= this.#since) return;
+    this.#arrived = true;
+    if (this.#unsure) this.#tell("");
+    this.#unsure = false;
   }
 
   /** Give up the pending STOP, because the operator releases it or leaves the page. */
   over() {
     ++this.#press;
     if (this.#waits) this.#tell(UNSURE);
+    this.#unsure ||= this.#waits;
     this.#waits = false;
   }
 
@@ -76,9 +85,16 @@ class Stopping {
   }
 
   #ends(told) {
+    if (told.barred) {
+      this.#waits = false;
+      this.#tell(NOT_HERE);
+      document.documentElement.classList.remove("stops"); // a STOP that cannot work is grey
+      return true;
+    }
     if (!told.ok && !(told.lost && this.#arrived)) return false;
     this.#waits = false;
     this.#tell(this.#whole ? "" : "STOP: the robot has confirmed it. This page is not complete: reload it.");
+    this.after(told);
     return true;
   }
 }
@@ -96,7 +112,7 @@ async function posted() {
     const body = JSON.stringify({ robot: new URLSearchParams(location.search).get("robot") ?? undefined });
     const answer = await fetch("api/srv/stop", { method: "POST", body, signal: expiring(3000) });
     const told = await answer.json();
-    return { ok: answer.ok, text: told.message ?? told.error ?? `${answer.status}` };
+    return { ok: answer.ok, barred: BARRED.includes(answer.status), text: told.message ?? told.error ?? `${answer.status}` };
   } catch {
     return { ok: false, lost: true, text: "no connection to the robot" };
   }

@@ -1,9 +1,9 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./hand.js";
-import { age, ago, clock, person, reason, said, signed } from "./words.js";
+import { RELEASE, age, ago, clock, logged, person, reason, said, signed } from "./words.js";
 
-const DOUBTFUL = "STOP may not reach the robot from here.";
+const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
 const LEVELS = ["", "warning", "error", "warning"];
 
 /** Return an element with its children; strings become text nodes. */
@@ -56,9 +56,9 @@ export function folded(events) {
 
 export function happened(list, told, elsewhere) {
   const rows = folded([...told.events].reverse()).map((one) => {
-    const by = `${one.by && !one.text.endsWith(one.by) ? ` — ${one.by}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
+    const by = `${one.by && !one.text.endsWith(one.by) ? ` — ${logged(one.by)}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
     const head = made("strong", "", one.name.replaceAll("_", " "));
-    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(one.text, elsewhere)}${by}`);
+    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(logged(one.text), elsewhere)}${by}`);
   });
   list.replaceChildren(...rows);
 }
@@ -100,12 +100,15 @@ function empty(robot, own) {
  *  the public name of this page. */
 export function banner(state, locked, elsewhere, own) {
   const alone = !boarded(state);
-  const missing = alone && state.mode === "waiting";
-  mode(missing ? "noboard" : state.mode, missing ? "NO BOARD" : state.mode.toUpperCase());
+  const words = state.mode.toUpperCase();
+  if (alone && state.mode === "waiting") mode("noboard", "NO BOARD");
+  else mode(state.mode, alone ? `${words} · NO BOARD` : words);
   const why = state.mode === "driving" && state.sender ? `Driven by ${person(state.sender, own)}.` : reason(state, elsewhere);
-  text("reason", locked ? why.replace("press Release", "an operator releases it") : why);
+  const button = RELEASE[state.mode];
+  const does = state.mode === "inactive" ? "an operator switches it on" : "an operator releases it";
+  text("reason", locked && button ? why.replace(`press ${button}`, does) : why);
   const warned = [
-    alone ? "Nobody can stop the motors from here." : "",
+    alone ? "Nobody can stop the motors from here: use the robot's own switch." : "",
     state.wheel_fault, state.recording_error, state.latch_file_error,
     state.certificate_expiry.startsWith("valid") ? "" : state.certificate_expiry,
   ];
@@ -127,8 +130,7 @@ function mode(name, words) {
   const stop = document.getElementById("stop");
   stop.setAttribute("aria-pressed", String(name === "stopped"));
   text("stop-words", `${name === "stopped" ? "STOPPED" : "STOP"}${stop.dataset.robot ?? ""}`);
-  const release = { stopped: "Release STOP", fault: "Release fault" }[name];
-  if (release) text("clear", release);
+  if (RELEASE[name]) text("clear", RELEASE[name]);
   document.title = `${words} · ${document.getElementById("robot").textContent}`;
 }
 

@@ -1,5 +1,9 @@
 // Formats numbers and times for people. This module is pure.
 
+/** The button that ends a mode, by mode. */
+export const RELEASE = { stopped: "Release STOP", fault: "Release fault", inactive: "Switch on" };
+
+const NAMELESS = "a program without a name";
 const UTC = /\b(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d) UTC\b/g;
 
 export function signed(value, decimals) {
@@ -59,21 +63,33 @@ export function yaw(q) {
 export function person(sender, own = "") {
   const [, name, certificate] = sender.match(/^(?:(.*)\/)?[0-9a-f]{16}(?: \[(.*)\])?$/) ?? [null, sender];
   if (own && sender === own) return "you";
+  if (name === "unnamed") return NAMELESS;
   if (name === "here") return "another page on the robot itself";
   if (name && own && name === own.replace(/\/[^/]*$/, "")) return `another page of ${name}`;
-  return name || certificate || "a program without a name";
+  return name || certificate || NAMELESS;
 }
 
 /** Return the reason without the mode, which the banner shows above it. */
 export function reason(state, elsewhere) {
   if (state.mode === "ready" && state.reason.startsWith("waiting for a command")) return "Nobody drives.";
   const before = `${state.mode}: `;
-  return said(named(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason), elsewhere);
+  const words = said(named(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason), elsewhere);
+  return words.replace("press Release", `press ${RELEASE[state.mode] ?? "Release"}`);
 }
 
-/** Return a sentence with senders in a person's words. The log keeps their digits, which tell two of one name apart. */
+/** Return a sentence with senders in a person's words. */
 export function named(text) {
-  return text.replace(/\/[0-9a-f]{16}\b/g, "").replaceAll(" (native)", "").replaceAll("here@page", "a page on the robot itself");
+  return text
+    .replace(/\/[0-9a-f]{16}\b/g, "")
+    .replace(/\b[0-9a-f]{16}\b(?: \[(.*?)\])?/g, (_, certificate) => certificate || NAMELESS)
+    .replaceAll(" (native)", "")
+    .replace(/\bby unnamed\b/g, `by ${NAMELESS}`)
+    .replaceAll("here@page", "a page on the robot itself");
+}
+
+/** Return a sentence of the log, with four digits of each sender: they tell two of one name apart. */
+export function logged(text) {
+  return text.replace(/\b([0-9a-f]{4})[0-9a-f]{12}\b/g, "$1");
 }
 
 /** Replace service names by button names, of this page or of the own page of the robot `elsewhere`, and times in UTC
@@ -82,7 +98,7 @@ export function said(text, elsewhere = "", now = new Date()) {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere
     ? { "call srv/clear": `Release is ${there}`, "srv/clear": `Release ${there}`, "call srv/activate": `Switch on is ${there}` }
-    : { "call srv/clear": "press Release", "srv/clear": "Release", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on under Settings" };
+    : { "call srv/clear": "press Release", "srv/clear": "Release", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on" };
   const local = text.replace(UTC, (_, day, time) => clock({ sec: Date.parse(`${day}T${time}Z`) / 1000, nanosec: 0 }, now));
   return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), local);
 }

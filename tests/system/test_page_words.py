@@ -1,0 +1,268 @@
+"""What the page says and offers in each state, and what it does not offer without a state."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from acsard.machine.authority import Authority
+from tests.system.browser import NAME, Page
+from tests.system.chromium import CHROMIUM, PHONE, SIDEWAYS, Browser, browsing
+from tests.system.harness import PLAIN, Bus, Daemon, Peer, until
+from tests.system.test_page_camera import Stream
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+]
+
+HIDDEN = "document.getElementById('clear').hidden"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    there = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
+    with browsing(options=there) as browser:
+        browser.size(*PHONE)
+        yield browser
+        browser.open("about:blank")
+
+
+def shows(browser: Browser, name: str, words: str) -> None:
+    """Wait until the element with this id contains the words."""
+    until(lambda: words in browser.text(name), 8.0, f"{name} says {words!r}")
+
+
+def test_a_page_that_has_shown_no_stop_releases_none(tmp_path: Path, browser: Browser) -> None:
+    """Another person may have stopped the robot while this page had no connection."""
+    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, tmp_path) as page:
+            browser.open(page.here)
+            shows(browser, "mode", "READY")
+            bus.get("srv/stop")
+            shows(browser, "mode", "STOPPED")
+            assert browser.js(HIDDEN) is False
+        shows(browser, "mode", "NO CONNECTION")
+        assert browser.js(HIDDEN) is True
+        bus.get("srv/stop")
+        time.sleep(2.1)  # from then on, the daemon takes a clear that names no stop
+        daemon.signal(signal.SIGSTOP)
+        try:
+            with Page(daemon, tmp_path, "--address", page.here):
+                shows(browser, "mode", "WAITING")
+                assert browser.js(HIDDEN) is True
+                for button in ("clear", "activate"):
+                    browser.js(f"document.getElementById({button!r}).click()")
+                    shows(browser, "alarm", "does not know what it would release")
+                daemon.signal(signal.SIGCONT)
+                shows(browser, "mode", "STOPPED")
+                assert browser.js(HIDDEN) is False
+                browser.js("document.getElementById('clear').click()")
+                shows(browser, "mode", "READY")
+        finally:
+            daemon.signal(signal.SIGCONT)
+
+
+STILL = """import('/page/hand.js').then(({still}) => still(
+    {mode: MODE, link: 'up', source: SOURCE, sender: 'joy/0123456789abcdef', sources: SOURCES},
+    'teleop', 'here/0123456789abcdef'))"""
+
+TELEOP = "{name: 'teleop', priority: 50}"
+
+
+@pytest.mark.parametrize(
+    ("mode", "source", "others", "words"),
+    [
+        ("driving", "safety", "{name: 'safety', priority: 60}", "joy (safety) drives and has"),
+        ("driving", "nav", "{name: 'nav', priority: 50}", "joy (nav) drives and has priority"),
+        ("driving", "nav", "{name: 'nav', priority: 10}", ""),
+        ("ready", "", "{name: 'safety', priority: 60}", ""),
+    ],
+)
+def test_the_stick_is_grey_while_a_source_that_comes_before_it_drives(
+    page: Page, browser: Browser, mode: str, source: str, others: str, words: str
+) -> None:
+    asked = STILL.replace("MODE", repr(mode)).replace("SOURCES", f"[{TELEOP}, {others}]")
+    told = browser.js(asked.replace("SOURCE", repr(source)))
+    assert told.startswith(words) if words else told == ""
+
+
+def test_the_stick_is_grey_on_a_robot_that_has_no_source_for_it(
+    page: Page, browser: Browser
+) -> None:
+    asked = STILL.replace("MODE", "'ready'").replace("SOURCES", "[{name: 'joy', priority: 1}]")
+    assert "teleop is not one of its sources" in browser.js(asked.replace("SOURCE", "''"))
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Daemon, Bus, Peer, Page]]:
+    where = tmp_path_factory.mktemp("words")
+    with (
+        Peer(where / "mcu") as board,
+        Daemon(where, board.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, where) as page,
+    ):
+        bus.linked()
+        yield daemon, bus, board, page
+
+
+@pytest.fixture
+def page(robot: tuple[Daemon, Bus, Peer, Page], browser: Browser) -> Page:
+    """Open the page of a robot that is ready."""
+    browser.size(*PHONE)
+    browser.open(robot[3].here)
+    shows(browser, "mode", "READY")
+    return robot[3]
+
+
+STOPPING = """(() => {
+    const said = [];
+    const one = new stopping.constructor(SEND, words => said.push(words));
+    DO;
+    return said;
+})()"""
+
+
+def test_a_stop_that_the_robot_reports_at_last_is_no_longer_called_unconfirmed(
+    page: Page, browser: Browser
+) -> None:
+    story = STOPPING.replace("SEND", "() => new Promise(() => {})")
+    did = "one.complete(); one.press(); one.over(); one.heard(performance.now() + 1)"
+    _, unsure, *after = browser.js(story.replace("DO", did))
+    assert "was not confirmed" in unsure
+    assert after == [""]
+
+
+def test_a_program_that_drives_is_named_and_a_push_takes_over(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    with robot[1].commanding(0.1):
+        shows(browser, "hint", "commander (app) drives. Hold and push to take over.")
+    shows(browser, "hint", "Hold and push to drive")
+
+
+def test_switch_on_is_beside_stop_while_the_robot_is_off(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    robot[1].get("srv/deactivate")
+    shows(browser, "clear", "Switch on")
+    shows(browser, "reason", "press Switch on")
+    browser.tap("clear")
+    shows(browser, "mode", "READY")
+
+
+def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    _, bus, board, _ = robot
+    bus.get("srv/stop")
+    shows(browser, "mode", "STOPPED")
+    board.unplug()
+    try:
+        shows(browser, "mode", "STOPPED · NO BOARD")
+        shows(browser, "doubt", "use the robot's own switch")
+        assert browser.js("document.title") == "STOPPED · NO BOARD · acsar"
+    finally:
+        board.plug()
+    until(lambda: browser.text("mode") == "STOPPED", 8.0, "the board is back")
+    browser.tap("clear")
+    shows(browser, "mode", "READY")
+
+
+def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    _, bus, board, _ = robot
+    usual, board.reply = board.reply, lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
+    try:
+        shows(browser, "mode", "FAULT")
+        browser.tap("stop")
+        shows(browser, "alarm", "Release fault leads to STOPPED")
+    finally:
+        board.reply = usual
+    shows(browser, "hint", "Press Release fault first")
+    browser.tap("clear")
+    shows(browser, "mode", "STOPPED")
+    assert browser.text("alarm") == ""
+    browser.tap("clear")
+    shows(browser, "mode", "READY")
+    assert bus.state()["mode"] == "ready"
+
+
+NAMES = """import('/page/words.js').then(({person, named, logged}) => [
+    person('unnamed'), named('stopped by unnamed (native) at noon'),
+    named('held by 0123456789abcdef [laptop]'), named('held by 0123456789abcdef'),
+    logged('commander/0123456789abcdef -> commander/fedcba9876543210')])"""
+
+
+def test_nobody_reads_a_long_number_for_a_name(page: Page, browser: Browser) -> None:
+    assert browser.js(NAMES) == [
+        "a program without a name",
+        "stopped by a program without a name at noon",
+        "held by laptop",
+        "held by a program without a name",
+        "commander/0123 -> commander/fedc",
+    ]
+
+
+MIDDLE = """(() => {
+    const [map, tools, words] = ['map', 'erase', 'where'].map(
+        name => document.getElementById(name).getBoundingClientRect());
+    return [map.top, tools.bottom, words.top, map.bottom].map(Math.round);
+})()"""
+
+
+@pytest.mark.parametrize("size", [PHONE, SIDEWAYS], ids=["phone", "sideways"])
+def test_the_robot_on_the_map_is_between_the_buttons_and_the_words(
+    page: Page, browser: Browser, size: tuple[int, int]
+) -> None:
+    browser.size(*size)
+    top, tools, words, bottom = browser.js(MIDDLE)
+    assert top < tools < words < bottom
+    below = f"""(() => {{
+        const map = document.getElementById('map');
+        const data = map.getContext('2d').getImageData(0, 0, map.width, map.height).data;
+        const accent = getComputedStyle(document.documentElement).getPropertyValue('--accent');
+        const [r, g, b] = [1, 3, 5].map(at => parseInt(accent.trim().slice(at, at + 2), 16));
+        const rows = [];
+        for (let n = 0; n < data.length; n += 4)
+            if (data[n] === r && data[n + 1] === g && data[n + 2] === b)
+                rows.push(Math.floor(n / 4 / map.width) * map.clientHeight / map.height);
+        return [Math.min(...rows), Math.max(...rows)].map(row => row + {top});
+    }})()"""
+    first, last = browser.js(below)
+    assert (first + last) / 2 == pytest.approx((tools + words) / 2, abs=5.0)
+
+
+def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_camera(
+    tmp_path: Path, browser: Browser
+) -> None:
+    stream = Stream()
+    Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
+    config = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
+    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with Page(daemon, tmp_path) as page:
+            browser.open(f"{page.away}/#token={page.invite('viewer', 'tv')}")
+            shows(browser, "role", "viewer")
+            bus.get("srv/deactivate")
+            shows(browser, "reason", "an operator switches it on")
+            bus.get("srv/activate")
+            shows(browser, "mode", "READY")
+            page.vault.revoke("tv")
+            shows(browser, "mode", "NO CONNECTION")
+            time.sleep(1.0)
+            before = sum(page.refused().values())
+            time.sleep(2.0)
+            assert sum(page.refused().values()) - before <= 1.0
+            browser.tap("stop")
+            shows(browser, "alarm", "STOP needs an invitation to this page")
+            red = "getComputedStyle(document.getElementById('stop')).backgroundColor"
+            assert browser.js(red) != "rgb(196, 18, 10)"
+    stream.close()
