@@ -27,7 +27,7 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Any
 
-from aiohttp import web
+from aiohttp import StreamReader, web, web_protocol
 from aiohttp.web_protocol import RequestHandler
 
 from acsard.web.answers import HEADERS, problem
@@ -46,8 +46,16 @@ REQUEST_S = 10.0
 """Time limit from the accept to the head of the first request; the connection is cut after that."""
 
 HEAD_BYTES = 131072
-"""Bytes of a connection's first request after which it is cut if they are still only headers.
-Headers that never end would fill the memory."""
+"""Bytes of a request after which its connection is cut if they are still only headers. Headers that
+never end would fill the memory."""
+
+AHEAD = 1
+"""Requests that a client may send before it has the answer to the last one. No browser does, and 32
+of them, as aiohttp allows, have megabytes of headers."""
+
+UNREAD_BYTES = 32768
+"""Bytes of answers that wait for a client that does not read, above which its next request waits
+too. asyncio's limit for a TLS connection is 512 KiB."""
 
 UNREAD_S = 5.0
 """Time limit for a client that does not read its answers, or whose network is lost. The kernel ends
@@ -74,7 +82,7 @@ NO_REQUEST = "that is not an HTTP request"
 MISSING = "Missing 'Host'"
 """Start of aiohttp's message for a missing `Host` header."""
 
-Factory = Callable[[], asyncio.Protocol]
+Factory = Callable[[], "Reader"]
 
 
 class Acceptor:
@@ -103,6 +111,7 @@ class Acceptor:
         `secure` is None for plain HTTP.
         """
         sslproto.SSLProtocol.max_size = READ_BYTES
+        web_protocol.MAX_MSG_QUEUE_SIZE = AHEAD
         self._listeners.append(opened)
         self._resume(opened, secure, make)
 
@@ -117,10 +126,10 @@ class Acceptor:
             for one in pool.strangers():
                 one.cut()
 
-    def spoke(self, transport: asyncio.BaseTransport | None) -> None:
-        """Cancel the time limit of this connection, because a request has arrived."""
+    def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
+        """Cancel the time limit of this connection, because a request with this body begins."""
         if (one := _connection(transport)) is not None:
-            one.spoke()
+            one.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
         """Keep this connection when others have to go, because its client is known."""
@@ -240,9 +249,11 @@ class _Connection(asyncio.Protocol):
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
-        self._head: int | None = 0
-        """Bytes of the first request's head, None once it is complete."""
-        self._inner: asyncio.Protocol | None = None
+        self._head = 0
+        """Bytes of the next request's head."""
+        self._body: StreamReader | None = None
+        """The body of the last request."""
+        self._inner: Reader | None = None
 
     def enter(self) -> None:
         """Take a place, and wait for the first byte."""
@@ -314,35 +325,45 @@ class _Connection(asyncio.Protocol):
             with suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
-    def spoke(self) -> None:
-        """Cancel the limits of the first request."""
-        self._head = None
+    def spoke(self, body: StreamReader) -> None:
+        """Cancel the limits of a request's head, because a request with this body begins."""
+        self._head, self._body = 0, body
+        self._cancel_timer()
+
+    def _cancel_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
 
     def _leave(self) -> None:
         """Give back the place."""
-        self.spoke()
+        self._cancel_timer()
         self.pool.leave(self)
 
     # The transport calls the methods below.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = transport
+        transport.set_write_buffer_limits(UNREAD_BYTES)  # type: ignore[attr-defined]
+        if self._secure is not None:
+            transport.set_read_buffer_limits(READ_BYTES)  # type: ignore[attr-defined]
         self._inner = self._make()
         self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        if self._head is not None:
-            self._head += len(data)
-            if self._head > HEAD_BYTES:
-                self._acceptor.crowded(self)
-                return
-        if self._inner is not None:
-            self._inner.data_received(data)
+        if self._inner is None:
+            return
+        in_body = self._body is not None and not self._body.is_eof()
+        self._inner.data_received(data)
+        if in_body or not self._inner.reads_head:
+            self._head = 0
+            return
+        self._head += len(data)
+        if self._head > HEAD_BYTES:
+            self._acceptor.crowded(self)
 
-    def eof_received(self) -> bool | None:
-        return None if self._inner is None else self._inner.eof_received()
+    def eof_received(self) -> None:
+        if self._inner is not None:
+            self._inner.eof_received()
 
     def pause_writing(self) -> None:
         if self._inner is not None:
@@ -370,6 +391,14 @@ class Reader(RequestHandler):
         """Create a handler for `server`, which is the server of the application's runner."""
         super().__init__(server, loop=server._loop, **server._kwargs)
         self._counted = counts
+
+    @property
+    def reads_head(self) -> bool:
+        """Whether the next bytes are a request's head, because no request waits.
+
+        No request follows that for a WebSocket.
+        """
+        return not self._upgraded and not self._messages
 
     def handle_error(
         self,

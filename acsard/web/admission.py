@@ -128,7 +128,7 @@ class Admission:
 
     @web.middleware
     async def _serve(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        self._acceptor.spoke(request.transport)
+        self._acceptor.spoke(request.transport, request.content)
         try:
             if request.method == "OPTIONS" and self._listed(request):
                 return self._preflight(request)

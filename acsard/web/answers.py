@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Mapping
+
 import msgspec
 from aiohttp import web
 
@@ -12,6 +15,9 @@ from acsard.web.routes import JSON, Problem
 
 READ_S = 10.0
 """Time limit for reading from a disk."""
+
+PIECE = 32768
+"""Bytes that are handed to the network at once."""
 
 STATUS: dict[Reason, int] = {
     "no_token": 401,
@@ -70,6 +76,27 @@ def sent(request: web.Request, file: File) -> web.Response:
     if file.packed is not None and takes_gzip(request):
         body, headers["Content-Encoding"] = file.packed, "gzip"
     return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
+
+
+async def sent_in_pieces(
+    request: web.Request, body: bytes, headers: Mapping[str, str], within: float
+) -> web.StreamResponse:
+    """Send a large body without a copy of it; cut the connection after `within` s."""
+    if request.method == "HEAD":
+        return web.Response(body=body, headers=headers)
+    answer = web.StreamResponse(headers=headers)
+    answer.content_length = len(body)
+    try:
+        async with asyncio.timeout(within):
+            await answer.prepare(request)
+            for begin in range(0, len(body), PIECE):
+                await answer.write(memoryview(body)[begin : begin + PIECE])
+    except TimeoutError:
+        if request.transport is not None:
+            request.transport.abort()
+    except ConnectionError:
+        pass  # the client has gone; aiohttp notices
+    return answer
 
 
 def takes_gzip(request: web.Request) -> bool:

@@ -29,10 +29,10 @@ from acsard.host.threads import in_thread
 from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
-from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip
+from acsard.web.answers import READ_S, TroubleError, reply, sent, sent_in_pieces, takes_gzip
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
 from acsard.web.calls import Calls
-from acsard.web.camera import Camera
+from acsard.web.camera import SEND_S, Camera
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE, Files
@@ -262,16 +262,21 @@ class Page:
         """Wait for a camera picture that the client has not seen, and return it."""
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.mono_ns()
-        picture = await self._camera.after(int(seen) if seen.isdecimal() and len(seen) < 16 else 0)
+        number = int(seen) if seen.isdecimal() and len(seen) < 16 else 0
+        picture = await self._camera.after(number)
         if picture is None:
             return web.Response(status=304)
-        now_ns = clock.mono_ns()
-        told = {
-            "ETag": f'"{picture.number}"',
-            "Age-Ms": str((now_ns - picture.at_ns) // 1_000_000),
-            "Waited-Ms": str((now_ns - begun_ns) // 1_000_000),
-        }
-        return web.Response(body=picture.body, content_type="image/jpeg", headers=told)
+        async with self._camera.sending(request[WHO].token):
+            _limit_buffer(request)
+            picture = self._camera.newest or picture  # there may have been a wait
+            now_ns = clock.mono_ns()
+            told = {
+                "Content-Type": "image/jpeg",
+                "ETag": f'"{picture.number}"',
+                "Age-Ms": str((now_ns - picture.at_ns) // 1_000_000),
+                "Waited-Ms": str((now_ns - begun_ns) // 1_000_000),
+            }
+            return await sent_in_pieces(request, picture.body, told, SEND_S)
 
     async def recordings(self, request: web.Request) -> web.StreamResponse:
         return reply(await self._box.rows())
@@ -367,7 +372,7 @@ ROUTES: tuple[Route, ...] = (
         "request waited here (`Waited-Ms`), ms, as headers; with the `ETag` of the last one as "
         "`If-None-Match` it waits up to a second for a newer one",
         gives={200: Body("A picture.", str, "image/jpeg"),
-               304: Body("There is no newer picture.", media="")}),
+               304: Body("There is no newer picture.", media="")}, paced=False),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
         gives={200: Body("A list.", list[Recording])}),

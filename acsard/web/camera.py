@@ -2,15 +2,17 @@
 
 Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads it while
 clients ask for pictures, and only the newest picture is kept: a client with a slow network gets
-fewer pictures, and no old ones. A picture that equals the one before byte for byte is not new,
-because some servers repeat the last picture when their camera is lost.
+fewer pictures, and no old ones. Each client that reads slowly keeps a picture in memory, so the
+number of those is limited. A picture that equals the one before byte for byte is not new, because
+some servers repeat the last picture when their camera is lost.
 """
 
 from __future__ import annotations
 
 import asyncio
 import re
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from email.message import Message
 
 import aiohttp
@@ -18,6 +20,7 @@ from msgspec import Struct
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
+from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
@@ -32,8 +35,15 @@ AGAIN_S = 0.5
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits for the connection to the camera's server, and for its next byte."""
 
-MAX_PICTURE, MAX_HEAD = 4_000_000, 4096
-"""Maximum size of a picture and of the header lines before it, bytes."""
+MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
+"""Maximum size of a picture and of the header lines before it, bytes. A JPEG of 1920 x 1080 pixels
+has a few hundred thousand."""
+
+SENDS, SENDS_OF_TOKEN = 8, 2
+"""Limits on the pictures that are being sent: in all, and per token."""
+
+SEND_S = 5.0
+"""Time limit for sending a picture; the connection is cut after that. A page waits no longer."""
 
 _LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
 
@@ -94,11 +104,13 @@ class Camera:
 
     def __init__(self, url: str) -> None:
         self._url = url
-        self._newest: Picture | None = None
+        self.newest: Picture | None = None
+        """The newest picture, None if the stream is not read or has none."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0
-        self._changed = asyncio.Event()
+        self._changed, self._sent = asyncio.Event(), asyncio.Event()
+        self._sends = Places(SENDS, SENDS_OF_TOKEN)
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
@@ -113,12 +125,29 @@ class Camera:
             self._reading = asyncio.create_task(self._read_again_and_again())
         with suppress(TimeoutError):
             async with asyncio.timeout(WAIT_S):
-                while self._newest is None or self._newest.number == number:
+                while self.newest is None or self.newest.number == number:
                     await self._changed.wait()
-        newest = self._newest
+        newest = self.newest
         if newest is None:
             raise TroubleError(503, self._trouble)
         return None if newest.number == number else newest
+
+    @asynccontextmanager
+    async def sending(self, token: str) -> AsyncIterator[None]:
+        """Hold a place for sending a picture; raise `TroubleError` if none becomes free in time."""
+        try:
+            async with asyncio.timeout(WAIT_S):
+                while not self._sends.enter(token):
+                    await self._sent.wait()
+        except TimeoutError:
+            text = f"{SENDS_OF_TOKEN} pictures are on their way to this token already, or {SENDS}"
+            raise TroubleError(503, f"{text} in all: wait for them") from None
+        try:
+            yield
+        finally:
+            self._sends.leave(token)
+            self._sent.set()
+            self._sent.clear()
 
     def close(self) -> None:
         """Stop reading."""
@@ -133,9 +162,9 @@ class Camera:
                     await self._read(session)
                 except (aiohttp.ClientError, TimeoutError, OSError, ValueError) as error:
                     self._trouble = f"the camera's stream cannot be read: {error or 'no answer'}"
-                    self._newest = None  # clients get the reason instead of an old picture
+                    self.newest = None  # clients get the reason instead of an old picture
                 await asyncio.sleep(AGAIN_S)
-        self._newest = None  # the next client must not see a picture from before
+        self.newest = None  # the next client must not see a picture from before
 
     async def _read(self, session: aiohttp.ClientSession) -> None:
         async with session.get(self._url, allow_redirects=False) as answer:
@@ -151,10 +180,10 @@ class Camera:
                 self._take(parts.feed(data))
 
     def _take(self, body: bytes | None) -> None:
-        if body is None or (self._newest is not None and body == self._newest.body):
+        if body is None or (self.newest is not None and body == self.newest.body):
             return
         self._number += 1
-        self._newest = Picture(body, self._number, clock.mono_ns())
+        self.newest = Picture(body, self._number, clock.mono_ns())
         self._changed.set()
         self._changed.clear()
 

@@ -77,7 +77,7 @@ class Route(Struct, frozen=True):
     """False exempts it from the request rate limit.
 
     A stop must always go through. A page that reconnects must not be kept out by another program
-    that uses the same token.
+    that uses the same token. Pictures have a limit of their own.
     """
 
     @property

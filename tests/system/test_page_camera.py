@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import re
+import socket
+import ssl
 import struct
 import threading
 import time
 import zlib
 from collections.abc import Iterator
+from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import pytest
 from aiohttp import web
+from yarl import URL
 
 from acsard.machine.authority import Authority
+from acsard.web.camera import SEND_S
 from tests.system.browser import NAME, Page
 from tests.system.chromium import CHROMIUM, PHONE, browsing
-from tests.system.harness import Bus, Daemon, free_endpoint, until
+from tests.system.harness import Bus, Daemon, free_endpoint, resident_kb, until
 
 pytestmark = pytest.mark.slow
 
@@ -48,6 +53,8 @@ class Stream:
         self.port = int(free_endpoint().rpartition(":")[2])
         self.grey, self.clients = 0, 0
         self.runs, self.silent, self.ends = True, False, False
+        self.more = 0
+        """Bytes by which each picture is larger than it needs to be."""
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(5.0)
@@ -67,7 +74,7 @@ class Stream:
         try:
             while not self.ends:
                 if not self.silent:
-                    body = picture(self.grey)
+                    body = picture(self.grey) + bytes(self.more)
                     head = f"--frame\r\nContent-Length: {len(body)}\r\n\r\n".encode()
                     await answer.write(head + body + b"\r\n")
                 self.grey = (self.grey + self.runs) % 256
@@ -172,6 +179,70 @@ def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None:
             assert (await got(viewer, url, last.headers["ETag"])).status == 304
             server.vault.revoke("tv")
             assert (await got(viewer, url)).status == 401
+
+    asyncio.run(story())
+
+
+def test_pictures_that_nobody_reads_cost_little_memory(filmed: Filmed) -> None:
+    """Before, each of these clients cost a picture of its own."""
+    server, pid = filmed.server, filmed.server.pid
+    filmed.stream.more = 900_000
+
+    async def story() -> None:
+        url, clients = f"{server.away}/api/camera", []
+        tokens = [server.invite("viewer", f"tv{n}") for n in range(12)]
+        async with AsyncExitStack() as stack:
+            for token in tokens * 2:
+                clients.append(await stack.enter_async_context(server.client(token)))
+            assert (await got(clients[0], url)).status == 200
+            before = resident_kb(pid)
+            # The streams of these answers are opened and not read.
+            asking = [asyncio.create_task(one.get(url)) for one in clients]
+            most, end = 0, time.monotonic() + 3.0
+            while time.monotonic() < end:
+                most = max(most, resident_kb(pid) - before)
+                await asyncio.sleep(0.05)
+            for task in asking:
+                task.cancel()
+            print(f"\n24 clients that read no pictures: {most / 1000:+.1f} MB")
+            assert most < 15_000
+
+    asyncio.run(story())
+
+
+def test_a_client_that_reads_a_picture_too_slowly_is_cut_off(filmed: Filmed) -> None:
+    server = filmed.server
+    filmed.stream.more = 900_000
+    place, token = URL(server.away), server.invite("viewer", "tv")
+    trusting = ssl._create_unverified_context()
+    with socket.socket() as plain:
+        plain.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        plain.connect(("127.0.0.1", place.port))
+        with trusting.wrap_socket(plain) as slow:
+            head = f"GET /api/camera HTTP/1.1\r\nHost: {place.host}:{place.port}\r\n"
+            slow.sendall(f"{head}Authorization: Bearer {token}\r\n\r\n".encode())
+            begun, size = time.monotonic(), 0
+            with suppress(ConnectionError, ssl.SSLError):
+                while size < 900_000 and (more := len(slow.recv(16384))):
+                    size += more
+                    time.sleep(0.16)
+            assert SEND_S - 1.0 < time.monotonic() - begun < SEND_S + 3.0
+            assert 100_000 < size < 900_000
+    assert "Traceback" not in server.stderr
+
+
+def test_three_pages_with_one_token_get_pictures_and_answers(filmed: Filmed) -> None:
+    server = filmed.server
+
+    async def story() -> None:
+        async with server.client(server.invite("viewer", "tv")) as viewer:
+
+            async def page() -> None:
+                for _ in range(100):
+                    assert (await got(viewer, f"{server.away}/api/camera")).status == 200
+
+            await asyncio.gather(page(), page(), page())
+            assert (await got(viewer, f"{server.away}/api/state")).status == 200
 
     asyncio.run(story())
 

@@ -9,10 +9,11 @@ import asyncio
 import math
 import os
 import socket
+import ssl
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -418,19 +419,51 @@ def test_a_browser_with_many_cookies_of_other_ports_gets_the_page(table: Table) 
         assert answer.status == 200
 
 
-def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus) -> None:
-    """Clients without a token could fill the memory with headers."""
+@pytest.mark.parametrize("before", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"])
+def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus, before: bytes) -> None:
+    """Clients without a token could fill the memory with headers, of the first request or later."""
     sent = 0
     with (
         table.attack("headers without an end", "cut off", "crowded"),
         _opened(table.page) as greedy, suppress(ConnectionError),
     ):  # fmt: skip
+        greedy.sendall(before)
+        if before:
+            assert greedy.recv(100).startswith(b"HTTP/1.1 200")
         greedy.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n")
         for number in range(200):
             greedy.sendall(b"X-%d: " % number + b"x" * 3000 + b"\r\n")
             sent += 3000
             time.sleep(0.005)
     assert sent < 300_000
+
+
+@pytest.mark.parametrize("headers", [0, 60])
+def test_answers_that_nobody_reads_cost_little_memory(table: Table, bus: Bus, headers: int) -> None:
+    """Sixty clients without a token send requests without end, and read no answer."""
+    page, place = table.page, URL(table.page.away)
+    trusting = ssl._create_unverified_context()
+    request = f"GET /x HTTP/1.1\r\nHost: {place.host}:{place.port}\r\n" + "".join(
+        f"X-{n}: {'x' * 200}\r\n" for n in range(headers)
+    )
+    said = (request + "\r\n").encode() * 20
+    with ExitStack() as stack:
+        greedy = []
+        for _ in range(60):
+            one = socket.socket()
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            one.connect(("127.0.0.1", place.port))
+            greedy.append(stack.enter_context(trusting.wrap_socket(one)))
+            greedy[-1].setblocking(False)
+        before, most, end = resident_kb(page.pid), 0, time.monotonic() + UNREAD_S - 1.0
+        while time.monotonic() < end:
+            for one in greedy:
+                with suppress(OSError):
+                    one.send(said)
+            most = max(most, resident_kb(page.pid) - before)
+            time.sleep(0.01)
+    print(f"\n60 clients that read no answers, {headers} more headers: {most / 1000:+.1f} MB")
+    assert most < 15_000
 
 
 def test_a_viewer_that_floods_with_pings_is_cut_off(
