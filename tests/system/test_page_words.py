@@ -211,33 +211,43 @@ def test_nobody_reads_a_long_number_for_a_name(page: Page, browser: Browser) -> 
     ]
 
 
-MIDDLE = """(() => {
-    const [map, tools, words] = ['map', 'erase', 'where'].map(
-        name => document.getElementById(name).getBoundingClientRect());
-    return [map.top, tools.bottom, words.top, map.bottom].map(Math.round);
+PARTS = """['map', 'erase', 'where'].map(
+    name => document.getElementById(name).getBoundingClientRect()).map(
+    box => [box.left, box.top, box.right, box.bottom].map(Math.round))"""
+
+DRAWN = """(() => {
+    const map = document.getElementById('map'), {left, top} = map.getBoundingClientRect();
+    const data = map.getContext('2d').getImageData(0, 0, map.width, map.height).data;
+    const style = getComputedStyle(document.documentElement).getPropertyValue('COLOUR').trim();
+    const wanted = [1, 3, 5].map(at => parseInt(style.slice(at, at + 2), 16)), found = [];
+    const share = map.clientHeight / map.height;
+    for (let n = 0; n < data.length; n += 4)
+        if (wanted.every((one, at) => data[n + at] === one))
+            found.push([left + (n / 4 % map.width) * share,
+                        top + Math.floor(n / 4 / map.width) * share]);
+    const [xs, ys] = [0, 1].map(at => found.map(one => one[at]));
+    return [xs, ys].flatMap(all => [Math.min(...all), Math.max(...all)]);
 })()"""
+"""The left, right, upper and lower end of what the map shows in this colour, px."""
 
 
 @pytest.mark.parametrize("size", [PHONE, SIDEWAYS], ids=["phone", "sideways"])
-def test_the_robot_on_the_map_is_between_the_buttons_and_the_words(
-    page: Page, browser: Browser, size: tuple[int, int]
+def test_the_map_shows_the_robot_and_its_direction_beside_the_buttons_and_a_scale(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page], size: tuple[int, int]
 ) -> None:
+    robot[1].get("srv/set_pose", {"x": 0.0, "y": 0.0, "yaw": 0.0})
     browser.size(*size)
-    top, tools, words, bottom = browser.js(MIDDLE)
-    assert top < tools < words < bottom
-    below = f"""(() => {{
-        const map = document.getElementById('map');
-        const data = map.getContext('2d').getImageData(0, 0, map.width, map.height).data;
-        const accent = getComputedStyle(document.documentElement).getPropertyValue('--accent');
-        const [r, g, b] = [1, 3, 5].map(at => parseInt(accent.trim().slice(at, at + 2), 16));
-        const rows = [];
-        for (let n = 0; n < data.length; n += 4)
-            if (data[n] === r && data[n + 1] === g && data[n + 2] === b)
-                rows.push(Math.floor(n / 4 / map.width) * map.clientHeight / map.height);
-        return [Math.min(...rows), Math.max(...rows)].map(row => row + {top});
-    }})()"""
-    first, last = browser.js(below)
-    assert (first + last) / 2 == pytest.approx((tools + words) / 2, abs=5.0)
+    shows(browser, "where", "x 0.00 m · y 0.00 m · 0°")
+    browser.js("document.getElementById('erase').click()")
+    (left, _, right, _), (_, _, _, tools), (_, words, _, bottom) = browser.js(PARTS)
+    west, east, north, south = browser.js(DRAWN.replace("COLOUR", "--accent"))
+    assert (north + south) / 2 == pytest.approx((tools + words) / 2, abs=5.0)
+    middle = (left + right) / 2
+    assert west == pytest.approx(middle - 13, abs=4.0)
+    assert east == pytest.approx(middle + 83, abs=8.0)  # the end of the dashed ray
+    west, east, north, south = browser.js(DRAWN.replace("COLOUR", "--ink"))
+    assert left < west < east < left + 70  # a bar of 45 px says 0.5 m
+    assert words - 30 < north < south < bottom
 
 
 def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_camera(

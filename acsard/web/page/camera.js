@@ -59,7 +59,8 @@ export class Camera {
       const headers = this.#tag ? { "If-None-Match": this.#tag } : {};
       const answer = await fetch("api/camera", { headers, cache: "no-store", signal: expiring(5000) });
       if (answer.status === 304) return "";
-      if (!answer.ok) return (await answer.json()).error ?? `${answer.status}`;
+      // The reason behind the colon is for the person who sets the camera up: the interface has it.
+      if (!answer.ok) return (await answer.json()).error?.split(":")[0] ?? `${answer.status}`;
       // The picture counts as old as if the way of the request had taken no time: a slow network ages pictures.
       const held = Number(answer.headers.get("Waited-Ms")) - Number(answer.headers.get("Age-Ms"));
       const picture = await createImageBitmap(await answer.blob());
