@@ -84,6 +84,8 @@ class Run:
         self._ticket = 0
         self.active: list[tuple[str, tuple[Any, ...]]] = []
         self._fed_ns = 0
+        self._ended = b""
+        """The last byte of the board that reached the daemon."""
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
@@ -285,6 +287,7 @@ class Run:
                 fault = (name, tuple(values))
                 self.active.append(fault)
                 self._troubled(name)
+                self.witness.lying_ns = self.true_ns
                 product.board(list(self.active))
                 if name == "echo":
                     self.echo.begin()
@@ -396,13 +399,16 @@ class Run:
             self._linked = False
             witness.new_life(self.true_ns)
             self.reports = Reports()
-            self.pose.doubt()
+            self.pose.begin()
 
         self.at(after_ns + 1000, start)
 
     # what the product shows
 
     def _fed(self, at_ns: int, data: bytes) -> None:
+        before, self._ended = self._ended, data[-1:]
+        if b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
+            self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
         true_ns = at_ns - START_NS + self.slept_ns
@@ -442,8 +448,10 @@ class Run:
         witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
             self.pose.placed()
-        for name, _ in self.active:
-            witness.troubles[name] = true_ns
+        for fault in self.active:
+            if fault not in self.lasting:
+                witness.troubles[fault[0]] = true_ns
+        witness.lies = self.active[len(self.lasting) :]
         if seen.followed_ns is not None:
             clock = self.reports.follows(true_ns, seen.followed_ns)
             if clock:

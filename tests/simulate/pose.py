@@ -39,7 +39,14 @@ class PoseWitness:
         self._last: tuple[int, Pose] | None = None
 
     def doubt(self) -> None:
-        """The encoders missed a part of the drive: restart the comparison at the next estimate."""
+        """The encoders missed a part of the drive: restart the comparison at the next estimate.
+
+        The pose may not jump all the same.
+        """
+        self._anchor = None
+
+    def begin(self) -> None:
+        """Note that a new daemon or a new pose begins: nothing before it counts."""
         self._anchor = self._last = None
 
     def placed(self) -> None:
@@ -70,7 +77,7 @@ class PoseWitness:
         """Forget the pose if it was set in this step."""
         if self._placed:
             self._placed = False
-            self.doubt()
+            self.begin()
 
     def _one(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool

@@ -40,6 +40,12 @@ HARMLESS = {
 }  # fmt: skip
 """Troubles of the board that are no reason to latch a fault."""
 
+DISOBEYS_NS = NS
+"""Within this time and `feedback.fault_time` a wheel that does not obey is a fault."""
+
+CLEARLY = 4.0
+"""rad/s. From this speed on, a wheel that does not obey cannot be taken for one that does."""
+
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
 """Refused messages that may have been speeds of a program that shares its identity, so a zero
 before them arms nobody."""
@@ -97,6 +103,18 @@ class Witness:
         self.fault_ns: int | None = None
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
+        self.lies: list[tuple[str, tuple[Any, ...]]] = []
+        """The faults that the board has now, beside its lasting properties."""
+        self.lying_ns = 0
+        """When the last fault of the board began."""
+        fault_time = config.get("feedback", {}).get("fault_time", 0.5)
+        coarse = config.get("sim", {}).get("encoder_counts", 3200) < 400
+        self._disobeys_ns = 0 if coarse or not fault_time else DISOBEYS_NS + int(fault_time * NS)
+        """Within this time a wheel that does not obey is a fault; 0 if the robot cannot see it."""
+        self._driven: list[tuple[int, float]] = [(0, 0.0)] * 4
+        """Since when each wheel has been commanded to turn clearly and in one direction."""
+        self.rested_ns = 0
+        """When the robot stood last, with zeros on the wire."""
         self.blocked_ns: int | None = None
         """Since when the kernel takes no line."""
         self.braking: tuple[int, tuple[float, ...]] | None = None
@@ -292,6 +310,8 @@ class Witness:
         if mode == "fault" != self.mode:
             self.counts["fault"] += 1
             recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
+            if "pushed" in recent and self.last == ZERO and self.rested_ns >= self.last_ns:
+                recent.remove("pushed")  # a hand turns wheels that were at rest: never a fault
             if self.mode and self.fault_ns is None and set(recent) <= HARMLESS:
                 raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
             if self.fault_ns is None:
@@ -325,6 +345,7 @@ class Witness:
             return
         if wheels == ZERO:
             self.last, self.last_ns, self.coasting, self.braking = ZERO, made_ns, None, None
+            self._driven = [(at_ns, 0.0)] * 4
             self.softest = dict(self.limits)
             return
         self.counts["moving lines"] += 1
@@ -350,7 +371,26 @@ class Witness:
         else:
             self._held(at_ns, held, grows, line, wheels)
         self._wished(at_ns, wheels, before, grows, line)
+        self.obeyed(at_ns, wheels)
         self.last, self.last_ns, self.cut = wheels, made_ns, False
+
+    def obeyed(self, at_ns: int, wheels: tuple[float, ...]) -> None:
+        """Judge that a wheel which clearly does not obey is a fault of the robot."""
+        clear = self.mode == "driving" and self.linked
+        for place, speed in enumerate(wheels):
+            since_ns, before = self._driven[place]
+            if not clear or abs(speed) < CLEARLY or speed * before <= 0.0:
+                since_ns = at_ns
+            self._driven[place] = since_ns, speed
+        if len(self.lies) != 1 or not disobeys(*self.lies[0]) or not self._disobeys_ns:
+            return
+        name, values = self.lies[0]
+        others = (last_ns for kind, last_ns in self.troubles.items() if kind != name)
+        since_ns = max(self.lying_ns, self._stalled[1], *others, 0)
+        wheel = next(w for w, (place, _) in enumerate(self.motors) if place == values[0])
+        if at_ns - max(since_ns, self._driven[wheel][0]) > self._disobeys_ns:
+            text = f"wheel {wheel} with {name}{values} is commanded {wheels[wheel]:.2f} rad/s"
+            raise BrokenError("a wheel that does not obey is a fault", at_ns, text)
 
     def stalls(self, begun_ns: int, ended_ns: int) -> None:
         """Note a stall of the host: the daemon reads what came during it in the steps behind it."""
@@ -466,6 +506,8 @@ class Witness:
 
     def wheels(self, at_ns: int, fastest: float) -> None:
         """Judge the true wheels: those of a robot that is held must stand in the end."""
+        if self.last == ZERO and fastest < 1.0:
+            self.rested_ns = at_ns
         if fastest < 0.5 or self.pending:
             return
         held = self.held
@@ -570,6 +612,13 @@ class Witness:
         if rim:
             scale = min(scale, limits["wheel_speed"] / rim)
         return v * scale, w * scale
+
+
+def disobeys(name: str, values: tuple[Any, ...]) -> bool:
+    """Return whether a wheel with this fault of the board clearly does not obey its command."""
+    if name == "bias":
+        return values[1] in (-1.0, 9.0)
+    return name in ("dead_motor", "stuck_encoder", "reversed_motor", "reversed_encoder")
 
 
 def _fastest(wheels: tuple[float, ...]) -> float:

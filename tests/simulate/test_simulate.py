@@ -8,6 +8,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, played
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
+from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, problems
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS, Message, messages, sample
@@ -181,6 +183,41 @@ def test_a_ramp_that_takes_twice_as_long_as_from_its_own_speed_is_a_finding(
         else:
             with pytest.raises(BrokenError, match=promise):
                 ramp(witness, fastest, share)
+
+
+@pytest.mark.parametrize(("speed", "raises"), [(5.0, True), (3.0, False)])
+def test_a_wheel_that_clearly_does_not_obey_must_become_a_fault(speed: float, raises: bool) -> None:
+    witness = witnessed()
+    witness.lies = [("dead_motor", (witness.motors[2][0],))]
+
+    def drive() -> None:
+        for n in range(100, 350):
+            witness.obeyed(n * NS // 100, (0.0, 0.0, -speed, 0.0))
+
+    expected = pytest.raises(BrokenError, match="does not obey") if raises else nullcontext()
+    with expected:
+        drive()
+
+
+def test_a_hand_that_turns_wheels_at_rest_causes_no_fault() -> None:
+    witness = witnessed()
+    witness.line(NS, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", NS, NS)
+    witness.wheels(2 * NS, 0.0)
+    witness.troubles["pushed"] = 3 * NS
+    witness.wheels(3 * NS, 9.0)
+    with pytest.raises(BrokenError, match="no fault without a cause"):
+        witness.step(3 * NS, "fault", "a wheel turns by itself")
+
+
+def test_a_pose_may_not_jump_although_the_encoders_missed_a_part_of_the_drive() -> None:
+    pose, sure = PoseWitness({}), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
+    truth = 0, 0.0, 0.0, 0.0, 0.0
+    pose.see(0, [(0, 1.0, 1.0, 0.0, sure, ())], truth, 0, set())
+    pose.doubt()
+    with pytest.raises(BrokenError, match="the pose never jumps"):
+        pose.see(NS // 10, [(NS // 10, 9.0, 1.0, 0.0, sure, ())], truth, 0, set())
+    pose.begin()
+    pose.see(NS // 5, [(NS // 5, 1.0, 1.0, 0.0, sure, ())], truth, 0, set())
 
 
 def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> None:
