@@ -72,6 +72,11 @@ MESSAGES = Rate(200.0, 400.0)
 """Limit on messages per WebSocket. The burst allowance covers the messages a client sends when its
 network returns."""
 
+COMMANDS = Rate(60.0, 120.0)
+"""Limit on the commands of one token, or of one local WebSocket. A finger sends 20 a second. The
+daemon accepts 1000 a second of this server, so 24 WebSockets that sent 180 each made it drop half
+of a driver's commands."""
+
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
 """Limit on the stops of one token to other robots that no page shows and that have never answered a
 stop here. They may not exist. Any other robot is stopped whenever a client asks."""

@@ -9,6 +9,7 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.host.rate_limits import Buckets
 from acsard.web.limits import (
+    COMMANDS,
     CONNECTIONS,
     CONNECTIONS_ALIKE,
     CONNECTIONS_HERE,
@@ -120,6 +121,7 @@ def test_the_page_tells_the_places_that_there_are() -> None:
     assert f"fewer than {fewest} files" in told
     assert f"A network with {SOCKETS_OF_ONE} such connections" in told
     assert f"A token keeps {SOCKETS_OF_TOKEN} connections" in told
+    assert f"{COMMANDS.hz:g} commands a second, and {COMMANDS.most:g} at once" in told
     assert f"Some requests wait {HOLD_S:g} s beyond a rate" in told
     assert f"{STOPS.hz:g} stops or `whoami` a second of one token in one network" in told
     assert f"{PICTURES.hz:g} pictures, {OPENINGS.hz:g} new WebSockets" in told
