@@ -36,7 +36,7 @@ from acsard.host.rate_limits import Buckets
 from acsard.web.answers import HEADERS, problem
 from acsard.web.callers import Who, is_loopback, network_of, unmapped
 from acsard.web.counts import Counts
-from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, Sockets, sockets_for
+from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, sockets_for
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 """Time limit for a TLS handshake, and maximum number of handshakes at once."""
@@ -59,10 +59,6 @@ never end would fill the memory."""
 AHEAD = 1
 """Requests that a client may send before it has the answer to the last one. No browser does, and 32
 of them, as aiohttp allows, have megabytes of headers."""
-
-UNREAD_BYTES = 32768
-"""Bytes of answers that wait for a client that does not read, above which its next request waits
-too. asyncio's limit for a TLS connection is 512 KiB."""
 
 UNREAD_S = 5.0
 """Time limit for a client that does not read its answers, or whose network is lost. The kernel ends

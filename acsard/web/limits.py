@@ -1,7 +1,7 @@
 """The limits of the page per client. This module is pure.
 
-The rates are those of messages, requests and wrong tokens. The places are those of TCP connections,
-WebSockets and subscriptions.
+The rates are those of messages, commands, requests, TLS handshakes and wrong tokens. The places are
+those of TCP connections, WebSockets and subscriptions.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ SOCKETS_LEAST = 16
 OWN_FILES = 128
 """Files of the process beside those of its connections: it has 20 open when nobody is connected. A
 report and a calibration need more for a while."""
+
+UNREAD_BYTES = 32768
+"""Bytes that wait for a client that does not read, above which its next request waits, and its
+WebSocket gets no new values. asyncio's limit for a TLS connection is 512 KiB."""
 
 OVERRUNS = 600
 """Number of messages beyond the rate limit that ends a connection."""
