@@ -62,8 +62,8 @@ STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.
 which its requests wait. Three pages show a camera with 60 pictures a second."""
 
 STRANGERS = Rate(30.0, 150.0)
-"""Rate of the requests without a token from one network, beyond which they wait. A page has 17
-files, so the burst serves eight phones behind one address at once."""
+"""Rate of the requests without a token from one network, beyond which they wait. A phone loads
+the page by 16, so the burst serves eight phones behind one address at once."""
 
 HANDSHAKES = Rate(30.0, 100.0)
 """Rate of the TLS handshakes of one network, beyond which they wait. A browser needs six."""
