@@ -56,6 +56,10 @@ class Buckets:
         self._shared = None if in_all is None else Bucket(in_all)
         self._buckets: dict[str, Bucket] = {}
 
+    def room(self, name: str, now_ns: int) -> bool:
+        """Return whether this name has a unit left."""
+        return name not in self._buckets or self._buckets[name].room(now_ns)
+
     def take(self, name: str, now_ns: int) -> bool:
         """Consume one unit of this name; return False if it, or all together, have none left."""
         if name not in self._buckets:

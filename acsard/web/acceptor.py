@@ -4,7 +4,8 @@ No other module counts them. A connection goes through these states:
 
 1. silent: only a socket and a place in `Sockets`. TLS starts with the first byte, so a silent
    connection costs a file and no memory;
-2. waiting, if `HANDSHAKES` others are in the TLS handshake;
+2. waiting, if `HANDSHAKES_AT_ONCE` others are in the TLS handshake, or if its network has begun too
+   many lately;
 3. starting: in the TLS handshake, for at most `HANDSHAKE_S`, or `HURRIED_S` if others wait;
 4. open: aiohttp reads its requests.
 
@@ -30,17 +31,23 @@ from typing import Any
 from aiohttp import StreamReader, web, web_protocol
 from aiohttp.web_protocol import RequestHandler
 
+from acsard.host import clock
+from acsard.host.rate_limits import Buckets
 from acsard.web.answers import HEADERS, problem
 from acsard.web.callers import Who, is_loopback, network_of, unmapped
 from acsard.web.counts import Counts
-from acsard.web.limits import SOCKETS_HERE, Sockets, sockets_for
+from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, sockets_for
 
-HANDSHAKE_S, HANDSHAKES = 3.0, 32
+HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 """Time limit for a TLS handshake, and maximum number of handshakes at once."""
 
 HURRIED_S = 0.3
 """Time limit for a TLS handshake of the most crowded network while others wait. Clients that fall
 silent in their handshakes must not keep a phone waiting for `HANDSHAKE_S`."""
+
+HANDSHAKE_EVERY_S = 0.005
+"""Shortest interval between the begins of two handshakes. Each one occupies the server for 1 ms or
+two, and a stop must not wait for 32 of them in a row."""
 
 REQUEST_S = 10.0
 """Time limit from the accept to the head of the first request; the connection is cut after that."""
@@ -52,10 +59,6 @@ never end would fill the memory."""
 AHEAD = 1
 """Requests that a client may send before it has the answer to the last one. No browser does, and 32
 of them, as aiohttp allows, have megabytes of headers."""
-
-UNREAD_BYTES = 32768
-"""Bytes of answers that wait for a client that does not read, above which its next request waits
-too. asyncio's limit for a TLS connection is 512 KiB."""
 
 UNREAD_S = 5.0
 """Time limit for a client that does not read its answers, or whose network is lost. The kernel ends
@@ -98,10 +101,13 @@ class Acceptor:
         self._here = Sockets["_Connection"](SOCKETS_HERE)
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
-        self._waiting: dict[_Connection, None] = {}
+        self._waiting: dict[str, dict[_Connection, None]] = {}
+        """The connections that wait for their handshake by network, in turns."""
+        self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
         """The connections in the TLS handshake, with the time of its start, oldest first."""
-        self._hurry: asyncio.TimerHandle | None = None
+        self._again: asyncio.TimerHandle | None = None
+        """The next call of `_next`."""
         self._ended: set[_Connection] = set()
         """The connections whose token had ended at the last call of `tidy`."""
 
@@ -188,31 +194,46 @@ class Acceptor:
 
     def wait(self, one: _Connection) -> None:
         """Start the TLS handshake of a connection when there is room."""
-        self._waiting[one] = None
-        self._next()
+        self._waiting.setdefault(one.network, {})[one] = None
+        if self._again is None:
+            self._next()
 
     def give_up(self, one: _Connection) -> None:
         """Forget a connection that waits for its handshake."""
-        self._waiting.pop(one, None)
+        same = self._waiting.get(one.network, {})
+        same.pop(one, None)
+        if not same:
+            self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
         """Note the end of a handshake, and start the next one."""
         self._starting.pop(one, None)
-        self._next()
+        if self._again is None:
+            self._next()
 
     def _next(self) -> None:
-        now = asyncio.get_running_loop().time()
-        while self._waiting and self._has_room(now):
-            # A network with many slow handshakes must not delay those of the others.
-            networks = Counter(one.network for one in self._starting)
-            one = min(self._waiting, key=lambda one: networks[one.network])
-            del self._waiting[one]
-            self._starting[one] = now
+        """Start the handshake of a connection that waits, if one may start, and come back."""
+        loop, self._again = asyncio.get_running_loop(), None
+        if not self._waiting:
+            return
+        now_ns, begun = clock.mono_ns(), Counter(one.network for one in self._starting)
+        # A network with many handshakes must not delay those of the others.
+        ready = [name for name in self._waiting if self._handshakes.room(name, now_ns)]
+        if ready and self._has_room(loop.time()):
+            network = min(ready, key=lambda name: begun[name])
+            self._handshakes.take(network, now_ns)
+            same = self._waiting.pop(network)
+            one = next(iter(same))
+            del same[one]
+            if same:
+                self._waiting[network] = same  # behind the others
+            self._starting[one] = loop.time()
             one.start()
+        self._again = loop.call_later(HANDSHAKE_EVERY_S, self._next)
 
     def _has_room(self, now: float) -> bool:
         """Return whether a handshake may start, after the oldest one was cut if it is too slow."""
-        if len(self._starting) < HANDSHAKES:
+        if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
         # The most crowded network loses a handshake, so a slow client of another one keeps its own.
         networks = Counter(one.network for one in self._starting)
@@ -221,10 +242,6 @@ class Acceptor:
             item for item in self._starting.items() if networks[item[0].network] == most
         )
         if now < begun + HURRIED_S:
-            if self._hurry is not None:
-                self._hurry.cancel()
-            loop = asyncio.get_running_loop()
-            self._hurry = loop.call_at(begun + HURRIED_S, self._next)
             return False
         del self._starting[oldest]
         self.slow(oldest)

@@ -8,6 +8,7 @@ has takes a token as well, so a stranger does not learn which paths exist.
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from functools import partial
@@ -17,7 +18,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import WebConfig
 from acsard.host import clock
-from acsard.host.rate_limits import Buckets
+from acsard.host.rate_limits import Buckets, Rate
 from acsard.host.threads import in_thread
 from acsard.web.acceptor import Acceptor
 from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
@@ -37,9 +38,9 @@ from acsard.web.callers import (
 )
 from acsard.web.counts import Counts
 from acsard.web.frames import MAX_BYTES
-from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS
+from acsard.web.limits import GUESSES, GUESSES_OF_ONE, HOLD_S, REQUESTS, STRANGERS
 from acsard.web.routes import Route
-from acsard.web.tokens import Vault
+from acsard.web.tokens import Token, Vault, owner_in
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
 """Pattern of a valid `Host` header. It is strict because the value is copied into a response
@@ -69,6 +70,36 @@ WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
+READ_EVERY_S = 0.005
+"""Shortest interval between two looks at the file of tokens. Each one starts a thread, for which
+the whole server waits: a flood of requests with a thread each delayed a stop by 200 ms."""
+
+
+class Lookups:
+    """Reads the file of tokens for all requests that arrive meanwhile."""
+
+    def __init__(self, vault: Vault) -> None:
+        self._vault, self._lock = vault, asyncio.Lock()
+        self._next: asyncio.Task[Sequence[Token]] | None = None
+        self._read_s = -READ_EVERY_S
+
+    async def read(self) -> Sequence[Token]:
+        """Return the tokens by a reading that begins after this call; raises `TimeoutError`.
+
+        So a token that was revoked before this call is not valid.
+        """
+        if self._next is None:
+            self._next = asyncio.create_task(self._later())
+            self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return await asyncio.shield(self._next)
+
+    async def _later(self) -> Sequence[Token]:
+        loop = asyncio.get_running_loop()
+        async with self._lock:
+            await asyncio.sleep(self._read_s + READ_EVERY_S - loop.time())
+            self._next, self._read_s = None, loop.time()
+            return await in_thread(self._vault.all, READ_S)
+
 
 class Admission:
     """Finds the row of each request, and refuses the request or hands it to the row's handler."""
@@ -91,7 +122,9 @@ class Admission:
         self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
-        self._guesses, self._paces = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(REQUESTS)
+        self._guesses, self._strangers = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(STRANGERS)
+        self._paces: dict[Rate, Buckets] = {}
+        self._lookups = Lookups(vault)
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
@@ -114,7 +147,8 @@ class Admission:
             raise RefusedError(
                 "no_token", "a token is missing: run `acsard web --invite ROLE` on the robot"
             )
-        who = await in_thread(lambda: next(filter(None, map(self._vault.who, shown)), None), READ_S)
+        tokens = await self._lookups.read()
+        who = next(filter(None, (owner_in(tokens, text) for text in shown)), None)
         # A valid token is accepted even while guessing is throttled, so another client's wrong
         # guesses lock nobody out.
         if who is not None:
@@ -131,10 +165,21 @@ class Admission:
         self._acceptor.spoke(request.transport, request.content)
         try:
             if request.method == "OPTIONS" and self._listed(request):
+                await self._pace_stranger(request)
                 return self._preflight(request)
-            await self._admit(request, self._rows.get(request.match_info.route))
-            return await handler(request)
+            waits = await self._admit(request, self._rows.get(request.match_info.route))
+            # A stop is sent at once, and its answer waits.
+            if waits and request.method != "POST":
+                await asyncio.sleep(HOLD_S)
+            answer = await handler(request)
+            if waits and request.method == "POST":
+                await asyncio.sleep(HOLD_S)
+            return answer
         except RefusedError as error:
+            if error.reason == "too_fast":
+                await asyncio.sleep(HOLD_S)
+            elif WHO not in request:
+                await self._pace_stranger(request)
             self._counts.refuse(error.reason, _origin(request))
             answer = problem(STATUS.get(error.reason, 403), str(error))
             if error.reason == "too_many":
@@ -155,8 +200,16 @@ class Admission:
                 return answer
             return problem(error.status, WORDS.get(error.status, error.reason))
 
-    async def _admit(self, request: web.Request, row: Route | None) -> None:
-        """Raise `RefusedError`, or store the identity of the caller unless the row is open."""
+    async def _pace_stranger(self, request: web.Request) -> None:
+        """Let a request without a valid token wait if its network sends many of them."""
+        if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
+            await asyncio.sleep(HOLD_S)
+
+    async def _admit(self, request: web.Request, row: Route | None) -> bool:
+        """Return whether the request or its answer must wait; raise `RefusedError`.
+
+        Store the identity of the caller unless the row is open.
+        """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
         is_open = row is not None and row.least is None
@@ -164,7 +217,14 @@ class Admission:
         if request.method not in ("GET", "HEAD") if is_open else not listed:
             require_own_origin(said)
         if is_open:
-            return
+            # The files of the page arrive on several connections, which must not be displaced
+            # before the first of them has asked for more.
+            shown = [] if here else tokens_shown(request, self._robot)
+            if who := next(filter(None, map(self._vault.known, shown)), None):
+                self._acceptor.admitted(request.transport, who)
+            elif not here:
+                await self._pace_stranger(request)
+            return False
         who = replace(self._local, address=said.peer)
         if not here:
             # A cookie belongs to the robot's own page.
@@ -172,13 +232,21 @@ class Admission:
             who = await self.owner(said.peer, shown)
         request[WHO] = who
         self._acceptor.admitted(request.transport, who)
-        # Clients on the robot itself have no token and no rate limit.
-        paced = who.token and (row is None or row.paced)
-        if paced and not self._paces.take(who.token, clock.mono_ns()):
+        fast = self._too_fast(who, row)
+        if fast and not (row and row.waits):
             text = f"more than {REQUESTS.hz:g} requests a second: use /ws, which sends changes"
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:
             who.require(row.least, f"{row.method} {row.path}")
+        return fast
+
+    def _too_fast(self, who: Who, row: Route | None) -> bool:
+        """Count a request; return whether it is beyond the rate of its row."""
+        if not who.token:
+            return False  # clients on the robot itself have no rate limit
+        rate = row.rate if row else REQUESTS
+        name = f"{who.token} {network_of(who.address)}" if row and row.waits else who.token
+        return not self._paces.setdefault(rate, Buckets(rate)).take(name, clock.mono_ns())
 
     def _listed(self, request: web.Request) -> bool:
         return by_listed_page(asked_of(request), self._origins)

@@ -25,7 +25,7 @@ from acsard.core.messages.permissions import least_role
 from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
-from acsard.host.threads import in_thread
+from acsard.host.threads import NoThreadError, in_thread
 from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
@@ -35,11 +35,11 @@ from acsard.web.calls import Calls
 from acsard.web.camera import SEND_S, Camera
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
-from acsard.web.files import PAGE, Files
+from acsard.web.files import PAGE, File, Files
 from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES, Begin
 from acsard.web.guide import Choices, Guide
-from acsard.web.limits import Seats
+from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.reports import POLICY, Reports, ReportState, State
 from acsard.web.robots import Robots
@@ -52,6 +52,10 @@ from acsard.web.viewer import HEARTBEAT_S, Viewer
 BODY_S = 5.0
 """Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
 connection."""
+
+FILE_S = 1.0
+"""Time for which a file of the page is sent without a look at the disk. A look starts a thread, for
+which the whole server waits."""
 
 SEND_BUFFER = 65536
 """Size of the kernel's send buffer for one client. A larger buffer would deliver stale data."""
@@ -106,6 +110,8 @@ class Page:
         self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
+        self._sent: dict[str, tuple[File, float]] = {}
+        """The files of the page, and when each was read or compared, by the event loop's clock."""
         self._viewers: set[Viewer] = set()
         self._admission = Admission(robots.id, names, vault, acceptor, counts, rules)
         self.app = self._admission.application(ROUTES, self)
@@ -132,6 +138,8 @@ class Page:
         self._reports.tidy()
         try:
             counting = await in_thread(self._vault.counting, READ_S)
+        except NoThreadError:
+            return  # the disk was not asked, so no token is in doubt
         except TimeoutError:
             counting = frozenset()
         for viewer in list(self._viewers):
@@ -151,9 +159,16 @@ class Page:
         return await self._send(request, request.match_info["name"])
 
     async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
-        file = await in_thread(lambda: self._files.get(name), READ_S)
-        if file is None:
-            raise web.HTTPNotFound
+        now = asyncio.get_running_loop().time()
+        file, read = self._sent.get(name, (None, 0.0))
+        if file is None or now > read + FILE_S:
+            if file is not None:
+                self._sent[name] = file, now  # until the disk has answered
+            file = await in_thread(lambda: self._files.get(name), READ_S)
+            if file is None:
+                self._sent.pop(name, None)
+                raise web.HTTPNotFound
+            self._sent[name] = file, now
         return sent(request, file)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
@@ -164,7 +179,7 @@ class Page:
         who = await self._admission.owner(peer_of(request), [form.token])
         cookie = cookie_name(self._robots.id, own_port(request))
         shown = "" if form.replace else request.cookies.get(cookie, "")
-        present = await in_thread(lambda: self._vault.who(shown), READ_S)
+        present = self._vault.known(shown)
         if present is not None and not who.may(present.role):
             raise TroubleError(
                 409,
@@ -357,10 +372,10 @@ ROUTES: tuple[Route, ...] = (
                409: Body("The browser's cookie has more permissions: `replace` it?", Problem)}),
     Route("GET", "/ws", "viewer", Page.socket,
         "a WebSocket with JSON as text in both directions: follows, drives, stops",
-        gives={101: Body("It is open.", media="")}, paced=False),
+        gives={101: Body("It is open.", media="")}, rate=OPENINGS, waits=True),
     Route("GET", "/api", "viewer", Page.api, "this document", gives={200: Body("OpenAPI 3.1.")}),
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
-        gives={200: Body("The caller.", Caller)}, paced=False),
+        gives={200: Body("The caller.", Caller)}, rate=STOPS, waits=True),
     Route("GET", "/api/settings", least_role("config"), Page.settings,
         "the settings that srv/set accepts, with values, ranges, and when each may change",
         gives={200: Body("A list.", list[Setting])}),
@@ -372,7 +387,8 @@ ROUTES: tuple[Route, ...] = (
         "request waited here (`Waited-Ms`), ms, as headers; with the `ETag` of the last one as "
         "`If-None-Match` it waits up to a second for a newer one",
         gives={200: Body("A picture.", str, "image/jpeg"),
-               304: Body("There is no newer picture.", media="")}, paced=False),
+               304: Body("There is no newer picture.", media="")},
+        rate=PICTURES, waits=True),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
         gives={200: Body("A list.", list[Recording])}),

@@ -14,7 +14,10 @@ from acsard.client.commander import Commander, Sender, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.messages.schema import Twist, Vector3
 from acsard.core.values import REST
+from acsard.host import clock
+from acsard.host.rate_limits import Buckets
 from acsard.web.counts import Counts
+from acsard.web.limits import COMMANDS
 
 
 class Hand:
@@ -25,16 +28,28 @@ class Hand:
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
+        self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
         """The server must exit when its thread is dead: no viewer can drive then, and no zero
         command is sent."""
 
-    def give(self, source: str, commander: Commander, sender: Sender, wish: Wish) -> None:
-        """Queue a command in place of an older one of the same commander."""
+    def give(
+        self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
+    ) -> bool:
+        """Queue a command in place of an older one of the same commander.
+
+        Return False if its owner, a token or a local viewer, sends too many. A zero after a speed
+        is queued in any case.
+        """
+        now_ns = clock.mono_ns()
+        ends = wish.twist == REST and commander.drives(now_ns)
+        if not self._rates.take(owner, now_ns) and not ends:
+            return False
         replaced = commander.replaced
         self.outbox.take(commander, partial(self._put, source, sender), wish)
         if commander.replaced > replaced:
             self._counts.add("commands_superseded")
+        return True
 
     def _put(self, source: str, sender: Sender, wish: Wish) -> None:
         try:

@@ -1,7 +1,7 @@
 """The limits of the page per client. This module is pure.
 
-The rates are those of messages, requests and wrong tokens. The places are those of TCP connections,
-WebSockets and subscriptions.
+The rates are those of messages, commands, requests, TLS handshakes and wrong tokens. The places are
+those of TCP connections, WebSockets and subscriptions.
 """
 
 from __future__ import annotations
@@ -30,6 +30,10 @@ OWN_FILES = 128
 """Files of the process beside those of its connections: it has 20 open when nobody is connected. A
 report and a calibration need more for a while."""
 
+UNREAD_BYTES = 32768
+"""Bytes that wait for a client that does not read, above which its next request waits, and its
+WebSocket gets no new values. asyncio's limit for a TLS connection is 512 KiB."""
+
 OVERRUNS = 600
 """Number of messages beyond the rate limit that ends a connection."""
 
@@ -53,9 +57,29 @@ are few and are not limited."""
 REQUESTS = Rate(50.0, 200.0)
 """Limit on HTTP requests per token. The page's static files are exempt."""
 
+STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.0)
+"""Rates of a token's stops, pictures of the camera and new WebSockets from one network, beyond
+which its requests wait. Three pages show a camera with 60 pictures a second."""
+
+STRANGERS = Rate(30.0, 150.0)
+"""Rate of the requests without a token from one network, beyond which they wait. A phone loads
+the page by 16, so the burst serves eight phones behind one address at once."""
+
+HANDSHAKES = Rate(30.0, 100.0)
+"""Rate of the TLS handshakes of one network, beyond which they wait. A browser needs six."""
+
+HOLD_S = 0.5
+"""Time for which a request beyond a rate waits. A refusal costs the server as much as an answer, so
+a client that asks without end must wait for either."""
+
 MESSAGES = Rate(200.0, 400.0)
 """Limit on messages per WebSocket. The burst allowance covers the messages a client sends when its
 network returns."""
+
+COMMANDS = Rate(60.0, 120.0)
+"""Limit on the commands of one token, or of one local WebSocket. A finger sends 20 a second. The
+daemon accepts 1000 a second of this server, so 24 WebSockets that sent 180 each made it drop half
+of a driver's commands."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
 """Limit on the stops of one token to other robots that no page shows and that have never answered a
@@ -93,6 +117,8 @@ class Sockets(Generic[C]):
         """The network of each connection."""
         self._known: dict[C, str] = {}
         """The token of each connection that is kept."""
+        self._shown: dict[C, str] = {}
+        """The last valid token of each connection, kept or not."""
         self._tokens: Counter[str] = Counter()
 
     def enter(self, network: str, one: C) -> C | None:
@@ -130,7 +156,10 @@ class Sockets(Generic[C]):
         The last token counts, because a browser may get another one.
         """
         network, before = self._networks.get(one), self._known.get(one)
-        if network is None or before == token or self._tokens[token] >= SOCKETS_OF_TOKEN:
+        if network is None:
+            return
+        self._shown[one] = token
+        if before == token or self._tokens[token] >= SOCKETS_OF_TOKEN:
             return
         if before is None:
             self._forget(network, one)
@@ -142,6 +171,7 @@ class Sockets(Generic[C]):
     def leave(self, one: C) -> None:
         """Give the place back, if the connection has one."""
         network = self._networks.pop(one, None)
+        self._shown.pop(one, None)
         if network is None:
             return
         token = self._known.pop(one, None)
@@ -152,7 +182,7 @@ class Sockets(Generic[C]):
 
     def ended(self, valid: Collection[str]) -> list[C]:
         """Return the connections whose token is not one of these; the robot itself needs none."""
-        return [one for one, token in self._known.items() if token and token not in valid]
+        return [one for one, token in self._shown.items() if token and token not in valid]
 
     def strangers(self) -> list[C]:
         """Return the connections that have shown no valid token."""

@@ -17,6 +17,8 @@ from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.messages.topics import SERVICES, TOPICS, VERBS, Topic
 from acsard.core.values import ROLES, Role
+from acsard.host.rate_limits import Rate
+from acsard.web.limits import REQUESTS, STOPS
 
 Handler = Callable[[Any, Any], Awaitable[Any]]
 """Takes the page and the request, and returns the response."""
@@ -73,11 +75,14 @@ class Route(Struct, frozen=True):
     """Media types of the request's body."""
     gives: Mapping[int, Body] = {}
     """The answers by HTTP status. Every error is a `Problem`."""
-    paced: bool = True
-    """False exempts it from the request rate limit.
+    rate: Rate = REQUESTS
+    """Limit on its requests per token, shared by all rows of this rate."""
+    waits: bool = False
+    """True makes a request beyond the rate wait instead of refusing it.
 
-    A stop must always go through. A page that reconnects must not be kept out by another program
-    that uses the same token. Pictures have a limit of their own.
+    A stop must always go through: it is sent at once, and its answer waits. A page that reconnects
+    must not be kept out by another program that uses the same token elsewhere. So the rate is that
+    of the token in one network.
     """
 
     @property
@@ -118,5 +123,6 @@ def services(handler: Handler) -> Iterator[Route]:
         }
         yield Route(
             "POST", f"/api/{key}", SERVICE_ROLES[verb], handler, notes[key],
-            takes=takes, gives=gives, paced=verb != "stop",
+            takes=takes, gives=gives, rate=STOPS if verb == "stop" else REQUESTS,
+            waits=verb == "stop",
         )  # fmt: skip

@@ -19,11 +19,9 @@ from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.callers import Reason
 from acsard.web.counts import Counts
+from acsard.web.limits import UNREAD_BYTES
 from acsard.web.socket_messages import Refused
 from acsard.web.streams import Stream
-
-UNREAD_BYTES = 32768
-"""Limit on unread bytes; above it the client receives no new values until it has read some."""
 
 UNREAD_FRAMES = 200
 """Maximum number of waiting answers; beyond it the oldest are dropped."""

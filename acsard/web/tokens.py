@@ -11,7 +11,7 @@ import hmac
 import os
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -63,15 +63,14 @@ class Vault:
 
     def who(self, text: str) -> Who | None:
         """Return the owner of a token, or None if the token is unknown or has expired."""
-        if not text or len(text) > 200:
-            return None
-        digest, found = _digest(text), None
-        for token in self.all():
-            if hmac.compare_digest(token.digest, digest):
-                found = token
-        if found is None or found.ends <= time.time():
-            return None
-        return Who(found.role, found.name, found.digest)
+        return owner_in(self.all(), text)
+
+    def known(self, text: str) -> Who | None:
+        """Return the owner of a token by the last reading of the file, without a look at the disk.
+
+        The page's server reads the file once a second.
+        """
+        return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
         """Return the seconds until a token expires, 0 if it is unknown."""
@@ -80,7 +79,10 @@ class Vault:
 
     def all(self) -> list[Token]:
         """Return this robot's tokens, including expired ones; none if the file cannot be read."""
-        return [one for one in self._shared() if one.robot == self.robot]
+        return self._own(self._shared())
+
+    def _own(self, tokens: list[Token]) -> list[Token]:
+        return [one for one in tokens if one.robot == self.robot]
 
     def _shared(self) -> list[Token]:
         """Return the tokens of all robots that share the file."""
@@ -187,6 +189,19 @@ def place() -> Path:
         return SERVICE
     base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(base) / "acsard-web"
+
+
+def owner_in(tokens: Sequence[Token], text: str) -> Who | None:
+    """Return the owner of a token, or None if it is not one of these or has expired."""
+    if not text or len(text) > 200:
+        return None
+    digest, found = _digest(text), None
+    for token in tokens:
+        if hmac.compare_digest(token.digest, digest):
+            found = token
+    if found is None or found.ends <= time.time():
+        return None
+    return Who(found.role, found.name, found.digest)
 
 
 def _digest(text: str) -> str:

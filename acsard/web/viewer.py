@@ -42,7 +42,7 @@ from acsard.web.frames import (
 )
 from acsard.web.guide import Guide
 from acsard.web.keys import Keys
-from acsard.web.limits import MESSAGES, OVERRUNS
+from acsard.web.limits import COMMANDS, MESSAGES, OVERRUNS
 from acsard.web.robots import Robots
 from acsard.web.routes import RECORDINGS
 from acsard.web.socket_sender import Outgoing
@@ -222,7 +222,10 @@ class Viewer:
         self._stamp_ns = stamp_ns
         wish = Wish(Twist(frame.cmd.linear_x, frame.cmd.angular_z), stamp_ns, frame.steady)
         commander = self._commanders.setdefault(frame.source, Commander())
-        self._hand.give(frame.source, commander, self._sender, wish)
+        owner = self.who.token or self.sender
+        if not self._hand.give(owner, frame.source, commander, self._sender, wish):
+            text = f"more than {COMMANDS.hz:g} commands a second of this token"
+            self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
         """Send a zero command to each source by which the robot may still follow this viewer.

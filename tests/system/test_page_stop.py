@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -130,6 +131,34 @@ def test_stop_latches_as_soon_as_it_is_red_while_every_other_file_is_never_answe
     finally:
         browser.ask("Fetch.disable")
         browser.open("about:blank")
+
+
+DYING = """
+    const send = WebSocket.prototype.send;
+    WebSocket.prototype.send = function (data) { if (!window.dead) send.call(this, data); };
+    Object.defineProperty(WebSocket.prototype, "onmessage", {
+        set(take) { this.addEventListener("message", (event) => window.dead || take(event)); },
+    });
+"""
+"""Makes WebSockets that pass nothing on once `dead` is set, and stay open."""
+
+
+def test_stop_latches_within_a_second_while_the_socket_is_dead_but_open(robot: Robot) -> None:
+    browser = robot.browser
+    added = browser.ask("Page.addScriptToEvaluateOnNewDocument", source=DYING)
+    try:
+        with robot.without():
+            until(lambda: browser.text("mode") == "READY", 10.0, "the page is complete")
+            browser.js("window.dead = true")
+            begun = time.monotonic()
+            browser.key("Down", "Space", " ")
+            browser.key("Up", "Space", " ")
+            until(lambda: robot.mode == "stopped", 10.0, "stopped")
+            took = time.monotonic() - begun
+            print(f"\nSTOP latches {1000 * took:.0f} ms after the press")
+            assert took < 1.0
+    finally:
+        browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
 
 
 @pytest.fixture

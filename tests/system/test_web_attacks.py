@@ -8,10 +8,12 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import re
 import socket
 import ssl
 import time
 import urllib.request
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -21,9 +23,17 @@ import aiohttp
 import pytest
 from yarl import URL
 
+from acsard.host.rate_limits import Rate
 from acsard.web.acceptor import REQUEST_S, UNREAD_S
 from acsard.web.app import BODY_S
-from acsard.web.limits import SOCKETS_OF_ONE
+from acsard.web.limits import (
+    HANDSHAKES,
+    HOLD_S,
+    OPENINGS,
+    SOCKETS_OF_ONE,
+    STOPS,
+    STRANGERS,
+)
 from tests.system.browser import NAME, Hands, Page, hands, run
 from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, cpu_seconds, resident_kb, until
 
@@ -529,6 +539,157 @@ def test_who_does_not_read_the_answers_is_disconnected_soon(table: Table, bus: B
         until(held, PATIENCE_S, "it is accepted")
         until(lambda: not held(), UNREAD_S + PATIENCE_S / 3, "it is disconnected")
     assert "Traceback" not in table.page.stderr
+
+
+ENDLESS: dict[str, tuple[str, int, Rate, str]] = {
+    "files": ("GET /page/main.js", 30, STRANGERS, "200"),
+    "no token": ("GET /api/state", 30, STRANGERS, "401"),
+    "whoami": ("GET /api/whoami", 30, STOPS, "200"),
+    "sockets": ("GET /ws", 5, OPENINGS, "101"),
+    "stops": ("POST /api/srv/stop", 30, STOPS, "200"),
+}
+"""A request that some clients send without end: their number, its rate, and the answer."""
+
+
+@pytest.mark.parametrize("what", ENDLESS)
+def test_a_client_that_asks_without_end_waits_and_is_not_refused(
+    table: Table, bus: Bus, tokens: dict[str, str], what: str
+) -> None:
+    said, clients, rate, status = ENDLESS[what]
+    place, lasts_s = URL(table.page.away), 3.0
+    headers = {"Host": f"{place.host}:{place.port}", "Content-Length": "0"}
+    if rate != STRANGERS:
+        headers["Authorization"] = f"Bearer {tokens['viewer']}"
+    if said.endswith("/ws"):
+        headers |= UPGRADE
+    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    words = f"{said} HTTP/1.1\r\n{lines}\r\n".encode()
+    answers: Counter[str] = Counter()
+
+    async def asks(end: float) -> None:
+        trusting = ssl._create_unverified_context()
+        while time.monotonic() < end:
+            reader, writer = await asyncio.open_connection(
+                "127.0.0.1", place.port, ssl=trusting, server_hostname=NAME
+            )
+            while time.monotonic() < end:
+                writer.write(words)
+                head = (await reader.readuntil(b"\r\n\r\n")).decode()
+                answers[head.split()[1]] += 1
+                if status == "101":
+                    break
+                length = re.search(r"(?i)content-length: (\d+)", head)
+                await reader.readexactly(int(length[1]) if length else 0)
+            writer.transport.abort()
+
+    async def story() -> None:
+        end = time.monotonic() + lasts_s
+        await asyncio.gather(*(asks(end) for _ in range(clients)))
+
+    run(story)
+    print(f"\n{what}: {answers.total() / lasts_s:.0f} answers a second to {clients} clients")
+    assert set(answers) == {status}
+    lasts_s += HOLD_S  # an answer may come after the end
+    assert answers.total() <= rate.most + (rate.hz + clients / HOLD_S) * lasts_s
+
+
+def test_a_stop_beyond_the_rate_is_sent_at_once_and_only_its_answer_waits(
+    page: Page, bus: Bus, tokens: dict[str, str]
+) -> None:
+    async def story() -> None:
+        async with page.client(tokens["viewer"]) as session:
+
+            async def asks() -> None:
+                while True:
+                    async with session.get(f"{page.away}/api/whoami") as answer:
+                        await answer.read()
+
+            async def stop() -> float:
+                begun = time.monotonic()
+                async with session.post(f"{page.away}/api/srv/stop") as answer:
+                    assert answer.status == 200
+                return time.monotonic() - begun
+
+            # These clients have the same rate, and take almost all of it.
+            others = [asyncio.create_task(asks()) for _ in range(50)]
+            await asyncio.sleep(2.0)
+            took = 0.0
+            for _ in range(20):
+                await asyncio.to_thread(bus.ask, "srv/clear")
+                asking = asyncio.create_task(stop())
+                await asyncio.to_thread(
+                    until, lambda: bus.state()["mode"] == "stopped", PATIENCE_S, "it stops"
+                )
+                early = not asking.done()
+                if (took := await asking) >= HOLD_S:
+                    assert early
+                    break
+            assert took >= HOLD_S
+            for one in others:
+                one.cancel()
+
+    run(story)
+
+
+def test_handshakes_of_one_network_wait_beyond_their_rate(table: Table, bus: Bus) -> None:
+    place, lasts_s, done = URL(table.page.away), 3.0, 0
+
+    async def shakes(end: float) -> None:
+        nonlocal done
+        trusting = ssl._create_unverified_context()
+        while time.monotonic() < end:
+            with suppress(ConnectionError, TimeoutError):
+                async with asyncio.timeout(end - time.monotonic()):
+                    _, writer = await asyncio.open_connection(
+                        "127.0.0.1", place.port, ssl=trusting, server_hostname=NAME
+                    )
+                done += 1
+                writer.transport.abort()
+
+    async def story() -> None:
+        end = time.monotonic() + lasts_s
+        await asyncio.gather(*(shakes(end) for _ in range(30)))
+
+    run(story)
+    print(f"\n{done / lasts_s:.0f} handshakes a second")
+    assert done <= HANDSHAKES.most + HANDSHAKES.hz * lasts_s + 5
+
+
+def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
+    table: Table, bus: Bus, tokens: dict[str, str]
+) -> None:
+    place, trusting = URL(table.page.away), ssl._create_unverified_context()
+
+    async def story() -> None:
+        async with table.page.client() as phone:
+            form = {"token": tokens["viewer"]}
+            async with phone.post(
+                f"{table.page.away}/token", data=form, allow_redirects=False
+            ) as a:
+                cookie = a.headers["Set-Cookie"].partition(";")[0]
+        reader, writer = await asyncio.open_connection(
+            "127.0.0.1", place.port, ssl=trusting, server_hostname=NAME
+        )
+
+        async def fetches(path: str) -> bytes:
+            host = f"{place.host}:{place.port}"
+            said = f"GET {path} HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n"
+            writer.write(said.encode())
+            head = await reader.readuntil(b"\r\n\r\n")
+            length = re.search(rb"(?i)content-length: (\d+)", head)
+            await reader.readexactly(int(length[1]) if length else 0)
+            return head
+
+        assert b" 200 " in await fetches("/")
+        idle = await _idle("127.0.0.1", place.port or 0, SOCKETS_OF_ONE + 10)
+        await asyncio.sleep(0.3)
+        assert b" 200 " in await fetches("/page/main.js")
+        for one in idle:
+            one.close()
+        writer.transport.abort()
+
+    with table.attack("a crowd around a phone that loads", "it loads", "crowded", 10):
+        run(story)
 
 
 VIEWERS, A_SECOND, LASTS_S = 6, 190, 4.0

@@ -7,7 +7,8 @@ import json
 import re
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -19,7 +20,7 @@ import pytest
 
 from acsard.machine.authority import Authority
 from tests.system.browser import NAME, Page, hands, run
-from tests.system.chromium import CHROMIUM, browsing
+from tests.system.chromium import CHROMIUM, PHONE, browsing
 from tests.system.harness import (
     PATIENCE_S,
     ROOT,
@@ -181,6 +182,18 @@ def served(where: Path, origin: str) -> Iterator[None]:
         thread.join()
 
 
+LATE = """(() => {
+    const now = Date.now;
+    window.tries = 0, window.told = "";
+    window.fetch = async () => {
+        if (++window.tries === 4) Date.now = () => now() + 31000;
+        throw new Error();
+    };
+    window.alert = (text) => (window.told = text);
+})()"""
+"""Makes STOP fail, and 31 s pass at its fourth attempt."""
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
 def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
@@ -190,27 +203,34 @@ def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
     assert "http://127.0.0.1:8080" in text
     (tmp_path / "index.html").write_text(text.replace("http://127.0.0.1:8080", server.here))
 
-    async def takes_over(look: Callable[[str], None]) -> None:
-        async with hands(server) as finger:
-            await finger.say(subscribe="state", rate=50)
-            await finger.until_driving(-0.2)
-            holding = asyncio.create_task(finger.hold(-0.2, PATIENCE_S))
-            await asyncio.to_thread(look, "driving by teleop")
-            holding.cancel()
-            await finger.drive(0.0)
-
-    with served(tmp_path, origin), browsing() as browser:
+    # A tab in the background does not drive, so the robot's own page has a browser of its own.
+    with served(tmp_path, origin), browsing() as browser, browsing() as phone:
 
         def shows(words: str) -> None:
             until(lambda: words in browser.text("state"), PATIENCE_S, f"it shows {words!r}")
 
+        def drives(source: str) -> bool:
+            state = bus.state()
+            return bool(state["source"] == source and state["linear"] > 0.1)
+
         browser.open(origin)
         shows("ready by nobody")
+        phone.size(*PHONE)
+        phone.open(server.here)
         browser.js("document.getElementById('forward').onpointerdown()")
         shows("driving by app")
-        until(lambda: bus.state()["linear"] > 0.1, PATIENCE_S, "it drives")
-        run(lambda: takes_over(shows))
+        until(lambda: drives("app"), PATIENCE_S, "the dashboard drives")
+        phone.hold(lambda: drives("teleop"))
+        shows("driving by teleop")
+        phone.lift()
+        until(lambda: drives("app"), PATIENCE_S, "the dashboard drives on")
         shows("driving by app")
         browser.js("document.getElementById('stop').click()")
         shows("stopped by")
         assert bus.state()["mode"] == "stopped"
+        browser.js(LATE)
+        browser.js("document.getElementById('stop').click()")
+        until(lambda: "not confirmed" in browser.js("window.told"), PATIENCE_S, "it gives up")
+        tries = browser.js("window.tries")
+        time.sleep(1.0)
+        assert browser.js("window.tries") == tries == 4

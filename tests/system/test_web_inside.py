@@ -26,10 +26,9 @@ from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
 from acsard.web.guide import Guide
 from acsard.web.jobs import Reach
-from acsard.web.limits import OVERRUNS
+from acsard.web.limits import OVERRUNS, UNREAD_BYTES
 from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
-from acsard.web.socket_sender import UNREAD_BYTES
 from acsard.web.tokens import Vault
 from tests.system.browser import Hands, run
 from tests.system.harness import PATIENCE_S, Daemon, seconds

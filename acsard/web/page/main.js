@@ -27,6 +27,7 @@ const VIEWS = ["drive", "status", "events", "set", "robots"];
 const words = (told) => clickable(named(told), OTHER);
 const READ = 8000; // ms in which a message can be read
 const LATCHED = ["stopped", "fault"];
+const SOON = 300; // ms in which the WebSocket answers a STOP, unless it is dead but still open
 
 const link = new Link(refused);
 const map = new PathMap($("map"));
@@ -283,6 +284,15 @@ async function refused() {
   return shut;
 }
 
+/** Resolve to the answer to a STOP, by the WebSocket or, if that does not answer soon, also by `post`. */
+async function hedged(called, post) {
+  const told = await Promise.race([called, new Promise((done) => setTimeout(done, SOON))]);
+  if (told && !told.lost) return told;
+  const answered = (one) => one.then((told) => (told.lost ? Promise.reject() : told));
+  const posted = post();
+  return Promise.any([answered(called), answered(posted)]).catch(() => posted);
+}
+
 link.addEventListener("hello", greeted);
 link.addEventListener("key:state", stated);
 link.addEventListener("key:odom", ({ detail: { value } }) => {
@@ -375,7 +385,7 @@ setInterval(looked, 100);
 // Refresh the list, because recordings grow and new ones begin while it is visible.
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
 const post = stopping.send;
-stopping.send = () => (link.open ? link.call("stop", undefined, OTHER) : post());
+stopping.send = () => (link.open ? hedged(link.call("stop", undefined, OTHER), post) : post());
 stopping.after = (told) => {
   if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched behind the fault: Release fault leads to STOPPED" });
 };

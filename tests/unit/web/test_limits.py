@@ -9,6 +9,7 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.host.rate_limits import Buckets
 from acsard.web.limits import (
+    COMMANDS,
     CONNECTIONS,
     CONNECTIONS_ALIKE,
     CONNECTIONS_HERE,
@@ -16,6 +17,10 @@ from acsard.web.limits import (
     CONNECTIONS_OF_TOKEN,
     GUESSES,
     GUESSES_OF_ONE,
+    HANDSHAKES,
+    HOLD_S,
+    OPENINGS,
+    PICTURES,
     REQUESTS,
     SOCKETS,
     SOCKETS_HERE,
@@ -23,6 +28,8 @@ from acsard.web.limits import (
     SOCKETS_OF_BROWSER,
     SOCKETS_OF_ONE,
     SOCKETS_OF_TOKEN,
+    STOPS,
+    STRANGERS,
     Seats,
     Shares,
     Sockets,
@@ -114,6 +121,14 @@ def test_the_page_tells_the_places_that_there_are() -> None:
     assert f"fewer than {fewest} files" in told
     assert f"A network with {SOCKETS_OF_ONE} such connections" in told
     assert f"A token keeps {SOCKETS_OF_TOKEN} connections" in told
+    assert f"{COMMANDS.hz:g} commands a second, and {COMMANDS.most:g} at once" in told
+    assert f"Some requests wait {HOLD_S:g} s beyond a rate" in told
+    assert f"{STOPS.hz:g} stops or `whoami` a second of one token in one network" in told
+    assert f"{PICTURES.hz:g} pictures, {OPENINGS.hz:g} new WebSockets" in told
+    assert f"{STRANGERS.hz:g} requests a second of one network without a token" in told
+    assert f"{STRANGERS.most:g} of the requests without a token may come at once" in told
+    shakes = HANDSHAKES
+    assert f"begin {shakes.most:g} TLS handshakes at once, then {shakes.hz:g} a second" in told
     most, hz = GUESSES_OF_ONE.most, GUESSES_OF_ONE.hz
     assert f"may try {most:g} wrong tokens at once, then one every {1 / hz:g} s" in told
     assert (GUESSES.most / most, GUESSES.hz / hz) == pytest.approx((10, 10))
@@ -170,6 +185,16 @@ def test_the_connections_of_a_token_that_has_ended_are_found() -> None:
     assert sockets.ended({"kept", "lent"}) == []
     assert sockets.ended({"kept"}) == ["lent"]
     assert sockets.ended(()) == ["lent", "kept", "both"]
+
+
+def test_the_connections_of_a_token_beyond_its_share_are_found_when_it_ends() -> None:
+    sockets = Sockets[int](SOCKETS)
+    for n in range(SOCKETS_OF_TOKEN + 20):
+        sockets.enter(f"10.0.0.{n}", n)
+        sockets.prove(n, "lent")
+    assert len(sockets.ended({"kept"})) == SOCKETS_OF_TOKEN + 20
+    sockets.leave(SOCKETS_OF_TOKEN + 5)
+    assert len(sockets.ended({"kept"})) == SOCKETS_OF_TOKEN + 19
 
 
 def test_a_token_keeps_a_share_of_the_places_only() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.topics import SERVICES, row_of
 from acsard.web.app import ROUTES
+from acsard.web.limits import REQUESTS
 
 PAGE = (Path(__file__).parents[3] / "deploy/web/README.md").read_text()
 
@@ -22,9 +23,12 @@ def test_only_the_page_s_own_files_and_the_token_are_open_to_strangers() -> None
     assert is_open == {"/", "/favicon.ico", "/page/{name}", "/token"}
 
 
-def test_only_stops_the_return_of_a_page_and_pictures_pass_the_rate_limit() -> None:
-    free = {"/api/srv/stop", "/api/whoami", "/ws", "/api/camera"}
-    assert {row.path for row in ROUTES if not row.paced} == free
+def test_stops_the_return_of_a_page_and_pictures_wait_beyond_their_rate_and_are_not_refused() -> (
+    None
+):
+    waiting = {"/api/srv/stop", "/api/whoami", "/ws", "/api/camera"}
+    assert {row.path for row in ROUTES if row.waits} == waiting
+    assert all(row.rate == REQUESTS for row in ROUTES if row.path not in waiting)
 
 
 def test_each_service_has_the_role_that_the_bus_asks_for() -> None:
