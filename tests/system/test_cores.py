@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import os
+import sys
+from pathlib import Path
 
-from tests.system.cores import Idle, idle, taken
+import pytest
+
+from tests.system import cores
+from tests.system.cores import Idle, idle, idle_class, taken
+from tests.system.harness import Program
 
 
 def test_where_a_core_was_free_for_a_while_a_failure_counts() -> None:
@@ -18,3 +24,26 @@ def test_it_is_counted_as_the_kernel_counts() -> None:
     first = idle()
     assert 0.0 <= first.idle_s <= first.at * (os.cpu_count() or 1) * 1.1
     assert idle() >= first
+
+
+IN_THE_IDLE_CLASS = """\
+import os, time
+while time.process_time() < 0.3:
+    pass
+os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+print("idle", flush=True)
+time.sleep(60)
+"""
+"""It computes in the normal class, because a busy machine gives the idle class hardly any time."""
+
+
+def test_the_time_of_a_program_in_the_idle_class_is_counted(tmp_path: Path) -> None:
+    before = idle_class()
+    with Program([sys.executable, "-S", "-c", IN_THE_IDLE_CLASS], tmp_path) as program:
+        program.says("idle")
+        assert idle_class() - before >= 0.25
+
+
+def test_the_time_of_the_idle_class_counts_as_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cores, "idle_class", lambda: 1e9)
+    assert idle().idle_s >= 1e9

@@ -11,7 +11,7 @@ import struct
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,22 +65,63 @@ def browser() -> Iterator[Browser]:
         yield browser
 
 
-@pytest.fixture
-def page(tmp_path: Path, browser: Browser) -> Iterator[Phone]:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+class Robot(NamedTuple):
+    """A daemon with its link up, a client on its bus, and its page."""
+
+    daemon: Daemon
+    bus: Bus
+    server: Page
+
+
+@contextmanager
+def running(where: Path) -> Iterator[Robot]:
+    """Run a robot and its page."""
+    with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
-        with Page(daemon, tmp_path) as server:
-            page = Phone(daemon, bus, server, browser)
-            browser.size(*PHONE)
-            browser.said.clear()
-            browser.open(server.here)
-            page.shows("mode", "READY")
-            page.shows("age", "live")
-            yield page
-            browser.lift()
-            browser.open("about:blank")
+        with Page(daemon, where) as server:
+            yield Robot(daemon, bus, server)
 
 
+@pytest.fixture(scope="module")
+def common_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """The robot of all tests that leave it as it was, apart from a latch. Its start takes 1 s."""
+    with running(tmp_path_factory.mktemp("common")) as robot:
+        yield robot
+
+
+@pytest.fixture
+def own_robot(tmp_path: Path) -> Iterator[Robot]:
+    with running(tmp_path) as robot:
+        yield robot
+
+
+alone = pytest.mark.usefixtures("own_robot")
+"""Gives a test a new robot.
+
+The test ends or suspends a process, changes a setting, counts, or looks at a history.
+"""
+
+
+@pytest.fixture
+def page(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Phone]:
+    """The page of a robot that stands and may be driven, just opened."""
+    own = "own_robot" in request.fixturenames
+    robot: Robot = request.getfixturevalue("own_robot" if own else "common_robot")
+    page = Phone(*robot, browser)
+    robot.bus.ask("srv/clear")
+    robot.bus.ask("srv/activate")
+    robot.bus.at_rest()
+    browser.size(*PHONE)
+    browser.said.clear()
+    browser.open(robot.server.here)
+    page.shows("mode", "READY")
+    page.shows("age", "live")
+    yield page
+    browser.lift()
+    browser.open("about:blank")
+
+
+@alone
 def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     assert browser.js("document.getElementById('simulated').hidden") is False
@@ -137,6 +178,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.touch("End")
 
 
+@alone
 def test_what_a_button_could_not_is_reported_once(page: Phone) -> None:
     page.browser.tap("tab-set")
     page.browser.js("document.getElementById('reset').click()")
@@ -253,6 +295,7 @@ COARSE = """(() => {
 """The clock of a browser that tells no page the exact time."""
 
 
+@alone
 def test_a_browser_whose_clock_stands_for_a_tenth_of_a_second_drives_and_lets_go(
     page: Phone,
 ) -> None:
@@ -312,6 +355,7 @@ def viewers(page: Phone) -> int:
     return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", told, re.MULTILINE)[0])
 
 
+@alone
 def test_a_page_that_is_left_is_gone_at_once_and_there_again_when_somebody_goes_back(
     page: Phone,
 ) -> None:
@@ -364,6 +408,7 @@ def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, othe
     browser.key("Up", "KeyW", "w")
 
 
+@alone
 def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
     page.browser.tap("tab-events")
     page.server.process.kill()
@@ -372,6 +417,7 @@ def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
     page.shows("alarm", "STOP: no connection to the robot")
 
 
+@alone
 def test_a_stop_into_a_connection_that_is_dead_and_does_not_know_it_is_sent_again(
     page: Phone, tmp_path: Path
 ) -> None:
@@ -442,6 +488,7 @@ def test_the_screen_stays_on_while_the_stick_is_held_and_no_longer(page: Phone) 
     page.bus.at_rest()
 
 
+@alone
 def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -> None:
     page.hold()
     page.shows("mode", "DRIVING")
@@ -468,6 +515,7 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
     assert "waiting for a command" not in page.browser.text("reason")
 
 
+@alone
 def test_a_page_that_comes_when_nothing_is_heard_waits_and_shows_nothing_as_measured(
     page: Phone,
 ) -> None:
@@ -574,6 +622,7 @@ SET = """(() => {
 """Decimal comma, as people in many countries type it."""
 
 
+@alone
 def test_what_is_set_and_switched_on_the_page_is_so(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     browser.tap("tab-set")
@@ -608,6 +657,7 @@ def drawing(browser: Browser) -> str:
     return looks[-1]
 
 
+@alone
 def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
     """Each button changes the drawing, and the reverse button restores it."""
     browser = page.browser
@@ -629,6 +679,7 @@ def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) 
     drawn(False, "as before again")
 
 
+@alone
 def test_the_map_turns_with_the_robot_and_back(page: Phone) -> None:
     browser = page.browser
     page.bus.get("srv/set_pose", {"x": 0.0, "y": 0.0, "yaw": 1.0})
@@ -742,6 +793,7 @@ def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(page: 
     run(story)
 
 
+@alone
 def test_the_stick_is_grey_and_says_why_in_each_mode_in_which_it_does_not_drive(
     page: Phone,
 ) -> None:
@@ -845,6 +897,7 @@ def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) 
     until(lambda: page.browser.js(seen) == "visible", 5.0, "the words again")
 
 
+@alone
 def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
     async def story() -> None:
         async with AsyncExitStack() as stack:
@@ -954,6 +1007,7 @@ class Look(NamedTuple):
         return cls(ms, browser.received - before)
 
 
+@alone
 def test_a_first_look_is_small_and_the_second_one_smaller(page: Phone, tmp_path: Path) -> None:
     with Program([sys.executable, "-c", BARE], tmp_path) as bare, browsing() as browser:
         (url,) = re.findall(r"http://\S+:\d+", bare.says("http://"))
@@ -1141,6 +1195,7 @@ def test_a_list_of_settings_has_no_space_and_says_why(page: Phone) -> None:
     until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops from there too")
 
 
+@alone
 def test_what_strangers_write_is_text(page: Phone) -> None:
     evil = "<img src=x onerror=document.title='owned'>"
     page.bus.put(f"cmd/{'app'}", {"linear": {"x": evil}, "angular": {"z": 0}})
@@ -1226,6 +1281,7 @@ def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_n
             assert told["origin"] == "null"
 
 
+@alone
 def test_curves_that_lie_on_each_other_are_told_apart_and_say_their_values(page: Phone) -> None:
     browser = page.browser
     browser.size(*DESKTOP, touch=False)
@@ -1257,6 +1313,7 @@ ABOVE = """(() => {
 """Number of points of the measured and of the commanded speed in the upper half of their plot."""
 
 
+@alone
 def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
     page: Phone,
 ) -> None:
