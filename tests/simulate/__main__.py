@@ -129,6 +129,12 @@ def main() -> int:
     parser.add_argument("--shrink", metavar="SEED", type=int, help="drop what a finding can spare")
     parser.add_argument("--keep", metavar="NAME", default="", help="with --shrink: into corpus/")
     parser.add_argument("--against", metavar="TREE", help="compare with another checkout")
+    parser.add_argument(
+        "--adapter",
+        metavar="FILE",
+        type=Path,
+        help="with --against: its product.py, if it has none",
+    )
     options = parser.parse_args()
     if options.replay:
         return replay(options.replay)
@@ -136,7 +142,9 @@ def main() -> int:
         return reduce(options.shrink, options.keep)
     if options.against:
         tree = Path(options.against)
-        return pairs.compare(tree, options.seed, options.hours * 3600, options.workers)
+        return pairs.compare(
+            tree, options.seed, options.hours * 3600, options.workers, options.adapter
+        )
     return min(1, explore(options.seed, options.hours, options.workers, options.within * 60))
 
 

@@ -1,42 +1,194 @@
 """The deliberate differences between two checkouts, which a paired run does not report.
 
-A change that is meant to alter what the daemon does names it here, and the entry goes when the
-older checkout is compared no more. Each entry is a field of the step, a regular expression, its
-replacement, and the reason. Both sides are rewritten by it before they are compared. Fields are
-`mode`, `reason`, `lines` and `odometry`; for the last two the whole text of the step's is taken.
+A change that is meant to alter the daemon's behaviour is named here. Its entry goes when the older
+checkout is compared no more. The present lists belong to the commit before the simulator; the
+section on the simulator in `tests/README.md` says how to compare with it.
 
-A change that alters everything behind an event cannot be rewritten. `LEFT_OUT` takes such events
-out of the plans: a field, its value and the reason. `DEFAULTS` does so for settings.
+- `DIFFERENCES` rewrites both sides before they are compared. Each entry is a field of the step, a
+  regular expression, its replacement, and the reason. Fields are `mode`, `reason`, `lines` and
+  `odometry`; for the last two the whole text of the step's is taken.
+- `CORRECTED` names the changes that `before_the_simulator.patch` brings to the older checkout.
+- `LEFT_OUT` takes events out of the plans if no entry above is possible: a field of the event, its
+  value and the reason.
 """
 
 from __future__ import annotations
 
+REWORDED: tuple[tuple[str, str], ...] = (
+    (" is new here: ", " is new: "),
+    (
+        r"come too late, by more than ([\d.]+) s: the network holds them up",
+        r"arrive more than \1 s too late: the network delays them",
+    ),
+    ("; if this goes on, check the network, then restart the sender", ""),
+    ("nothing but zeros", "only zeros"),
+    ("is kept waiting", "must wait"),
+    (r"sends none: (.*) has tools that", r"never sends one; \1 lists tools that"),
+    ("has the higher priority: until", "has priority: wait until"),
+    (
+        "of the same priority, came first: until",
+        "has the same priority and came first: wait until",
+    ),
+    (", has the same priority", " has the same priority"),
+    (
+        "more of its senders: the first until it is",
+        "more of its senders: wait until the first one is",
+    ),
+    (r"\(told (.*), saw ", r"(commanded \1, measured "),
+    (
+        "look at cable, motor and encoder; if it is motor d, at",
+        "check cable, motor and encoder, and for motor d also",
+    ),
+    (
+        "look at the motor's leads, its encoder's A and B, and",
+        "check the motor's leads, the A and B lines of its encoder, and",
+    ),
+    ("stopped at the start, because", "stopped when the daemon started, because"),
+    (
+        r"what else runs here\? \(`top`; as a service it goes first\)",
+        "which other program uses the processor? "
+        "(`top` shows it; as a service acsard has priority)",
+    ),
+    ("heard nothing of the", "received nothing from the"),
+    ("and heard too little for a link", "and received too little for a link"),
+    (
+        "sends nothing: its driver accepts no bytes; replug the adapter",
+        "sends nothing, because its driver accepts no bytes: "
+        "unplug the adapter and plug it in again",
+    ),
+    (
+        "come damaged; asking it for the check again",
+        "arrive damaged; the daemon asks it for the check again",
+    ),
+    ("nothing at all heard", "nothing was received"),
+    (
+        "is it powered, is this its port and mcu.baud_rate its own, are TX and RX crossed",
+        "has the board power, is this its port, does mcu.baud_rate fit, are TX and RX swapped",
+    ),
+    (
+        "does it cut its lines short, or leave out their ends",
+        "does the board cut its lines short, or omit the line ends",
+    ),
+    (
+        "what disturbs the cable, or prints on it too",
+        "does something disturb the cable, or print on it too",
+    ),
+    ("is mcu.baud_rate the board's own", "does mcu.baud_rate fit the board"),
+    ("look at cable, ground and baud rate", "check cable, ground and baud rate"),
+    (
+        "if its lines are further apart than ours, say so by mcu.reply_period",
+        "if the board sends its lines less often than the daemon, set mcu.reply_period",
+    ),
+    ("`acsard mcu check` looks closer", "`acsard mcu check` finds out more"),
+    (
+        "bytes heard but no line end, the last `",
+        "bytes received but no line end; the last bytes are `",
+    ),
+    (r"\b1 bytes received", "1 byte received"),
+    ("lines heard, ", "lines received, "),
+    (r"\b1 lines received", "1 line received"),
+    ("good, all good, but too few", "good, all of them good, but too few"),
+    ("received, all good, but too few", "received, all of them good, but too few"),
+    (
+        "apart: too seldom for a link by any setting; firmware that reports by its own clock "
+        r"must do so every ([\d.]+) s or sooner",
+        "apart, which is too seldom for any setting; firmware that reports by its own clock must "
+        r"send a line at least every \1 s",
+    ),
+    (
+        "what is sent comes back: TX and RX are joined, or the terminal echoes, or the RS-485 "
+        "adapter, or the board reports the speeds it was sent, not those it measures; mend that, "
+        "then replug it",
+        "the daemon's own lines come back: TX and RX are connected to each other, or a terminal or "
+        "the RS-485 adapter echoes, or the board reports the commanded speeds instead of "
+        "the measured ones; fix that, then unplug the board and plug it in again",
+    ),
+    (
+        "answered with a check before and now does not: its replies are damaged on the way "
+        r"\(look at cable and baud rate\), or it has other firmware \(then replug it\)",
+        "answered with a check before and now answers without: either its replies are damaged "
+        "(check cable and baud rate), or it runs other firmware "
+        "(then unplug it and plug it in again)",
+    ),
+    (
+        'answers without a check, and mcu.link_check = "require" drives only with one: give it '
+        "firmware that has it, or write mcu",
+        'answers without a check, but mcu.link_check = "require" lets the robot drive '
+        "only with one: install firmware that has the check, or write mcu",
+    ),
+)
+"""Words of reasons that mean the same: the old ones as a regular expression, and the new ones."""
+
 DIFFERENCES: tuple[tuple[str, str, str, str], ...] = (
-    (
-        "reason",
-        "; if this goes on, check the network, then restart the sender",
-        "",
-        "a late command says what to do",
-    ),
-    (
-        "reason",
-        r"switched off by .* at [^;]*;",
-        "switched off;",
-        "each deactivate is a new latch, so the reason names the last one and not the first",
-    ),
+    ("mode", "^leaving$", "shutdown", "the mode of a daemon that goes down has another name"),
+    *(("reason", old, new, "the same in other words") for old, new in REWORDED),
 )
 
-LEFT_OUT: tuple[tuple[str, object, str], ...] = (
-    ("verb", "activate", "an activate without the latch's number waits for 2 s"),
-    ("verb", "deactivate", "without an activate behind it the robot would stand for the whole run"),
-    ("do", "restart", "a clear without the latch's number waits for 2 s after a start"),
-    ("fault", ["echo"], "an echo is found up to seven lines later"),
-)
+MOTION, LINK, SIMULATOR = "acsard/drive/", "acsard/mcu/", "acsard/sim/"
 
-DEFAULTS: tuple[tuple[str, str, str], ...] = (
+CORRECTED: tuple[tuple[str, tuple[str, ...]], ...] = (
     (
-        "odometry",
-        "gyro",
-        "the simulated robot moves in other steps, so its gyro's last bits differ",
+        "a kept stop waits for a clear without a number by the monotonic clock, not the wall clock",
+        (MOTION + "lifecycle.py", "acsard/robot.py"),
+    ),
+    (
+        "each deactivate is a new latch, and an activate can name the latch that it releases",
+        (
+            MOTION + "lifecycle.py",
+            "acsard/incoming/commands.py",
+            "acsard/messages/json_schema.py",
+            "acsard/messages/report.py",
+            "acsard/messages/schema.py",
+            "acsard/robot.py",
+            "acsard/values.py",
+        ),
+    ),
+    (
+        "an echo is found up to seven lines later, and also of checked lines without samples",
+        (LINK + "echo.py", LINK + "negotiation.py", LINK + "session.py"),
+    ),
+    (
+        "a clock is proven by fewer rules, its proof does not end inside a burst, and a silence "
+        "does not make a steady clock forget its lowest delay",
+        (MOTION + "freshness.py",),
+    ),
+    (
+        "a speed that came before a zero of an unproven clock never counts by that zero",
+        (MOTION + "neutral.py",),
+    ),
+    (
+        "commands that were dropped unread end the wait of a shared identity for its zero",
+        (
+            MOTION + "neutral.py",
+            MOTION + "arbiter.py",
+            "acsard/incoming/bus.py",
+            "acsard/runtime/control_loop.py",
+            "tests/scenarios/world.py",
+        ),
+    ),
+    (
+        "lines of a backlog are as far apart as their stamps",
+        (LINK + "clock_of_reports.py",),
+    ),
+    (
+        "replies that are lost soon after the board became faster cost no distance",
+        (LINK + "clock_of_answers.py",),
+    ),
+    (
+        "after a second without an answer a zero counts only once the board answers again",
+        (LINK + "session.py",),
+    ),
+    (
+        "the simulated robot moves in fewer steps, so the last bits of its gyro differ",
+        (
+            SIMULATOR + "fake_mcu.py",
+            SIMULATOR + "faults.py",
+            SIMULATOR + "protocol.py",
+            SIMULATOR + "vehicle.py",
+            MOTION + "path.py",
+        ),
     ),
 )
+"""Each correction that the patch brings to the older checkout, with the files that it changes."""
+
+LEFT_OUT: tuple[tuple[str, object, str], ...] = ()

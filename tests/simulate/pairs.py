@@ -17,17 +17,20 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from tests.simulate.differences import DEFAULTS, DIFFERENCES, LEFT_OUT
+import msgspec
+
+from tests.simulate.differences import CORRECTED, DIFFERENCES, LEFT_OUT
 from tests.simulate.plan import Plan, made
 
 OURS = Path(__file__).parents[2]
 
 BOOT = """
 import importlib.util, sys
-tree, ours = sys.argv[1:3]
+tree, ours, adapter = sys.argv[1:4]
 sys.path.insert(0, tree)
 import acsard
 sys.path[0] = ours
@@ -35,7 +38,7 @@ import tests, tests.scenarios, tests.simulate
 from pathlib import Path
 if (Path(tree) / "tests/scenarios/world.py").exists():
     tests.scenarios.__path__[:] = [str(Path(tree) / "tests/scenarios")]
-product = Path(tree) / "tests/simulate/product.py"
+product = Path(adapter or Path(tree) / "tests/simulate/product.py")
 if product.exists():
     spec = importlib.util.spec_from_file_location("tests.simulate.product", product)
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
@@ -50,17 +53,19 @@ Step = dict[str, Any]
 
 def serve(where: Path) -> None:
     """Answer plans on the standard input until it ends."""
-    from tests.simulate.actors import collect_seldom, played
+    from tests.simulate.actors import collect_seldom
+    from tests.simulate.unjudged import Unjudged
 
     collect_seldom()
     print(json.dumps(str(where)), flush=True)
     for line in sys.stdin:
         asked = json.loads(line)
         trace = Trace(asked.get("second"))
-        result = played(asked["plan"], trace.step)
+        run = Unjudged(asked["plan"], trace.step)
+        error = run.played()
         answer = {
-            "hashes": trace.hashes, "steps": trace.steps, "finding": result.finding,
-            "simulated_s": result.simulated_s,
+            "hashes": trace.hashes, "steps": trace.steps, "error": error,
+            "simulated_s": run.simulated_s,
         }  # fmt: skip
         print(json.dumps(answer), flush=True)
 
@@ -77,7 +82,8 @@ class Trace:
         """Take the results of a step."""
         step = rewritten(step)
         second = step["at"] // 10**9
-        self._hash.update(json.dumps(step).encode())
+        # msgspec writes each float so that it can be read back to the last bit.
+        self._hash.update(msgspec.json.encode(step))
         while len(self.hashes) <= second:
             self.hashes.append("")
         # The hash goes on from second to second, so equal ends mean equal runs.
@@ -92,33 +98,32 @@ def rewritten(step: Step, differences: tuple[tuple[str, str, str, str], ...] = D
     for field, pattern, replacement, _ in differences:
         value = changed[field]
         text = value if isinstance(value, str) else json.dumps(value)
-        changed[field] = re.sub(pattern, replacement, text)
+        changed[field] = _replaced(pattern, replacement, text)
     return changed
 
 
+@lru_cache(4096)
+def _replaced(pattern: str, replacement: str, text: str) -> str:
+    return re.sub(pattern, replacement, text)
+
+
 def comparable(plan: Plan, left_out: tuple[tuple[str, object, str], ...] = LEFT_OUT) -> Plan:
-    """Return a plan without the events and settings by which the sides are meant to differ."""
+    """Return a plan without the events by which the sides are meant to differ."""
     events = plan["events"]
     for field, value, _ in left_out:
         events = [event for event in events if event.get(field) != value]
-    config = {
-        table: {
-            key: value
-            for key, value in keys.items()
-            if all((table, key) != default[:2] for default in DEFAULTS)
-        }
-        for table, keys in plan["config"].items()
-    }
-    return plan | {"events": events, "config": config}
+    return plan | {"events": events}
 
 
 class Side:
     """The process that plays plans on one checkout."""
 
-    def __init__(self, tree: Path) -> None:
+    def __init__(self, tree: Path, adapter: Path | None = None) -> None:
+        """Start the process. `adapter` stands for the tree's own `product.py`."""
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         self._process = subprocess.Popen(
-            [sys.executable, "-c", BOOT, str(tree.resolve()), str(OURS)],
+            [sys.executable, "-c", BOOT, str(tree.resolve()), str(OURS),
+             str(adapter.resolve()) if adapter else ""],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=OURS,
         )  # fmt: skip
         self.package = Path(self._read())
@@ -151,19 +156,19 @@ class Side:
 class Pair:
     """Two sides that play the same plans."""
 
-    def __init__(self, ours: Path, other: Path) -> None:
-        self.sides = Side(ours), Side(other)
+    def __init__(self, ours: Path, other: Path, adapter: Path | None = None) -> None:
+        self.sides = Side(ours), Side(other, adapter)
 
     def differs(self, plan: Plan) -> tuple[str, float]:
         """Return the first difference in words, "" for none, and the simulated s."""
         with ThreadPoolExecutor(2) as pool:
             a, b = pool.map(lambda side: side.play(plan), self.sides)
-        if a["hashes"] == b["hashes"] and a["finding"] == b["finding"]:
+        if a["hashes"] == b["hashes"] and a["error"] == b["error"]:
             return "", a["simulated_s"]
         both = zip(a["hashes"], b["hashes"], strict=False)
         second = next((n for n, (x, y) in enumerate(both) if x != y), None)
         if second is None:
-            return f"ends differ: {a['finding']!r} and {b['finding']!r}", a["simulated_s"]
+            return f"ends differ: {a['error']!r} and {b['error']!r}", a["simulated_s"]
         steps = [side.play(plan, second)["steps"] for side in self.sides]
         return first_difference(*steps), a["simulated_s"]
 
@@ -184,11 +189,16 @@ def first_difference(ours: list[Step], theirs: list[Step]) -> str:
 
 
 def compare(
-    tree: Path, seed: int, seconds: float, workers: int, show: Callable[[str], None] = print
+    tree: Path,
+    seed: int,
+    seconds: float,
+    workers: int,
+    adapter: Path | None = None,
+    show: Callable[[str], None] = print,
 ) -> int:
     """Compare this checkout with another one for so many s; return 1 if they differ."""
     began, differing, runs, total = time.perf_counter(), 0, 0, 0.0
-    pairs = [Pair(OURS, tree) for _ in range(max(1, workers // 2))]
+    pairs = [Pair(OURS, tree, adapter) for _ in range(max(1, workers // 2))]
     try:
         with ThreadPoolExecutor(len(pairs)) as pool:
             while total < seconds:
@@ -206,6 +216,6 @@ def compare(
     show(
         f"{runs} pairs from seed {seed}, {total / 3600:.2f} h simulated on both sides in "
         f"{time.perf_counter() - began:.0f} s, {differing} differ; "
-        f"{len(DIFFERENCES + LEFT_OUT + DEFAULTS)} deliberate differences are listed"
+        f"{len(DIFFERENCES) + len(CORRECTED) + len(LEFT_OUT)} deliberate differences are listed"
     )
     return min(1, differing)

@@ -18,13 +18,15 @@ from acsard.core.values import Latches
 from tests.scenarios.world import START
 from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
-from tests.simulate.actors import Result, played
+from tests.simulate.actors import Result, Run, played
+from tests.simulate.differences import CORRECTED, REWORDED
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, problems
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS, Message, messages, sample
+from tests.simulate.unjudged import Unjudged
 
 PLAIN = next(p for p in map(made, range(99)) if "odd configuration" not in p["kinds"])
 EMPTY: Plan = {
@@ -344,6 +346,39 @@ def test_an_event_that_is_left_out_of_pairs_is_in_no_plan_of_theirs() -> None:
     assert {event["do"] for event in one["events"]} - {event["do"] for event in less["events"]} == {
         "restart"
     }
+
+
+def test_a_pair_goes_on_behind_a_broken_promise_and_ends_at_an_exception_of_the_product(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def broken(self: Witness, *_: object) -> None:
+        raise BrokenError("a made-up promise", 0, "")
+
+    monkeypatch.setattr(Witness, "step", broken)
+    assert "a made-up promise" in played(quiet()).finding
+    trace = Trace()
+    assert Unjudged(quiet(), trace.step).played() == ""
+    # The last step is in the second in which the plan ends.
+    assert len(trace.hashes) == START.mono_ns // NS + quiet()["seconds"] + 1
+
+    def fails(self: Run, true_ns: int) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(Run, "run_to", fails)
+    assert Unjudged(quiet()).played() == "ZeroDivisionError: division by zero"
+
+
+def test_the_list_names_each_file_that_the_patch_for_the_older_checkout_changes() -> None:
+    patch = (OURS / "tests" / "simulate" / "before_the_simulator.patch").read_text("utf-8")
+    changed = set(re.findall(r"^diff --git a/(\S+) b/", patch, re.MULTILINE))
+    assert changed == {path for _, paths in CORRECTED for path in paths}
+
+
+def test_reworded_phrases_keep_the_new_words() -> None:
+    # A replacement that another entry changes again would be the same on one side only by chance.
+    for _, new in REWORDED:
+        text = new.replace(r"\1", "7")
+        assert pairs.rewritten({"mode": "ready", "reason": text})["reason"] == text
 
 
 def test_a_listed_difference_is_taken_out_on_both_sides() -> None:

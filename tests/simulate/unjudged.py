@@ -1,0 +1,58 @@
+"""Plays a plan without the judges, for a comparison with another checkout.
+
+The judges know the newest promises only, and an older product breaks some of them. So a pair
+compares what both products do, and judges neither.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.simulate.actors import Run
+from tests.simulate.product import Seen
+from tests.simulate.roads import NS, Message, sample
+
+
+class Unjudged(Run):
+    """A run that hands each step to `log` and judges nothing."""
+
+    def played(self) -> str:
+        """Play the plan without the lawful drive at its end. Return an exception as text, or ""."""
+        try:
+            self._begin()
+            self.run_to(int(self.plan["seconds"] * NS))
+        except Exception as error:  # noqa: BLE001 - the product may raise any
+            return f"{type(error).__name__}: {error}"
+        return ""
+
+    @property
+    def simulated_s(self) -> float:
+        """The time that the product simulated, without suspends."""
+        return (self.true_ns - self.slept_ns) / NS
+
+    def deliver(self, sender: dict[str, Any], message: Message) -> None:
+        """Hand a message to the daemon, if there is one."""
+        if self.product.alive:
+            at_ns = self._arrival(message.arrives_ns)
+            one = sample(sender, message, self.plan["config"], self.product.wall_ns)
+            self.product.deliver(at_ns, one.key, one.payload, **one.options)
+
+    def _fed(self, at_ns: int, data: bytes) -> None: ...
+
+    def _look(self) -> None: ...
+
+    def _take_answers(self) -> None:
+        for ticket, _ in self.product.replies():
+            self._calls.pop(ticket, None)
+
+    def _judge(self, seen: Seen) -> None:
+        if self._calls:
+            self._take_answers()
+        if self.log is not None:
+            self.log(
+                {
+                    "at": seen.at_ns, "mode": seen.mode, "reason": seen.reason,
+                    "lines": [[at, line.decode("latin-1")] for at, line in seen.lines],
+                    "odometry": seen.estimates,
+                }
+            )  # fmt: skip
