@@ -22,6 +22,9 @@ EARLY_NS = 60_000_000
 BURST_NS = 1_000_000
 """Messages within this time count as one, with the lowest of their delays."""
 
+REMEMBERED = 1000
+"""The robot remembers 1024 clocks. A sender that pauses while so many new names command is new."""
+
 
 class Wish:
     """A command that arrived, and what the omniscient view thinks of it."""
@@ -54,6 +57,8 @@ class Clock:
         self.stamp_ns = 0
         self.followed = False
         """The robot has followed one of its commands, so the daemon knows its delays."""
+        self.names = 0
+        """Number of clocks that the robot had met at its last command."""
         self.loose = False
         """It was adjusted or its sender paused: the pages promise nothing about its age."""
 
@@ -86,6 +91,9 @@ class Ages:
         age = arrived_ns - message.sent_ns
         clock = self.clocks.setdefault(sample.clock, Clock())
         clock.loose |= loose
+        if len(self.clocks) - clock.names > REMEMBERED:
+            clock.least_ns, clock.recent = None, deque()
+        clock.names = len(self.clocks)
         foreign = sender["way"] in FOREIGN
         if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
             clock.loose = True

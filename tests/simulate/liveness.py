@@ -76,6 +76,7 @@ class Liveness:
             and not sender["congestion"]
             and sender["jitter"] < 0.01
             and sender["hz"] >= 10.0
+            and sender["hz"] * run.witness.timeout[sender["source"]] / NS > 2.0
             and not any(rival["junk"] or rival["churn"] for rival in rivals)
             and all(priority[r["source"]] < priority[sender["source"]] for r in rivals)
         )
@@ -112,7 +113,9 @@ class Liveness:
         run.counts["largest container"] = max(run.counts["largest container"], size)
         if size > MOST_HELD:
             raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
-        run.run_to(run.true_ns + int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS))
+        boots_ns = int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS)
+        # The last sender of a source keeps it for the source's timeout.
+        run.run_to(run.true_ns + max(boots_ns, *run.witness.timeout.values()))
         for _ in range(3):
             verbs = {"fault": "clear", "stopped": "clear", "inactive": "activate"}
             verb = verbs.get(product.state()["mode"])
@@ -140,6 +143,7 @@ class Liveness:
         if plan["lawful"] != "a new client" and own:
             sender = own[0]
         zeros_s = run.witness.pause_ns / NS + 1.0
+        step_ns = min(50_000_000, run.witness.timeout[sender["source"]] // 4)
         # A share above 1 shows whether the limits of before a restart are still in force.
         share = plan.get("share", 0.5)
         speed = share * run.witness.limits["linear_speed"]
@@ -157,7 +161,7 @@ class Liveness:
             delay_ns = int(sender["delay"] * NS)
             message = Message(now_ns, now_ns + delay_ns, v, w, stamp_ns, number, "")
             run.at(now_ns + delay_ns, lambda m=message: run.deliver(sender, m))  # type: ignore[misc]
-            run.run_to(now_ns + 50_000_000)
+            run.run_to(now_ns + step_ns)
         mode, reason = run.witness.mode, run.witness.reason
         moving = run.true_ns - run.moved_ns < NS // 5
         if mode != "driving" or not moving:

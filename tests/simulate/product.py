@@ -20,6 +20,8 @@ from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import encode as encode_message
+from acsard.core.simulator.baud_mismatch import garbled
+from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
 from acsard.core.values import Event, Instant, Latches, Outputs, Received
@@ -256,8 +258,11 @@ class Product:
     def ask(
         self, at_ns: int, service: str, ticket: int, payload: bytes, via: Any, attachment: bytes
     ) -> None:
-        """Hand over a service call. A stop also goes ahead of its query, as on the real bus."""
-        key = f"srv/{service}"
+        """Hand over a service call. A stop also goes ahead of its query, as on the real bus.
+
+        `service` is a service, or a parameter service of ROS, which has "/" in its name.
+        """
+        key = service if "/" in service else f"srv/{service}"
         if service == "stop":
             self.deliver(at_ns, "stop", b"", via=via, attachment=attachment)
         query = Query(ticket, key, key, "", payload, "", at_ns, via, attachment)
@@ -284,11 +289,32 @@ class Product:
         """Have the board misbehave in these ways, and in no others, from now on."""
         self._lasting.close()
         self._faults = faults
+        mcu, bauds = self._world.mcu, [values[0] for name, values in faults if name == "wrong_baud"]
         for name, values in faults:
+            if name == "endless":
+                self._lasting.enter_context(mcu._with(ending=""))
+                continue
             # The daemon's TX is joined to its RX, so nothing of the board arrives.
             fault = "mute" if name == "echo" else name
-            self._lasting.enter_context(getattr(self._world.mcu, fault)(*values))
+            self._lasting.enter_context(getattr(mcu, fault)(*values))
+        self._garble(mcu, bauds[-1] if bauds else self._config.mcu.baud_rate)
         self.echo = any(name == "echo" for name, _ in faults)
+
+    def _garble(self, mcu: FakeMcu, baud_rate: int) -> None:
+        """Put a wire to this board on which its end has this baud rate."""
+        ours, kind = self._config.mcu.baud_rate, type(mcu)
+        vars(mcu).pop("receive", None)
+        vars(mcu).pop("advance", None)
+        if baud_rate == ours:
+            return
+
+        def receive(at_ns: int, data: bytes) -> None:
+            kind.receive(mcu, at_ns, garbled(data, ours, baud_rate))
+
+        def advance(at_ns: int) -> bytes:
+            return garbled(kind.advance(mcu, at_ns), baud_rate, ours)
+
+        vars(mcu).update(receive=receive, advance=advance)
 
     def reset(self, deaf_ns: int) -> None:
         self._world.mcu.reset(self.now_ns, deaf_ns)

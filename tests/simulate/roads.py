@@ -227,8 +227,10 @@ def _cdr(
 def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
     drive = config.get("drive", {})
     radius = drive.get("wheel_radius", 0.05)
-    half = w * drive.get("wheel_separation", 0.3) / 2
-    left, right = (v - half) / radius, (v + half) / radius
+    track = drive.get("wheel_separation", 0.3) * drive.get("wheel_separation_multiplier", 1.0)
+    half = w * track / 2
+    left = (v - half) / (radius * drive.get("left_wheel_radius_multiplier", 1.0))
+    right = (v + half) / (radius * drive.get("right_wheel_radius_multiplier", 1.0))
     speeds = [1.0, -1.0, 1.0, -1.0] if cancels else [right, left, left, right]
     sides = ("front_right", "front_left", "rear_left", "rear_right")
     names = [f"{side}_wheel_joint" for side in sides]
@@ -236,11 +238,29 @@ def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
     return msgspec.msgpack.encode({"name": names, "velocity": speeds})
 
 
-def read_reply(reply: bytes, via: str) -> tuple[bool, str]:
-    """Return whether a call worked, and the answer in words."""
+def parameters(settings: dict[str, float]) -> bytes:
+    """Return a request of ROS in CDR that sets these parameters."""
+    out = struct.pack("<I", len(settings))
+    for name, value in settings.items():
+        text = name.encode() + b"\0"
+        out += b"\0" * (-len(out) % 4) + struct.pack("<I", len(text)) + text
+        out += b"\3\0"  # the type of a double, and no bool
+        out += b"\0" * (-len(out) % 8) + struct.pack("<qd", 0, value)
+        # An empty string is a length of 1 and a NUL; then come five empty lists.
+        out += struct.pack("<IB3x5I", 1, 0, 0, 0, 0, 0, 0)
+    return b"\0\1\0\0" + out
+
+
+def read_reply(reply: bytes, via: str, listed: bool = False) -> tuple[bool, str]:
+    """Return whether a call worked, and the answer in words.
+
+    `listed` is true for a reply of ROS with a list of results, of which the first is read.
+    """
     if via == "native":
         found = msgspec.json.decode(reply)
         return found["success"], found["message"]
+    if listed:
+        reply = reply[4:]
     # CDR: a bool, three bytes to the next multiple of four, and a string with its length.
     length = struct.unpack_from("<I", reply, 8)[0]
     return bool(reply[4]), reply[12 : 12 + length - 1].decode()
