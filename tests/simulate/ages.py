@@ -1,9 +1,10 @@
 """What is known of each sender: its zeros, and how old a command may be by the true clock.
 
-The robot cannot see a true age: it compares delays by two clocks. `deploy/clients/README.md` says
-what it promises all the same, and this module allows exactly that: the timeout beyond the lowest
-delay that the robot has seen, for a foreign clock 1 s and 1 s a minute more, and for a sender that
-is new any delay that has looked constant for the time of a proof.
+The robot cannot see a true age, because it compares delays by two clocks. This module allows what
+`deploy/clients/README.md` promises and no more. A command is fresh if its true age exceeds the
+lowest delay that the robot has seen by at most the timeout. For a foreign clock, 1 s is allowed in
+addition, and 1 s more for each minute. The robot knows no lowest delay of a new sender, so it
+accepts any delay of that sender that has stayed constant for the proof time.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class Clock:
         self.names = 0
         """Number of clocks that the robot had met at its last command."""
         self.loose = False
-        """It was adjusted or its sender paused: the pages promise nothing about its age."""
+        """It was adjusted, or its sender paused or stamps falsely. The pages promise nothing about
+        the age of its commands."""
 
 
 class Ages:
@@ -97,7 +99,7 @@ class Ages:
         foreign = sender["way"] in FOREIGN
         if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
             clock.loose = True
-        if foreign and sender["clock"]:
+        if (foreign and sender["clock"]) or sender.get("bad_stamps"):
             clock.loose = True
         clock.stamp_ns = message.stamp_ns
         recent = clock.recent

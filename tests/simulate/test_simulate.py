@@ -90,6 +90,20 @@ def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_p
     assert re.search(r"^  way +\w+ \d", out, re.MULTILINE)
 
 
+def test_the_plan_of_each_finding_is_kept_and_the_first_ones_are_shrunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(one: Plan) -> Result:
+        return Result(one["seed"], "so", "a made-up promise", int(2 * NS), 2.0, 0.1, Counter())
+
+    monkeypatch.setattr(shrink, "played", broken)
+    seeds = range(main.MOST_SHRUNK + 1)
+    main.keep_plans([broken({"seed": seed}) for seed in seeds], tmp_path / "findings")
+    kept = [shrink.load(tmp_path / "findings" / f"{seed}.json") for seed in seeds]
+    assert [one["senders"] for one in kept[:-1]] == [[]] * main.MOST_SHRUNK
+    assert kept[-1] == json.loads(json.dumps(made(main.MOST_SHRUNK)))
+
+
 # the witness
 
 
