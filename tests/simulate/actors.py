@@ -399,6 +399,9 @@ class Run:
 
     def _restart(self, event: dict[str, Any], after_ns: int) -> None:
         product, witness = self.product, self.witness
+        if event.get("stop"):
+            product.stop_unseen()
+            witness.stops.append(self.true_ns)
         product.end(event["way"])
         self._take_answers()
         for call, arrived_ns, _ in self._calls.values():
@@ -410,8 +413,12 @@ class Run:
         def start() -> None:
             self.resumed_ns = product.now_ns
             if product.disk.full:
-                # It stands until a clear by somebody who looked after the start.
+                # The daemon starts stopped, because it cannot write the latch file. A clear
+                # releases this stop only if its sender has read `state` after the start.
                 witness.stops.append(self.true_ns)
+            if "damage" in event:
+                product.disk.damage(event["damage"])
+                witness.file_is_damaged(self.true_ns)
             product.start()
             self.liveness.event()
             self._linked = False

@@ -22,6 +22,7 @@ KINDS = (
     "pushes", "odd configuration",
     "other dialect", "unreadable board", "extreme timing", "other vehicle",
     "stop storms", "ros parameters", "typed latches",
+    "crashes", "damaged file", "kills on a full disk", "sender bursts", "bad stamps",
 )  # fmt: skip
 """The kinds of trouble that a run may have."""
 
@@ -316,6 +317,8 @@ def _sender(
         "phases": _phases(dice, seconds, lawful),
         "congestion": [],
         "clock": [],
+        "bursts": [],
+        "bad_stamps": 0.0,
         "junk": 0.0,
         "churn": False,
         "loss": 0.0,
@@ -353,6 +356,14 @@ def _sender(
             sender["congestion"].append([round(t, 3), round(t + length, 3), shape, round(size, 3)])
             t += length + dice.uniform(1.0, 15.0)
         sender["phases"] = _tried_again(dice, sender["phases"], sender["congestion"])
+    if "sender bursts" in kinds:
+        for _ in range(dice.randrange(1, 4)):
+            t = dice.uniform(0.0, seconds)
+            sender["bursts"].append(
+                [round(t, 3), round(t + dice.uniform(0.05, 1.0), 3), dice.choice((200, 500, 1000))]
+            )
+    if "bad stamps" in kinds and dice.random() < 0.5:
+        sender["bad_stamps"] = dice.choice((0.02, 0.3, 1.0))
     if "sender clocks" in kinds and way not in ("client", "page"):
         t = dice.uniform(2.0, 30.0)
         while t < seconds:
@@ -480,6 +491,9 @@ def _events(
             "suspend",
             **{"for": round(dice.choice((0.5, 5.0, 60.0, 3600.0)) * dice.uniform(0.5, 1.0), 3)},
         )
+        if dice.random() < 0.3:
+            again = round(at + dice.choice((0.03, 0.3, 3.0)) * dice.uniform(1.0, 2.0), 3)
+            once(again, "suspend", **{"for": round(dice.uniform(0.5, 60.0), 3)})
     for at in add("clock steps", 40):
         once(at, "wall", by=round(dice.choice((0.3, 3.0, 1e5)) * dice.uniform(-1.0, 1.0), 3))
     for at in add("restarts", 60):
@@ -491,6 +505,22 @@ def _events(
         )
     for at in add("full disk", 60):
         once(at, "disk", **{"for": round(dice.uniform(1.0, 30.0), 3)})
+    for at in add("crashes", 60):
+        once(
+            at,
+            "restart",
+            way=dice.choice(("crash before the robot", "crash behind the robot")),
+            stop=dice.random() < 0.5,
+            **{"for": round(dice.uniform(0.2, 3.0), 3)},
+        )
+    for at in add("damaged file", 90):
+        once(
+            at,
+            "restart",
+            way=dice.choice(("kill", "term")),
+            damage=dice.choice(("cut", "zeros", "version")),
+            **{"for": round(dice.uniform(0.2, 3.0), 3)},
+        )
 
     def call(at: float, verb: str, **more: Any) -> None:
         lossy = "lost calls" in kinds
@@ -510,6 +540,12 @@ def _events(
             call(after, "clear", named=dice.random() < 0.7)
         if dice.random() < 0.8:
             call(round(at + dice.uniform(2.0, 8.0), 3), "clear", named=True)
+    for at in add("kills on a full disk", 60):
+        once(at, "disk", **{"for": round(dice.uniform(1.0, 5.0), 3)})
+        late = round(at + dice.uniform(0.0, 1.0), 3)
+        call(late, dice.choice(("stop", "clear", "deactivate", "activate")), named=True)
+        killed = round(late + 0.01 + dice.choice((0.0, 0.02, 0.2)) * dice.random(), 3)
+        once(killed, "restart", way="kill", **{"for": round(dice.uniform(0.2, 5.0), 3)})
     if "lying board" in kinds:
         for at in [round(dice.uniform(1.0, seconds), 3) for _ in range(int(seconds / 10))]:
             call(at, "clear", named=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import msgspec
@@ -35,6 +35,7 @@ from acsard.daemon.latch_rules import (
     unreadable,
     unwritable,
 )
+from acsard.daemon.pacing import Period
 from tests.scenarios.world import START, World
 
 START_NS = START.mono_ns
@@ -87,6 +88,10 @@ def _plain(found: Measured) -> Estimate:
     )
 
 
+class CrashError(Exception):
+    """A defect of the daemon, as it were."""
+
+
 class Disk:
     """The latch file: what a process that is killed now leaves for the next one."""
 
@@ -115,6 +120,16 @@ class Disk:
         if not self.full:
             self._data, self._written = encode("acsar", latches), latches
 
+    def damage(self, how: str) -> None:
+        """Damage the file: `cut` it, fill it with `zeros`, or give it another `version`."""
+        match how:
+            case "cut":
+                self._data = self._data[: len(self._data) * 2 // 3]
+            case "zeros":
+                self._data = bytes(len(self._data))
+            case "version":
+                self._data = self._data.replace(b'"format": 1', b'"format": 2')
+
     def end(self) -> None:
         """Note that the daemon has ended: it writes nothing any more."""
         self._running = False
@@ -135,6 +150,8 @@ class Disk:
             found = stopped(Latches(), unreadable("FILE", str(error)), now)
         self._running, self.trouble = True, ""
         self._newest = self._written = found
+        if not self.full:
+            self._data = encode("acsar", found)  # the daemon tries out whether it can write
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
             self._newest = doubted(found, at_start(self.trouble), now)
@@ -254,6 +271,11 @@ class Product:
                     self.dropped += 1
         if at_ns == world.now_ns and (world._listens or key == "stop"):
             world._step()
+
+    def stop_unseen(self) -> None:
+        """Have a stop arrive that no step has taken yet."""
+        arrival = Arrival("stop", True, b"", "", self.now_ns, None, "", "native", b"", self.wall_ns)
+        self._world.bus.arrivals.insert(0, arrival)
 
     def ask(
         self, at_ns: int, service: str, ticket: int, payload: bytes, via: Any, attachment: bytes
@@ -376,8 +398,10 @@ class Product:
         self._world.wall_offset_ns += int(seconds * 1e9)
 
     def end(self, way: str) -> None:
-        """End the daemon by SIGTERM (`term`) or at once (`kill`)."""
+        """End the daemon by SIGTERM (`term`), by an exception in a step, or at once (`kill`)."""
         world = self._world
+        if way.startswith("crash"):
+            self._crash(way)
         if way == "term":
             world.loop.shutting_down = True
             for _ in range(60):
@@ -391,6 +415,21 @@ class Product:
             world.port.mcu.receive(world.now_ns + 50_000_000, b"\r\n" + stop)
         self.disk.end()
         self.alive = False
+
+    def _crash(self, way: str) -> None:
+        """Take a step in which the robot, or the port behind it, raises an exception."""
+        loop, port = self._world.loop, self._world.port
+
+        def broken(*_: Any) -> Any:
+            raise CrashError
+
+        if way == "crash before the robot":
+            vars(loop.robot)["step"] = broken
+        else:
+            vars(port)["offer"] = broken
+        with suppress(CrashError):
+            loop.step(self._world.instant, Period(1, self.now_ns))
+        loop.finish(self._world.instant)
 
     def start(self) -> None:
         """Start the daemon again, on the same board."""

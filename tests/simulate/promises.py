@@ -26,7 +26,10 @@ RAMP_NS = 300_000_000
 """Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
 
 BLOCKED_NS = 500_000_000
-"""After so long without a line that left, the daemon knows it. The board stops itself earlier."""
+"""Time after which the daemon must report that the kernel takes no line.
+
+The board's own watchdog stops the motors before that.
+"""
 
 LATE_NS = 150_000_000
 """Allowed beyond a ramp from the speeds that were seen at its beginning."""
@@ -280,6 +283,12 @@ class Witness:
         self.offs.clear()
         self.fault_ns = None
         self.limits, self.unsure = dict(self.file), set(self.file)
+
+    def file_is_damaged(self, at_ns: int) -> None:
+        """Note that a daemon cannot read the latch file, so it starts stopped."""
+        self.file_is_behind()
+        self.unsure.clear()
+        self.stops.append(at_ns)
 
     # what the daemon showed
 
