@@ -15,7 +15,7 @@ from typing import Any
 from tests.simulate.roads import FOREIGN, NS, Message, Sample
 
 MARGIN_NS = 30_000_000
-"""Allowed beside a time limit: two periods at the lowest rate of the plans and a line's way."""
+"""Allowed beside a time limit, for a line's way. Where periods matter, a limit allows them too."""
 
 EARLY_NS = 60_000_000
 """A delay that falls by more than this is a backlog that pours in."""

@@ -89,7 +89,7 @@ def _plain(found: Measured) -> Estimate:
 
 
 class CrashError(Exception):
-    """A defect of the daemon, as it were."""
+    """The exception that stands for a defect of the daemon."""
 
 
 class Disk:

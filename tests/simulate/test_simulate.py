@@ -22,11 +22,12 @@ from tests.scenarios.world import START
 from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
+from tests.simulate.ages import Ages
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.product import Disk, Seen, problems
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.roads import BAD_STAMPS, NS, Message, messages, parameters, sample
+from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
 
 ODD = {"odd configuration", "extreme timing", "other vehicle", "other dialect"}
 PLAIN = next(p for p in map(made, range(99)) if ODD.isdisjoint(p["kinds"]))
@@ -221,6 +222,26 @@ def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
         one = Message(int(at_s * NS), int(at_s * NS), v, 0.0, 0, 0, kind)
         witness.command(sender, one, sample(sender, one, PLAIN["config"], 0), one.arrives_ns)
     assert (witness.wishes[-1][1].armed_ns == NS) is armed
+
+
+@pytest.mark.parametrize(("names", "obeyed"), [(0, False), (1001, True)])
+def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
+    names: int, obeyed: bool
+) -> None:
+    ages, late_ns = Ages(0), 3 * NS
+    sender = {"way": "client", "delay": 0.001, "clock": []}
+
+    def fresh(clock: str, at_ns: int, delay_ns: int) -> bool:
+        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        by = Sample("cmd/app", b"", {}, clock, False, clock)
+        return ages.fresh(sender, one, by, at_ns, NS // 4, loose=False)
+
+    assert fresh("slow", NS, NS // 1000)
+    for number in range(names):
+        fresh(f"name {number}", 2 * NS, NS // 1000)
+    later = [fresh("slow", 10 * NS + n * NS // 20, late_ns) for n in range(20)]
+    assert not any(later[:5])
+    assert later[-1] is obeyed
 
 
 def test_a_set_that_had_no_answer_may_be_in_force_after_a_restart_or_not() -> None:
