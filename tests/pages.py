@@ -241,6 +241,10 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/coverage run": InCi(".venv/bin/coverage run"),
     ".venv/bin/coverage report": InCi(".venv/bin/coverage report"),
     ".venv/bin/python -m tests.simulate.planted": Shown("takes hours"),
+    ".venv/bin/python -m tests.simulate.planted --again": Elsewhere(
+        "tests/simulate/test_planted.py",
+        "test_a_row_whose_seed_finds_nothing_any_more_is_listed",
+    ),
     ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
     ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(

@@ -22,6 +22,9 @@ from tests.simulate.plan import Plan, made
 
 HERE = Path(__file__).parent
 
+MOST_SHRUNK = 3
+"""Findings whose plans a run shrinks. To shrink one plan takes up to 400 runs of it."""
+
 
 def commit() -> str:
     """Return the commit that is tried, with a + if files were changed since."""
@@ -67,8 +70,14 @@ def table(counts: Counter[str]) -> str:
     return "\n".join(f"  {group:<11} {', '.join(items)}" for group, items in groups.items())
 
 
-def explore(seed: int, hours: float, workers: int, within_s: float = math.inf) -> int:
-    """Play seeds for so many simulated hours; return the number of findings."""
+def explore(
+    seed: int, hours: float, workers: int, within_s: float = math.inf, plans: Path | None = None
+) -> int:
+    """Play seeds for so many simulated hours; return the number of findings.
+
+    The plan of each finding goes into the directory `plans`.
+    """
+    broken: list[Result] = []
     counts, simulated, cpu, findings, runs = Counter[str](), 0.0, 0.0, 0, 0
     began = time.perf_counter()
     for result in results(seed, hours * 3600, workers, within_s):
@@ -79,6 +88,7 @@ def explore(seed: int, hours: float, workers: int, within_s: float = math.inf) -
         counts.update(result.counts)
         counts["largest container"] = largest
         if result.finding:
+            broken.append(result)
             findings += 1
             show(result)
     took = time.perf_counter() - began
@@ -88,7 +98,17 @@ def explore(seed: int, hours: float, workers: int, within_s: float = math.inf) -
         f"{took:.0f} s by {workers} workers, {simulated / max(cpu, 1e-9):.0f} times real time per "
         f"core, {findings} findings"
     )
+    if plans is not None:
+        keep_plans(broken, plans)
     return findings
+
+
+def keep_plans(broken: list[Result], where: Path) -> None:
+    """Write the plan of each finding into a directory: the first ones shrunk, the others whole."""
+    for number, result in enumerate(broken):
+        plan = made(result.seed)
+        small = shrink.shrunk(plan, result) if number < MOST_SHRUNK else plan
+        print(shrink.kept(small, result, commit(), where / f"{result.seed}.json"), flush=True)
 
 
 def replay(what: str) -> int:
@@ -128,6 +148,9 @@ def main() -> int:
     parser.add_argument("--replay", metavar="SEED", help="play one seed, or a plan's file, again")
     parser.add_argument("--shrink", metavar="SEED", type=int, help="drop what a finding can spare")
     parser.add_argument("--keep", metavar="NAME", default="", help="with --shrink: into corpus/")
+    parser.add_argument(
+        "--plans", metavar="DIR", type=Path, help="keep the plan of each finding, shrunk"
+    )
     parser.add_argument("--against", metavar="TREE", help="compare with another checkout")
     parser.add_argument(
         "--adapter",
@@ -145,7 +168,8 @@ def main() -> int:
         return pairs.compare(
             tree, options.seed, options.hours * 3600, options.workers, options.adapter
         )
-    return min(1, explore(options.seed, options.hours, options.workers, options.within * 60))
+    within_s = options.within * 60
+    return min(1, explore(options.seed, options.hours, options.workers, within_s, options.plans))
 
 
 if __name__ == "__main__":

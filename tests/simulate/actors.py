@@ -22,9 +22,9 @@ from tests.simulate.liveness import Liveness
 from tests.simulate.plan import Plan
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
-from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.promises import DIALECTS, BrokenError, Witness
 from tests.simulate.reports import Echo, Reports, judge_state
-from tests.simulate.roads import NS, Message, messages, read_reply, sample
+from tests.simulate.roads import NS, Message, messages, parameters, read_reply, sample
 
 
 class Result(NamedTuple):
@@ -82,6 +82,8 @@ class Run:
         self._calls: dict[int, tuple[dict[str, Any], int, Callable[[bytes], None]]] = {}
         """Calls without an answer: the event, its arrival and the function for the answer."""
         self._ticket = 0
+        self._numbers: dict[int, int] = {}
+        """Numbers of latches that operators have read in `state`, each with the last time."""
         self.active: list[tuple[str, tuple[Any, ...]]] = []
         self._fed_ns = 0
         self._ended = b""
@@ -199,14 +201,28 @@ class Run:
         latch, read_ns = None, None
         if event.get("named") and self.product.alive:
             latch, read_ns = self.product.state()["latch"], self.true_ns
+            if "typed" in event:
+                latch, read_ns = self._typed(latch, event["typed"])
+            else:
+                self._numbers.pop(latch, None)
+                self._numbers[latch] = read_ns
         end_ns = int(self.plan["seconds"] * NS)
         due_ns = self.true_ns + int(event["late"] * NS)
-        for extra_ns in (0, 700_000_000) if event["twice"] else (0,):
+        times_ns = [int(n * event.get("gap", 0.0) * NS) for n in range(event.get("times", 1))]
+        for extra_ns in [*times_ns, *([700_000_000] if event["twice"] else [])]:
             if due_ns + extra_ns < end_ns or self.epilogue:
                 self.at(
                     due_ns + extra_ns,
                     lambda due=due_ns + extra_ns: self._ask(event, due, latch, read_ns),  # type: ignore[misc]
                 )
+
+    def _typed(self, latch: int, place: int) -> tuple[int, int]:
+        """Return a number that an operator types by hand, and when a state last had it.
+
+        It is one of the last numbers that another state had, or one that no latch ever had.
+        """
+        older = [known for known in self._numbers.items() if known[0] != latch]
+        return older[-place] if 0 < place <= len(older) else (2**53, -1)
 
     def _ask(
         self,
@@ -223,10 +239,14 @@ class Run:
         at_ns = self._arrival(due_ns)
         true_ns = at_ns - START_NS + self.slept_ns
         via, payload = event["via"], b""
-        if verb in ("set", "set_pose") or latch is not None:
+        service = verb
+        if verb == "set_pose" or latch is not None:
             via = "native"
         if latch is not None:
             payload = json.dumps({"latch": latch}).encode()
+        elif verb == "set" and via != "native":
+            payload = parameters(event["settings"])
+            service = "parameters/set_parameters" + ("_atomically" if event["whole"] else "")
         elif verb == "set":
             payload = json.dumps({"settings": event["settings"]}).encode()
         elif verb == "set_pose":
@@ -247,7 +267,7 @@ class Run:
         ticket = self._ticket
 
         def answered(reply: bytes) -> None:
-            success, text = read_reply(reply, via)
+            success, text = read_reply(reply, via, service.endswith("set_parameters"))
             self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
             if not success:
                 return
@@ -265,7 +285,7 @@ class Run:
                     self.pose.placed()
 
         self._calls[ticket] = event, true_ns, answered
-        product.ask(at_ns, verb, ticket, payload, via, attachment)
+        product.ask(at_ns, service, ticket, payload, via, attachment)
 
     # the board and the host
 
@@ -341,7 +361,8 @@ class Run:
         self.witness.blocked_ns = self.true_ns if blocked else None
 
     def _troubled(self, name: str) -> None:
-        self.witness.troubles[name] = self.true_ns
+        if name not in DIALECTS:
+            self.witness.troubles[name] = self.true_ns
         if name in LIARS:
             self.pose.doubt()
 
@@ -381,6 +402,9 @@ class Run:
 
     def _restart(self, event: dict[str, Any], after_ns: int) -> None:
         product, witness = self.product, self.witness
+        if event.get("stop"):
+            product.stop_unseen()
+            witness.stops.append(self.true_ns)
         product.end(event["way"])
         self._take_answers()
         for call, arrived_ns, _ in self._calls.values():
@@ -392,8 +416,12 @@ class Run:
         def start() -> None:
             self.resumed_ns = product.now_ns
             if product.disk.full:
-                # It stands until a clear by somebody who looked after the start.
+                # The daemon starts stopped, because it cannot write the latch file. A clear
+                # releases this stop only if its sender has read `state` after the start.
                 witness.stops.append(self.true_ns)
+            if "damage" in event:
+                product.disk.damage(event["damage"])
+                witness.file_is_damaged(self.true_ns)
             product.start()
             self.liveness.event()
             self._linked = False
@@ -411,6 +439,8 @@ class Run:
             self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
+        if any(name == "endless" for name, _ in self.active):
+            return
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
         if gap_ns > 9 * NS // 10:
@@ -449,9 +479,9 @@ class Run:
         if witness.pending:
             self.pose.placed()
         for fault in self.active:
-            if fault not in self.lasting:
+            if fault not in self.lasting and fault[0] not in DIALECTS:
                 witness.troubles[fault[0]] = true_ns
-        witness.lies = self.active[len(self.lasting) :]
+        witness.lies = [f for f in self.active[len(self.lasting) :] if f[0] not in DIALECTS]
         if seen.followed_ns is not None:
             clock = self.reports.follows(true_ns, seen.followed_ns)
             if clock:

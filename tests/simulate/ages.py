@@ -1,9 +1,10 @@
 """What is known of each sender: its zeros, and how old a command may be by the true clock.
 
-The robot cannot see a true age: it compares delays by two clocks. `deploy/clients/README.md` says
-what it promises all the same, and this module allows exactly that: the timeout beyond the lowest
-delay that the robot has seen, for a foreign clock 1 s and 1 s a minute more, and for a sender that
-is new any delay that has looked constant for the time of a proof.
+The robot cannot see a true age, because it compares delays by two clocks. This module allows what
+`deploy/clients/README.md` promises and no more. A command is fresh if its true age exceeds the
+lowest delay that the robot has seen by at most the timeout. For a foreign clock, 1 s is allowed in
+addition, and 1 s more for each minute. The robot knows no lowest delay of a new sender, so it
+accepts any delay of that sender that has stayed constant for the proof time.
 """
 
 from __future__ import annotations
@@ -14,13 +15,16 @@ from typing import Any
 from tests.simulate.roads import FOREIGN, NS, Message, Sample
 
 MARGIN_NS = 30_000_000
-"""Allowed beside a time limit: two periods at the lowest rate of the plans and a line's way."""
+"""Allowed beside a time limit, for a line's way. Where periods matter, a limit allows them too."""
 
 EARLY_NS = 60_000_000
 """A delay that falls by more than this is a backlog that pours in."""
 
 BURST_NS = 1_000_000
 """Messages within this time count as one, with the lowest of their delays."""
+
+REMEMBERED = 1000
+"""The robot remembers 1024 clocks. A sender that pauses while so many new names command is new."""
 
 
 class Wish:
@@ -54,8 +58,11 @@ class Clock:
         self.stamp_ns = 0
         self.followed = False
         """The robot has followed one of its commands, so the daemon knows its delays."""
+        self.names = 0
+        """Number of clocks that the robot had met at its last command."""
         self.loose = False
-        """It was adjusted or its sender paused: the pages promise nothing about its age."""
+        """It was adjusted, or its sender paused or stamps falsely. The pages promise nothing about
+        the age of its commands."""
 
 
 class Ages:
@@ -86,10 +93,13 @@ class Ages:
         age = arrived_ns - message.sent_ns
         clock = self.clocks.setdefault(sample.clock, Clock())
         clock.loose |= loose
+        if len(self.clocks) - clock.names > REMEMBERED:
+            clock.least_ns, clock.recent = None, deque()
+        clock.names = len(self.clocks)
         foreign = sender["way"] in FOREIGN
         if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
             clock.loose = True
-        if foreign and sender["clock"]:
+        if (foreign and sender["clock"]) or sender.get("bad_stamps"):
             clock.loose = True
         clock.stamp_ns = message.stamp_ns
         recent = clock.recent

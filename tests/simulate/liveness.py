@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from tests.simulate.actors import Run
 
 MOST_HELD = 1500
-"""Entries of the largest container of a daemon: it remembers 1024 clocks, and more of nothing."""
+"""Most entries that a container of the daemon may have.
+
+The largest one has the clocks of the last 1024 senders.
+"""
 
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
@@ -26,8 +29,8 @@ SETTLES_NS = 3 * NS
 PROOF_NS = 2 * NS
 """A new sender shows a steady delay for this time before its commands count."""
 
-LOOKED_AT_NS = 3 * NS // 20
-"""A sender that was silent for longer has paused."""
+PAUSE_NS = 3 * NS // 20
+"""Longest time between two commands of a sender that does not pause."""
 
 
 class Liveness:
@@ -56,7 +59,7 @@ class Liveness:
             return
         wish = self.run.witness.wishes[-1][1]
         before_ns, _ = self._latest.get(name, (0, ""))
-        if wish.arrived_ns - before_ns > LOOKED_AT_NS:
+        if wish.arrived_ns - before_ns > PAUSE_NS:
             self._since.pop(name, None)
             self._began[name] = wish.arrived_ns
         if wish.armed_ns <= self._event_ns or not (wish.v or wish.w):
@@ -74,8 +77,10 @@ class Liveness:
             sender["way"] in ("client", "page", "plain", "bridge")
             and not any(sender[bad] for bad in ("junk", "churn", "loss", "twice", "swap"))
             and not sender["congestion"]
+            and not sender.get("bad_stamps")
             and sender["jitter"] < 0.01
             and sender["hz"] >= 10.0
+            and sender["hz"] * run.witness.timeout[sender["source"]] / NS > 2.0
             and not any(rival["junk"] or rival["churn"] for rival in rivals)
             and all(priority[r["source"]] < priority[sender["source"]] for r in rivals)
         )
@@ -90,7 +95,7 @@ class Liveness:
         for name, since_ns in self._since.items():
             heard_ns, identity = self._latest[name]
             quiet = now_ns - self._event_ns > SETTLES_NS
-            if quiet and now_ns - since_ns > NS and now_ns - heard_ns < LOOKED_AT_NS:
+            if quiet and now_ns - since_ns > NS and now_ns - heard_ns < PAUSE_NS:
                 run.counts["lawful looks"] += 1
                 if now_ns - run.moved_ns > NS // 2:
                     text = f"{identity} since {since_ns / NS:.3f} s; {run.witness.reason}"
@@ -112,7 +117,9 @@ class Liveness:
         run.counts["largest container"] = max(run.counts["largest container"], size)
         if size > MOST_HELD:
             raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
-        run.run_to(run.true_ns + int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS))
+        boots_ns = int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS)
+        # The last sender of a source keeps it for the source's timeout.
+        run.run_to(run.true_ns + max(boots_ns, *run.witness.timeout.values()))
         for _ in range(3):
             verbs = {"fault": "clear", "stopped": "clear", "inactive": "activate"}
             verb = verbs.get(product.state()["mode"])
@@ -134,12 +141,18 @@ class Liveness:
             one
             for one in plan["senders"]
             if one["way"] in ("client", "page")
-            and not (one["churn"] or one["junk"] or one["id"] in run.witness.shared_clocks)
+            and not (
+                one["churn"]
+                or one["junk"]
+                or one.get("bad_stamps")
+                or one["id"] in run.witness.shared_clocks
+            )
         ]
         number = 10**6
         if plan["lawful"] != "a new client" and own:
             sender = own[0]
         zeros_s = run.witness.pause_ns / NS + 1.0
+        step_ns = min(50_000_000, run.witness.timeout[sender["source"]] // 4)
         # A share above 1 shows whether the limits of before a restart are still in force.
         share = plan.get("share", 0.5)
         speed = share * run.witness.limits["linear_speed"]
@@ -157,7 +170,7 @@ class Liveness:
             delay_ns = int(sender["delay"] * NS)
             message = Message(now_ns, now_ns + delay_ns, v, w, stamp_ns, number, "")
             run.at(now_ns + delay_ns, lambda m=message: run.deliver(sender, m))  # type: ignore[misc]
-            run.run_to(now_ns + 50_000_000)
+            run.run_to(now_ns + step_ns)
         mode, reason = run.witness.mode, run.witness.reason
         moving = run.true_ns - run.moved_ns < NS // 5
         if mode != "driving" or not moving:

@@ -20,6 +20,9 @@ KINDS = (
     "stops", "activation", "settings", "poses", "lost calls",
     "congestion", "loss", "disorder", "sender clocks", "hostile senders", "shared identities",
     "pushes", "odd configuration",
+    "other dialect", "unreadable board", "extreme timing", "other vehicle",
+    "stop storms", "ros parameters", "typed latches",
+    "crashes", "damaged file", "kills on a full disk", "sender bursts", "bad stamps",
 )  # fmt: skip
 """The kinds of trouble that a run may have."""
 
@@ -42,6 +45,12 @@ LIES = (
     "bias", "swapped_motors", "swapped_encoders", "late_watchdog", "no_watchdog",
 )  # fmt: skip
 
+DIALECTS = (
+    "unpadded", "spaces", "trailing_comma", "no_sample", "no_check", "plain_only",
+    "watchdog_fed_by_bad_lines",
+)  # fmt: skip
+"""Other forms of the protocol, to which a board may change while it runs."""
+
 
 def made(seed: int, seconds: float | None = None) -> Plan:
     """Return the plan of this seed."""
@@ -50,16 +59,22 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     kinds = sorted(kind for kind in KINDS if dice.random() < share)
     length = seconds or round(dice.choice((40, 60, 60, 90, 240)) * dice.uniform(0.8, 1.2), 1)
     while True:
-        config, extras = _config(dice, "odd configuration" in kinds)
+        config, extras = _config(
+            dice,
+            *(kind in kinds for kind in ("odd configuration", "extreme timing", "other vehicle")),
+        )
         if not problems(config):
             break
+    if "other dialect" in kinds:
+        extras["board"] += _dialect(dice, config["mcu"])
+    sources = [source["name"] for source in config["commands"]["sources"]]
     plan: Plan = {
         "seed": seed,
         "seconds": length,
         "kinds": kinds,
         "config": config,
         "senders": [
-            _sender(dice, n, kinds, length) for n in range(dice.choice((1, 1, 1, 2, 3, 6)))
+            _sender(dice, n, kinds, length, sources) for n in range(dice.choice((1, 1, 1, 2, 3, 6)))
         ],
         "events": [],
         "lawful": dice.choice(("a new client", "a sender of the plan")),
@@ -76,7 +91,9 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     return plan
 
 
-def _config(dice: random.Random, odd: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+def _config(
+    dice: random.Random, odd: bool, timing: bool, vehicle: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """A configuration as tables of `acsard.toml`, and the lasting nature of the board."""
     linear, angular = round(dice.uniform(0.2, 2.0), 2), round(dice.uniform(0.5, 6.0), 2)
     slow = round(max(linear / 5, dice.choice((0.5, 1.0, 3.0))) + 0.001, 3)
@@ -108,7 +125,11 @@ def _config(dice: random.Random, odd: bool) -> tuple[dict[str, Any], dict[str, A
     extras: dict[str, Any] = {"board": []}
     if odd:
         _make_odd(dice, config, extras)
-    if "odometry" not in config and dice.random() < 0.4:
+    if timing:
+        _make_extreme(dice, config)
+    if vehicle:
+        _make_other(dice, config)
+    if not config.get("odometry", {}).get("gyro") and dice.random() < 0.4:
         config["sim"]["motor_time_constant"] = round(dice.uniform(0.25, 0.4), 3)
     return config, extras
 
@@ -138,7 +159,8 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
             mcu.update(link_check="auto", encoder_counts=counts)
         case 3:
             mcu["trailing_comma"] = True
-            extras["board"] = [["comma_latched"], ["trailing_comma"]]
+            if dice.random() < 0.7:
+                extras["board"] = [["comma_latched"], ["trailing_comma"]]
         case 4:
             mcu["reply_period"] = 0.1
             extras["board"] = [["free_running", 0.1]]
@@ -157,6 +179,62 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
     if dice.random() < 0.3:
         config["odometry"] = {"gyro": True}
         sim.update(gyro_bias=0.01, gyro_noise=0.005, gyro_delay=0.01)
+
+
+def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
+    """Draw rates, timeouts and pauses from their whole range, and one to six sources.
+
+    No rate above 349 Hz is legal, because a plain line takes 2.9 ms at the highest baud rate.
+    """
+    rate, period = dice.choice(
+        ((10.0, 0.1), (200.0, 0.005), (300.0, 0.0034), ("auto", 0.01), (100.0, 0.01))
+    )
+    config["control"]["rate"] = rate
+    names = dice.sample((*SOURCES, "twin", "sixth"), dice.randrange(1, 7))
+    timeouts = [t for t in (0.05, 0.1, 0.25, 0.5, 2.0, 10.0) if t >= 2 * period]
+    commands = config["commands"]
+    commands["neutral_pause"] = dice.choice((0.5, 1.0, 5.0))
+    commands["sources"] = [
+        {"name": name, "priority": dice.choice((0, 10, 50, 100)), "timeout": dice.choice(timeouts)}
+        for name in names
+    ]
+
+
+def _make_other(dice: random.Random, config: dict[str, Any]) -> None:
+    """Draw corrections of the wheels, bounds that a sound wheel keeps, and error rates."""
+    config["drive"] = config.get("drive", {}) | {
+        "wheel_separation_multiplier": round(dice.uniform(0.8, 1.6), 3),
+        "left_wheel_radius_multiplier": round(dice.uniform(0.95, 1.05), 3),
+        "right_wheel_radius_multiplier": round(dice.uniform(0.95, 1.05), 3),
+    }
+    config["feedback"] = {
+        "wheel_speed": round(config["limits"]["wheel_speed"] * dice.uniform(1.5, 2.0), 2),
+        "wheel_acceleration": dice.choice((1000.0, 1500.0, 10000.0)),
+        "response_time": dice.choice((0.2, 0.5, 1.0)),
+        "fault_time": dice.choice((0.0, 0.3, 0.5, 2.0)),
+    }
+    config["odometry"] = config.get("odometry", {}) | {
+        name: dice.choice((1e-5, 1e-4, 1e-3, 1e-2))
+        for name in (
+            "distance_variance_per_metre", "yaw_variance_per_metre", "yaw_variance_per_radian"
+        )
+    }  # fmt: skip
+
+
+def _dialect(dice: random.Random, mcu: dict[str, Any]) -> list[list[Any]]:
+    """Return the lasting dialects of a board that a daemon with these settings can drive."""
+    possible = ["unpadded", "spaces", "watchdog_fed_by_bad_lines"]
+    # A board with a reply period ends its lines with a comma in any case.
+    if not (mcu.get("trailing_comma") or mcu.get("reply_period")):
+        possible.append("trailing_comma")
+    if mcu.get("link_check") == "auto":
+        possible += ["plain_only", "no_check"]
+    if mcu.get("encoder_counts"):
+        possible.append("no_sample")
+    chosen = dice.sample(possible, dice.choice((0, 1, 1, 2)))
+    if "no_check" in chosen and "plain_only" in chosen:
+        chosen.remove("no_check")
+    return [[name] for name in chosen]
 
 
 def _phases(dice: random.Random, seconds: float, lawful: bool) -> list[list[Any]]:
@@ -215,7 +293,9 @@ def _tried_again(
     return sorted(phases, key=lambda phase: float(phase[0]))
 
 
-def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> dict[str, Any]:
+def _sender(
+    dice: random.Random, n: int, kinds: list[str], seconds: float, sources: list[str]
+) -> dict[str, Any]:
     way = dice.choice(WAYS)
     # Most plans need a sender that drives: a robot at rest hides most defects.
     lawful = n == 0 and dice.random() < 0.8
@@ -224,7 +304,7 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
         "name": f"s{n}",
         "id": f"s{n}/{dice.getrandbits(64):016x}",
         "way": way,
-        "source": "teleop" if way == "page" else dice.choice(SOURCES),
+        "source": "teleop" if way == "page" and "teleop" in sources else dice.choice(sources),
         "wheels": way in ("client", "signed", "plain", "rmw") and dice.random() < 0.2,
         "form": dice.choice(("json", "msgpack", "cdr")),
         "hz": dice.choice((5.0, 10.0, 20.0, 20.0, 50.0)),
@@ -237,6 +317,8 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
         "phases": _phases(dice, seconds, lawful),
         "congestion": [],
         "clock": [],
+        "bursts": [],
+        "bad_stamps": 0.0,
         "junk": 0.0,
         "churn": False,
         "loss": 0.0,
@@ -274,6 +356,14 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
             sender["congestion"].append([round(t, 3), round(t + length, 3), shape, round(size, 3)])
             t += length + dice.uniform(1.0, 15.0)
         sender["phases"] = _tried_again(dice, sender["phases"], sender["congestion"])
+    if "sender bursts" in kinds:
+        for _ in range(dice.randrange(1, 4)):
+            t = dice.uniform(0.0, seconds)
+            sender["bursts"].append(
+                [round(t, 3), round(t + dice.uniform(0.05, 1.0), 3), dice.choice((200, 500, 1000))]
+            )
+    if "bad stamps" in kinds and dice.random() < 0.5:
+        sender["bad_stamps"] = dice.choice((0.02, 0.3, 1.0))
     if "sender clocks" in kinds and way not in ("client", "page"):
         t = dice.uniform(2.0, 30.0)
         while t < seconds:
@@ -361,6 +451,14 @@ def _events(
             (("slow_reply", 0.03), ("ftdi", 0.016), ("stalls", 1.0, 0.15), ("sparse_replies", 0.05))
         )
         board(at, dice.uniform(1.0, 20.0), kind, *values)
+    for at in add("other dialect", 60):
+        board(at, dice.uniform(0.2, 10.0), dice.choice(DIALECTS))
+    for at in add("unreadable board", 60):
+        board(
+            at,
+            dice.choice((0.05, 0.2, 1.0, 5.0)) * dice.uniform(0.5, 1.0),
+            *dice.choice((("endless",), ("wrong_baud", dice.choice((9600, 38400, 57600))))),
+        )
     for at in add("pushes", 40):
         board(at, dice.uniform(0.2, 4.0), "pushed", round(dice.uniform(-1.0, 1.0), 2))
     for at in add("resets", 60):
@@ -393,6 +491,9 @@ def _events(
             "suspend",
             **{"for": round(dice.choice((0.5, 5.0, 60.0, 3600.0)) * dice.uniform(0.5, 1.0), 3)},
         )
+        if dice.random() < 0.3:
+            again = round(at + dice.choice((0.03, 0.3, 3.0)) * dice.uniform(1.0, 2.0), 3)
+            once(again, "suspend", **{"for": round(dice.uniform(0.5, 60.0), 3)})
     for at in add("clock steps", 40):
         once(at, "wall", by=round(dice.choice((0.3, 3.0, 1e5)) * dice.uniform(-1.0, 1.0), 3))
     for at in add("restarts", 60):
@@ -404,6 +505,22 @@ def _events(
         )
     for at in add("full disk", 60):
         once(at, "disk", **{"for": round(dice.uniform(1.0, 30.0), 3)})
+    for at in add("crashes", 60):
+        once(
+            at,
+            "restart",
+            way=dice.choice(("crash before the robot", "crash behind the robot")),
+            stop=dice.random() < 0.5,
+            **{"for": round(dice.uniform(0.2, 3.0), 3)},
+        )
+    for at in add("damaged file", 90):
+        once(
+            at,
+            "restart",
+            way=dice.choice(("kill", "term")),
+            damage=dice.choice(("cut", "zeros", "version")),
+            **{"for": round(dice.uniform(0.2, 3.0), 3)},
+        )
 
     def call(at: float, verb: str, **more: Any) -> None:
         lossy = "lost calls" in kinds
@@ -423,6 +540,12 @@ def _events(
             call(after, "clear", named=dice.random() < 0.7)
         if dice.random() < 0.8:
             call(round(at + dice.uniform(2.0, 8.0), 3), "clear", named=True)
+    for at in add("kills on a full disk", 60):
+        once(at, "disk", **{"for": round(dice.uniform(1.0, 5.0), 3)})
+        late = round(at + dice.uniform(0.0, 1.0), 3)
+        call(late, dice.choice(("stop", "clear", "deactivate", "activate")), named=True)
+        killed = round(late + 0.01 + dice.choice((0.0, 0.02, 0.2)) * dice.random(), 3)
+        once(killed, "restart", way="kill", **{"for": round(dice.uniform(0.2, 5.0), 3)})
     if "lying board" in kinds:
         for at in [round(dice.uniform(1.0, seconds), 3) for _ in range(int(seconds / 10))]:
             call(at, "clear", named=True)
@@ -447,7 +570,18 @@ def _events(
                 ],
             )
     for at in add("settings", 20):
-        call(at, "set", settings=_settings(dice, config), via="native")
+        via = dice.choice(("native", "rmw", "bridge")) if "ros parameters" in kinds else "native"
+        call(at, "set", settings=_settings(dice, config), via=via, whole=dice.random() < 0.5)
+    for at in add("stop storms", 60):
+        # The operator hammers on the button, or a program is in a loop.
+        count, gap = dice.choice(((5, 0.3), (20, 0.1), (100, 0.01), (300, 0.002)))
+        call(at, "stop", put=dice.random() < 0.5, times=count, gap=gap)
+        for _ in range(dice.randrange(1, 4)):
+            call(round(at + dice.uniform(0.0, 3.0), 3), "clear", named=True)
+        call(round(at + dice.uniform(3.0, 8.0), 3), "clear", named=True)
+    for at in add("typed latches", 30):
+        typed = dice.choice((1, 1, 2, 3, 0))
+        call(at, dice.choice(("clear", "clear", "activate")), named=True, typed=typed)
     if not config["control"].get("auto_activate", True):
         # Without this a robot that waits for its first `activate` would stand until the end.
         call(round(dice.uniform(0.5, 5.0), 3), "activate", named=False)

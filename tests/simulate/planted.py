@@ -1,10 +1,11 @@
 """Plants faults in copies of the product, and measures how long the simulator needs to find each.
 
-    python -m tests.simulate.planted [--jobs 2] [--only NAME] [--missing]
+    python -m tests.simulate.planted [--jobs 2] [--only NAME] [--missing] [--again]
 
 Each fault is planted alone into a copy of this tree. One process plays seeds there until a promise
 breaks or the time is over. A finding counts only if the same seed breaks no promise on this tree.
-`PLANTED.md` keeps the results; a run replaces the rows that it has played.
+`PLANTED.md` keeps the results; a run replaces the rows that it has played. With `--again` only the
+recorded seed of each row is played, which takes seconds, and the page stays as it is.
 """
 
 from __future__ import annotations
@@ -38,6 +39,11 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 
 FIRST_SEED = 1
 
+MEASURED_WITH = (
+    "plan", "roads", "actors", "product", "promises", "ages", "pose", "reports", "liveness",
+)  # fmt: skip
+"""Modules of the simulator that make the plans, play them and judge them."""
+
 CHILD = """
 import json, sys
 from tests.simulate.actors import collect_seldom, played
@@ -65,13 +71,17 @@ class Row(NamedTuple):
     """Processor time until then, core-minutes."""
     simulated: str
     """Simulated time until then, minutes."""
-    plans: str
-    """The version of the plans that were played."""
+    simulator: str
+    """The version of the simulator that measured the row."""
 
 
 def version() -> str:
-    """Return a digest of the code that makes plans: another one gives a seed another plan."""
-    code = b"".join(Path(__file__).with_name(name).read_bytes() for name in ("plan.py", "roads.py"))
+    """Return a digest of the code that makes, plays and judges plans.
+
+    Another version may give a seed another plan, or find something else in it.
+    """
+    here = Path(__file__).parent
+    code = b"".join((here / f"{name}.py").read_bytes() for name in MEASURED_WITH)
     return hashlib.sha256(code).hexdigest()[:6]
 
 
@@ -128,6 +138,18 @@ def _row(fault: Fault, promise: str, seed: str, cpu_s: float, simulated_s: float
     return Row(fault.name, fault.breaks, promise, seed, core, simulated, version())
 
 
+def broken_again(fault: Fault, row: Row) -> str:
+    """Return why the recorded seed of a row no longer finds its fault, "" if it still does."""
+    seed = int(row.seed)
+    with tempfile.TemporaryDirectory() as name:
+        plant(fault, Path(name))
+        # The process plays one seed at least, however short its time.
+        (play,) = plays(Path(name), seed, 0.001)
+    if not play.promise:
+        return "breaks no promise"
+    return sound_finding(seed) and f"also breaks one without the fault: {sound_finding(seed)}"
+
+
 @cache
 def sound_finding(seed: int) -> str:
     """Return what this seed finds in the product without a fault."""
@@ -172,13 +194,15 @@ breaks a promise of the sound product does not count. Core-minutes are the proce
 process that plays, on a machine that other work kept busy.
 
 A fault must be found within {fault:g} core-minutes, a case within {case:g}. A row keeps its last
-measurement, and its last column says by which version of the plans. The present one is {version}.
-By it other seeds may find the faults of older rows, earlier or later. "not found" says that no seed
-did in the core-minutes of that row; `--missing` plays those faults again, and all without a row.
+measurement. Its last column is the version of the simulator that measured it: a digest of the
+modules that make, play and judge plans. With the present plans, another seed may find an older
+row's fault. `--again` prints the present version, plays the seed of each row again, and lists the
+rows that no longer hold. "not found" says that no seed found the fault in the core-minutes of that
+row. `--missing` measures those faults again, and all without a row.
 """
 
 COLUMNS = """
-| name | what it breaks | the promise that found it | seed | core-min | simulated min | plans |
+| name | what it breaks | the promise that found it | seed | core-min | simulated min | simulator |
 |---|---|---|---|---|---|---|
 """
 
@@ -195,12 +219,32 @@ def read() -> dict[str, Row]:
 def text_of(rows: dict[str, Row]) -> str:
     """Return the page with these rows, in the order of the lists."""
     minutes = {"fault": FAULT_MINUTES, "case": CASE_MINUTES}
-    text = HEAD.format(seed=FIRST_SEED, version=version(), **minutes)
+    text = HEAD.format(seed=FIRST_SEED, **minutes)
     for title, faults in (("Faults", FAULTS), ("Cases that were once true", CASES)):
         known = [rows[fault.name] for fault in faults if fault.name in rows]
         text += f"\n## {title}\n{COLUMNS}"
         text += "".join("| " + " | ".join(row) + " |\n" for row in known)
     return text
+
+
+def again(faults: list[Fault], jobs: int) -> int:
+    """Play the recorded seed of each of these faults; return the number of rows that do not hold.
+
+    A fault without a row, or with none that has a seed, has nothing to play.
+    """
+    rows = read()
+    present = version()
+    recorded = [(fault, rows[fault.name]) for fault in faults if rows.get(fault.name)]
+    recorded = [(fault, row) for fault, row in recorded if row.seed]
+    with ThreadPoolExecutor(jobs) as pool:
+        reasons = list(pool.map(lambda pair: broken_again(*pair), recorded))
+    lost = 0
+    for (fault, row), reason in zip(recorded, reasons, strict=True):
+        if reason:
+            lost += 1
+            print(f"{fault.name}: seed {row.seed} of version {row.simulator} {reason}")
+    print(f"{len(recorded) - lost} of {len(recorded)} rows hold; the simulator is {present}")
+    return lost
 
 
 def main() -> int:
@@ -209,11 +253,14 @@ def main() -> int:
     parser.add_argument("--only", metavar="NAME", help="faults whose name begins so")
     parser.add_argument("--minutes", type=float, help="core-minutes for each, instead of its own")
     parser.add_argument("--missing", action="store_true", help="those that the table has not found")
+    parser.add_argument("--again", action="store_true", help="play the seed of each row only")
     options = parser.parse_args()
     chosen = [f for f in (*FAULTS, *CASES) if f.name.startswith(options.only or "")]
     if options.missing:
         found = {name for name, row in read().items() if row.seed}
         chosen = [fault for fault in chosen if fault.name not in found]
+    if options.again:
+        return min(1, again(chosen, options.jobs))
     lock, lost = Lock(), 0
 
     def one(fault: Fault) -> None:

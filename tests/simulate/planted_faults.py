@@ -419,8 +419,8 @@ FAULTS = (
         "sanity evidence",
         "evidence against a healthy wheel is never dropped",
         SANITY,
-        "lasted = wheel.evidence[kind] + dt if bad else 0.0",
-        "lasted = wheel.evidence[kind] + (dt if bad else 0.0)",
+        "lasted = wheel.evidence[kind] + min(dt, most) if bad else 0.0",
+        "lasted = wheel.evidence[kind] + (min(dt, most) if bad else 0.0)",
     ),
     fault(
         "sanity dead",

@@ -13,7 +13,7 @@ from tests.simulate.roads import NS
 LIARS = {
     "bias", "stuck_encoder", "frozen_encoder", "reversed_encoder", "reversed_motor", "dead_motor",
     "swapped_motors", "swapped_encoders", "bit_errors", "noise", "partial_line", "echo", "mute",
-    "free_running", "pushed",
+    "free_running", "pushed", "plain_only", "endless", "wrong_baud",
 }  # fmt: skip
 """Board faults with which the encoders lie, or say nothing while the robot may move."""
 
@@ -31,7 +31,8 @@ class PoseWitness:
         drive = config.get("drive", {})
         fastest = config.get("feedback", {}).get("wheel_speed", 80.0)
         self.fastest: float = fastest * drive.get("wheel_radius", 0.05)
-        self.track: float = drive.get("wheel_separation", 0.3)
+        multiplier = drive.get("wheel_separation_multiplier", 1.0)
+        self.track: float = drive.get("wheel_separation", 0.3) * multiplier
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False

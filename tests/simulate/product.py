@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import msgspec
@@ -20,6 +20,8 @@ from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import encode as encode_message
+from acsard.core.simulator.baud_mismatch import garbled
+from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
 from acsard.core.values import Event, Instant, Latches, Outputs, Received
@@ -33,6 +35,7 @@ from acsard.daemon.latch_rules import (
     unreadable,
     unwritable,
 )
+from acsard.daemon.pacing import Period
 from tests.scenarios.world import START, World
 
 START_NS = START.mono_ns
@@ -85,6 +88,10 @@ def _plain(found: Measured) -> Estimate:
     )
 
 
+class CrashError(Exception):
+    """The exception that stands for a defect of the daemon."""
+
+
 class Disk:
     """The latch file: what a process that is killed now leaves for the next one."""
 
@@ -113,6 +120,16 @@ class Disk:
         if not self.full:
             self._data, self._written = encode("acsar", latches), latches
 
+    def damage(self, how: str) -> None:
+        """Damage the file: `cut` it, fill it with `zeros`, or give it another `version`."""
+        match how:
+            case "cut":
+                self._data = self._data[: len(self._data) * 2 // 3]
+            case "zeros":
+                self._data = bytes(len(self._data))
+            case "version":
+                self._data = self._data.replace(b'"format": 1', b'"format": 2')
+
     def end(self) -> None:
         """Note that the daemon has ended: it writes nothing any more."""
         self._running = False
@@ -133,6 +150,8 @@ class Disk:
             found = stopped(Latches(), unreadable("FILE", str(error)), now)
         self._running, self.trouble = True, ""
         self._newest = self._written = found
+        if not self.full:
+            self._data = encode("acsar", found)  # the daemon tries out whether it can write
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
             self._newest = doubted(found, at_start(self.trouble), now)
@@ -253,11 +272,19 @@ class Product:
         if at_ns == world.now_ns and (world._listens or key == "stop"):
             world._step()
 
+    def stop_unseen(self) -> None:
+        """Have a stop arrive that no step has taken yet."""
+        arrival = Arrival("stop", True, b"", "", self.now_ns, None, "", "native", b"", self.wall_ns)
+        self._world.bus.arrivals.insert(0, arrival)
+
     def ask(
         self, at_ns: int, service: str, ticket: int, payload: bytes, via: Any, attachment: bytes
     ) -> None:
-        """Hand over a service call. A stop also goes ahead of its query, as on the real bus."""
-        key = f"srv/{service}"
+        """Hand over a service call. A stop also goes ahead of its query, as on the real bus.
+
+        `service` is a service, or a parameter service of ROS, which has "/" in its name.
+        """
+        key = service if "/" in service else f"srv/{service}"
         if service == "stop":
             self.deliver(at_ns, "stop", b"", via=via, attachment=attachment)
         query = Query(ticket, key, key, "", payload, "", at_ns, via, attachment)
@@ -284,11 +311,32 @@ class Product:
         """Have the board misbehave in these ways, and in no others, from now on."""
         self._lasting.close()
         self._faults = faults
+        mcu, bauds = self._world.mcu, [values[0] for name, values in faults if name == "wrong_baud"]
         for name, values in faults:
+            if name == "endless":
+                self._lasting.enter_context(mcu._with(ending=""))
+                continue
             # The daemon's TX is joined to its RX, so nothing of the board arrives.
             fault = "mute" if name == "echo" else name
-            self._lasting.enter_context(getattr(self._world.mcu, fault)(*values))
+            self._lasting.enter_context(getattr(mcu, fault)(*values))
+        self._garble(mcu, bauds[-1] if bauds else self._config.mcu.baud_rate)
         self.echo = any(name == "echo" for name, _ in faults)
+
+    def _garble(self, mcu: FakeMcu, baud_rate: int) -> None:
+        """Put a wire to this board on which its end has this baud rate."""
+        ours, kind = self._config.mcu.baud_rate, type(mcu)
+        vars(mcu).pop("receive", None)
+        vars(mcu).pop("advance", None)
+        if baud_rate == ours:
+            return
+
+        def receive(at_ns: int, data: bytes) -> None:
+            kind.receive(mcu, at_ns, garbled(data, ours, baud_rate))
+
+        def advance(at_ns: int) -> bytes:
+            return garbled(kind.advance(mcu, at_ns), baud_rate, ours)
+
+        vars(mcu).update(receive=receive, advance=advance)
 
     def reset(self, deaf_ns: int) -> None:
         self._world.mcu.reset(self.now_ns, deaf_ns)
@@ -350,8 +398,10 @@ class Product:
         self._world.wall_offset_ns += int(seconds * 1e9)
 
     def end(self, way: str) -> None:
-        """End the daemon by SIGTERM (`term`) or at once (`kill`)."""
+        """End the daemon by SIGTERM (`term`), by an exception in a step, or at once (`kill`)."""
         world = self._world
+        if way.startswith("crash"):
+            self._crash(way)
         if way == "term":
             world.loop.shutting_down = True
             for _ in range(60):
@@ -365,6 +415,21 @@ class Product:
             world.port.mcu.receive(world.now_ns + 50_000_000, b"\r\n" + stop)
         self.disk.end()
         self.alive = False
+
+    def _crash(self, way: str) -> None:
+        """Take a step in which the robot, or the port behind it, raises an exception."""
+        loop, port = self._world.loop, self._world.port
+
+        def broken(*_: Any) -> Any:
+            raise CrashError
+
+        if way == "crash before the robot":
+            vars(loop.robot)["step"] = broken
+        else:
+            vars(port)["offer"] = broken
+        with suppress(CrashError):
+            loop.step(self._world.instant, Period(1, self.now_ns))
+        loop.finish(self._world.instant)
 
     def start(self) -> None:
         """Start the daemon again, on the same board."""

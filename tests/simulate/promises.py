@@ -26,7 +26,10 @@ RAMP_NS = 300_000_000
 """Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
 
 BLOCKED_NS = 500_000_000
-"""After so long without a line that left, the daemon knows it. The board stops itself earlier."""
+"""Time after which the daemon must report that the kernel takes no line.
+
+The board's own watchdog stops the motors before that.
+"""
 
 LATE_NS = 150_000_000
 """Allowed beyond a ramp from the speeds that were seen at its beginning."""
@@ -36,7 +39,7 @@ STAND_NS = 2 * NS
 
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
-    "stalls", "sparse_replies", "echo",
+    "stalls", "sparse_replies", "echo", "plain_only", "endless", "wrong_baud",
 }  # fmt: skip
 """Troubles of the board that are no reason to latch a fault."""
 
@@ -45,6 +48,9 @@ DISOBEYS_NS = NS
 
 CLEARLY = 4.0
 """rad/s. From this speed on, a wheel that does not obey cannot be taken for one that does."""
+
+DIALECTS = {"unpadded", "spaces", "trailing_comma", "no_sample", "no_check"}
+"""Forms of the protocol that are no trouble at all."""
 
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
 """Refused messages that may have been speeds of a program that shares its identity, so a zero
@@ -65,8 +71,14 @@ class Witness:
     def __init__(self, config: dict[str, Any]) -> None:
         self.config = config
         drive = config.get("drive", {})
-        self.radius = drive.get("wheel_radius", 0.05)
-        self.half = drive.get("wheel_separation", 0.3) / 2
+        radius = drive.get("wheel_radius", 0.05)
+        self.radii = tuple(
+            radius * drive.get(f"{side}_wheel_radius_multiplier", 1.0) for side in ("right", "left")
+        )
+        self.radius = sum(self.radii) / 2
+        self.half = (
+            drive.get("wheel_separation", 0.3) * drive.get("wheel_separation_multiplier", 1.0) / 2
+        )
         wheels = config["mcu"].get("wheels") or {
             "front_right": "+a", "front_left": "+b", "rear_left": "+c", "rear_right": "+d",
         }  # fmt: skip
@@ -85,6 +97,8 @@ class Witness:
         self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
         self.file_pause_ns = int(commands.get("neutral_pause", 1.0) * NS)
         rate = config["control"].get("rate", 100.0)
+        if rate == "auto":
+            rate = 100.0  # at 115200 baud the longest line allows more
         self.period_ns = int(NS / rate)
         quiet = max(0.1, 4 / rate, 3 * config["mcu"].get("reply_period", 0.0))
         self.quiet_ns = int(quiet * NS)
@@ -288,6 +302,12 @@ class Witness:
         self.fault_ns = None
         self.limits, self.unsure = dict(self.file), set(self.file)
 
+    def file_is_damaged(self, at_ns: int) -> None:
+        """Note that a daemon cannot read the latch file, so it starts stopped."""
+        self.file_is_behind()
+        self.unsure.clear()
+        self.stops.append(at_ns)
+
     # what the daemon showed
 
     def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
@@ -424,8 +444,8 @@ class Witness:
 
     def twist(self, wheels: tuple[float, ...]) -> tuple[float, float]:
         """Return the speed and turn rate of these wheels, front right and front left first."""
-        right, left = wheels[0], wheels[1]
-        return self.radius * (right + left) / 2, self.radius * (right - left) / (2 * self.half)
+        right, left = self.radii[0] * wheels[0], self.radii[1] * wheels[1]
+        return (right + left) / 2, (right - left) / (2 * self.half)
 
     def _most(self, name: str, at_ns: int) -> float:
         """Return a limit; shortly after it was changed the larger of the two."""
@@ -608,9 +628,10 @@ class Witness:
         limits, scale = self.softest, 1.0
         scale = min(scale, limits["linear_speed"] / abs(v) if v else 1.0)
         scale = min(scale, limits["angular_speed"] / abs(w) if w else 1.0)
-        rim = max(abs(v - w * self.half), abs(v + w * self.half)) / self.radius
-        if rim:
-            scale = min(scale, limits["wheel_speed"] / rim)
+        right, left = self.radii
+        wheel = max(abs(v - w * self.half) / left, abs(v + w * self.half) / right)
+        if wheel:
+            scale = min(scale, limits["wheel_speed"] / wheel)
         return v * scale, w * scale
 
 

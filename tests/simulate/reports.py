@@ -13,8 +13,8 @@ from tests.simulate.ages import MARGIN_NS
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import NS, Message, Sample, stable
 
-KEPT = 4000
-"""Commands that are remembered: those of the longest timeout, 3 s, at 400 Hz by three senders."""
+KEPT = 15_000
+"""Commands that are remembered: those of the longest timeout, 10 s, at 400 Hz by three senders."""
 
 ECHO_LINES, ECHO_CHANGE = 40, 6.0
 """Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as

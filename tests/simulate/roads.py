@@ -20,6 +20,12 @@ FOREIGN = ("signed", "rmw", "header", "zenoh", "bridged")
 AHEAD_NS = NS // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock."""
 
+LAST_STAMP = 2**63 - 1
+"""No attachment has a higher stamp, and each stamp is above 0: another attachment is ignored."""
+
+BAD_STAMPS = (-5 * NS, 0, 4_102_444_800 * NS, LAST_STAMP, 2**64 - 1)
+"""Stamps of broken clocks: before 1970, without a time, in 2100, and at the ends of the types."""
+
 JUNK = ("garbage", "not a number", "delete", "wildcard", "huge", "stranger", "cancels", "fields")
 
 
@@ -53,6 +59,8 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
     # Most senders of junk send few kinds of it, because one kind may hide what another one does.
     swarm = random.Random(f"junk {seed} {sender['name']}")
     kinds = swarm.sample(JUNK, swarm.choice((1, 1, 2, len(JUNK))))
+    bad_stamps = random.Random(f"stamps {seed} {sender['name']}")
+    bad_share = sender.get("bad_stamps", 0.0)
     found: list[Message] = []
     last_ns, number, t = 0, 0, float(sender["from"])
     phases, place = sender["phases"], -1
@@ -72,15 +80,26 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 if chance[4] < sender["swap"]:
                     arrives_ns += int(1.5 / sender["hz"] * NS)
                 stamp_ns = wall_ns + int((t + _ahead(sender, t)) * NS)
+                if bad_share and bad_stamps.random() < bad_share:
+                    stamp_ns = bad_stamps.choice(BAD_STAMPS)
                 v, w = float(wish[0]), float(wish[1])
                 message = Message(int(t * NS), arrives_ns, v, w, stamp_ns, number, junk)
                 found.append(message)
                 if chance[5] < sender["twice"]:
                     again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
                     found.append(message._replace(arrives_ns=again_ns))
-        t += (0.9 + 0.2 * chance[0]) / sender["hz"] if sender["jitter"] else 1 / sender["hz"]
+        hz = _hz(sender, t)
+        t += (0.9 + 0.2 * chance[0]) / hz if sender["jitter"] else 1 / hz
     end_ns = int((seconds + 0.2) * NS)
     return sorted((one for one in found if one.arrives_ns < end_ns), key=lambda m: m.arrives_ns)
+
+
+def _hz(sender: dict[str, Any], t: float) -> float:
+    """Return how often the sender sends at this time, Hz."""
+    for begin, end, hz in sender.get("bursts", ()):
+        if begin <= t < end:
+            return float(hz)
+    return float(sender["hz"])
 
 
 def _jitter(scale: float, chance: float) -> float:
@@ -122,8 +141,8 @@ def _ahead(sender: dict[str, Any], t: float) -> float:
 
 
 def stable(sender: dict[str, Any]) -> bool:
-    """Return whether nothing adjusts this sender's clock."""
-    return not sender["clock"]
+    """Return whether nothing adjusts this sender's clock, and all its stamps are true."""
+    return not sender["clock"] and not sender.get("bad_stamps")
 
 
 def sample(
@@ -137,6 +156,11 @@ def sample(
     keeps = message.stamp_ns - robot_wall_ns <= AHEAD_NS
     session, stamp_ns = "", None
     by_key = f"native/{source}"
+    # The seconds of a header end below the highest stamp.
+    stamp_counts = message.stamp_ns > 0 and (way == "header" or message.stamp_ns <= LAST_STAMP)
+    match way:
+        case "client" | "page" | "signed" | "header" if not stamp_counts:
+            identity, shared, clock = by_key, True, ""
     match way:
         case "client" | "page" | "signed":
             options["attachment"] = msgspec.msgpack.encode(
@@ -146,9 +170,9 @@ def sample(
         case "rmw":
             gid = hashlib.sha256(own.encode()).digest()[:16]
             options["attachment"] = struct.pack(
-                "<qqB16s", message.number, message.stamp_ns, 16, gid
+                "<qqB16s", message.number, min(message.stamp_ns, LAST_STAMP), 16, gid
             )
-        case "header":
+        case "header" if stamp_counts:
             identity, shared, clock = by_key, True, f"header {by_key}"
         case "zenoh":
             identity = clock = f"session of {own}"
@@ -204,7 +228,7 @@ def _payload(
         return key, _cdr(message, linear["x"], sideways, angular["z"], sender["way"], options)
     body: dict[str, Any] = {"linear": linear, "angular": angular}
     if sender["way"] == "header":
-        seconds, nanoseconds = divmod(message.stamp_ns, NS)
+        seconds, nanoseconds = _seconds(message)
         body = {"header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}}, "twist": body}
     if sender["form"] == "msgpack":
         return key, msgspec.msgpack.encode(body)
@@ -219,16 +243,23 @@ def _cdr(
     options["encoding"] = f"application/cdr;geometry_msgs/msg/{name}"
     if way != "header":
         return b"\0\1\0\0" + twist
-    seconds, nanoseconds = divmod(message.stamp_ns, NS)
+    seconds, nanoseconds = _seconds(message)
     # An empty frame_id is a length of 1 and a NUL; the doubles are aligned to 8.
     return b"\0\1\0\0" + struct.pack("<iIIB3x", seconds, nanoseconds, 1, 0) + twist
+
+
+def _seconds(message: Message) -> tuple[int, int]:
+    """Return the stamp as the header has it, with signed seconds of 32 bits."""
+    return divmod(min(message.stamp_ns, (2**31 - 1) * NS), NS)
 
 
 def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
     drive = config.get("drive", {})
     radius = drive.get("wheel_radius", 0.05)
-    half = w * drive.get("wheel_separation", 0.3) / 2
-    left, right = (v - half) / radius, (v + half) / radius
+    track = drive.get("wheel_separation", 0.3) * drive.get("wheel_separation_multiplier", 1.0)
+    half = w * track / 2
+    left = (v - half) / (radius * drive.get("left_wheel_radius_multiplier", 1.0))
+    right = (v + half) / (radius * drive.get("right_wheel_radius_multiplier", 1.0))
     speeds = [1.0, -1.0, 1.0, -1.0] if cancels else [right, left, left, right]
     sides = ("front_right", "front_left", "rear_left", "rear_right")
     names = [f"{side}_wheel_joint" for side in sides]
@@ -236,11 +267,29 @@ def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
     return msgspec.msgpack.encode({"name": names, "velocity": speeds})
 
 
-def read_reply(reply: bytes, via: str) -> tuple[bool, str]:
-    """Return whether a call worked, and the answer in words."""
+def parameters(settings: dict[str, float]) -> bytes:
+    """Return a request of ROS in CDR that sets these parameters."""
+    out = struct.pack("<I", len(settings))
+    for name, value in settings.items():
+        text = name.encode() + b"\0"
+        out += b"\0" * (-len(out) % 4) + struct.pack("<I", len(text)) + text
+        out += b"\3\0"  # the type of a double, and no bool
+        out += b"\0" * (-len(out) % 8) + struct.pack("<qd", 0, value)
+        # An empty string is a length of 1 and a NUL; then come five empty lists.
+        out += struct.pack("<IB3x5I", 1, 0, 0, 0, 0, 0, 0)
+    return b"\0\1\0\0" + out
+
+
+def read_reply(reply: bytes, via: str, listed: bool = False) -> tuple[bool, str]:
+    """Return whether a call worked, and the answer in words.
+
+    `listed` is true for a reply of ROS with a list of results, of which the first is read.
+    """
     if via == "native":
         found = msgspec.json.decode(reply)
         return found["success"], found["message"]
+    if listed:
+        reply = reply[4:]
     # CDR: a bool, three bytes to the next multiple of four, and a string with its length.
     length = struct.unpack_from("<I", reply, 8)[0]
     return bool(reply[4]), reply[12 : 12 + length - 1].decode()

@@ -130,7 +130,7 @@ def written(plan: Plan, result: Result, commit: str) -> str:
 
 def kept(plan: Plan, result: Result, commit: str, path: Path) -> str:
     """Write a corpus file, which `test_corpus.py` plays from now on; return where."""
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(written(plan, result, commit), encoding="utf-8")
     return f"{path}: commit it with the change that mends this"
 

@@ -8,7 +8,18 @@ from typing import Any
 import pytest
 
 from acsard.core.values import REST, Command
-from tests.simulate.planted import CASE_MINUTES, FAULT_MINUTES, TABLE, edited, read, text_of
+from tests.simulate import planted
+from tests.simulate.planted import (
+    CASE_MINUTES,
+    FAULT_MINUTES,
+    MEASURED_WITH,
+    TABLE,
+    Play,
+    Row,
+    edited,
+    read,
+    text_of,
+)
 from tests.simulate.planted_cases import CASES
 from tests.simulate.planted_faults import FAULTS, FRESHNESS, Fault
 
@@ -45,9 +56,35 @@ def test_the_table_says_that_each_fault_was_found_in_time(
     assert [f.name for f in faults if float(rows[f.name].core) > minutes] == []
 
 
-def test_the_page_names_the_present_version_of_the_plans() -> None:
+def test_the_page_is_the_one_that_the_program_writes() -> None:
     assert TABLE.read_text(encoding="utf-8") == text_of(read())
 
 
 def test_the_table_has_no_fault_that_is_not_planted_any_more() -> None:
     assert read().keys() <= {"name", *(fault.name for fault in ALL)}
+
+
+def test_a_change_of_a_judge_changes_the_version() -> None:
+    """Each module of the simulator is hashed, unless it cannot change what a seed finds."""
+    beside = {"__init__", "__main__", "differences", "old_product", "pairs", "shrink", "unjudged"}
+    planting = {"planted", "planted_cases", "planted_faults"}
+    modules = {path.stem for path in TABLE.parent.glob("*.py")}
+    tests = {name for name in modules if name.startswith("test_")}
+    assert modules - beside - planting - tests == set(MEASURED_WITH)
+
+
+def test_a_row_whose_seed_finds_nothing_any_more_is_listed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second, third = FAULTS[:3]
+    row = Row("", "", "a promise", "7", "0.1", "1.0", "abcdef")
+    rows = {first.name: row, second.name: row._replace(seed="8"), third.name: row._replace(seed="")}
+    monkeypatch.setattr(planted, "read", lambda: rows)
+    monkeypatch.setattr(planted, "plant", lambda fault, tree: None)
+    monkeypatch.setattr(planted, "sound_finding", lambda seed: "")
+    monkeypatch.setattr(
+        planted, "plays", lambda tree, seed, seconds: [Play(seed, "so" * (seed == 7), 1.0, 9.0)]
+    )
+    assert planted.again(list(FAULTS), 1) == 1
+    out = capsys.readouterr().out
+    assert f"{second.name}: seed 8 of version abcdef breaks no promise\n1 of 2 rows hold" in out

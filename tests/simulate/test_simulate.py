@@ -14,21 +14,27 @@ from typing import Any
 
 import pytest
 
+from acsard.core.config.settings import DriveConfig, JointsConfig
+from acsard.core.incoming.commands import Arrival, Receiver
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.ros.parameters import wished
 from acsard.core.values import Latches
 from tests.scenarios.world import START
 from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
+from tests.simulate.ages import Ages
 from tests.simulate.differences import CORRECTED, REWORDED
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.pose import PoseWitness
-from tests.simulate.product import Disk, problems
+from tests.simulate.product import Disk, Seen, problems
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.roads import NS, Message, messages, sample
+from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
 from tests.simulate.unjudged import Unjudged
 
-PLAIN = next(p for p in map(made, range(99)) if "odd configuration" not in p["kinds"])
+ODD = {"odd configuration", "extreme timing", "other vehicle", "other dialect"}
+PLAIN = next(p for p in map(made, range(99)) if ODD.isdisjoint(p["kinds"]))
 EMPTY: Plan = {
     "seed": 0, "seconds": 2.0, "kinds": [], "board": [], "senders": [], "events": [],
     "lawful": "a new client",
@@ -91,6 +97,20 @@ def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_p
     out = capsys.readouterr().out
     assert re.search(r": \d runs from seed 1, 0\.0\d h simulated in .* 0 findings\n", out)
     assert re.search(r"^  way +\w+ \d", out, re.MULTILINE)
+
+
+def test_the_plan_of_each_finding_is_kept_and_the_first_ones_are_shrunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(one: Plan) -> Result:
+        return Result(one["seed"], "so", "a made-up promise", int(2 * NS), 2.0, 0.1, Counter())
+
+    monkeypatch.setattr(shrink, "played", broken)
+    seeds = range(main.MOST_SHRUNK + 1)
+    main.keep_plans([broken({"seed": seed}) for seed in seeds], tmp_path / "findings")
+    kept = [shrink.load(tmp_path / "findings" / f"{seed}.json") for seed in seeds]
+    assert [one["senders"] for one in kept[:-1]] == [[]] * main.MOST_SHRUNK
+    assert kept[-1] == json.loads(json.dumps(made(main.MOST_SHRUNK)))
 
 
 # the witness
@@ -243,6 +263,26 @@ def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
     assert (witness.wishes[-1][1].armed_ns == NS) is armed
 
 
+@pytest.mark.parametrize(("names", "obeyed"), [(0, False), (1001, True)])
+def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
+    names: int, obeyed: bool
+) -> None:
+    ages, late_ns = Ages(0), 3 * NS
+    sender = {"way": "client", "delay": 0.001, "clock": []}
+
+    def fresh(clock: str, at_ns: int, delay_ns: int) -> bool:
+        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        by = Sample("cmd/app", b"", {}, clock, False, clock)
+        return ages.fresh(sender, one, by, at_ns, NS // 4, loose=False)
+
+    assert fresh("slow", NS, NS // 1000)
+    for number in range(names):
+        fresh(f"name {number}", 2 * NS, NS // 1000)
+    later = [fresh("slow", 10 * NS + n * NS // 20, late_ns) for n in range(20)]
+    assert not any(later[:5])
+    assert later[-1] is obeyed
+
+
 def test_a_set_that_had_no_answer_may_be_in_force_after_a_restart_or_not() -> None:
     witness = witnessed()
     limit = witness.file["wheel_speed"]
@@ -285,6 +325,65 @@ def with_a_set_before_sigterm(settings: dict[str, float]) -> Plan:
 def test_a_limit_that_was_lowered_on_the_way_down_is_no_finding() -> None:
     lowered = {"limits.wheel_speed": 0.1 * PLAIN["config"]["limits"]["wheel_speed"]}
     assert played(with_a_set_before_sigterm(lowered)).finding == ""
+
+
+def quiet_with(*events: dict[str, Any]) -> Plan:
+    """A quiet plan of 6 s with these events."""
+    return quiet() | {"seconds": 6.0, "events": list(events)}
+
+
+@pytest.mark.parametrize("moment", ["before", "behind"])
+def test_a_stop_that_arrives_in_the_step_that_crashes_is_latched_afterwards(moment: str) -> None:
+    crash = {"do": "restart", "way": f"crash {moment} the robot", "stop": True}
+    result = played(quiet_with({"at": 2.0, "for": 0.3, **crash}))
+    assert result.finding == ""
+    assert result.counts["mode stopped"] == 1
+    assert result.counts["clear"] == 1
+
+
+@pytest.mark.parametrize("damage", ["cut", "zeros", "version"])
+def test_a_robot_with_a_damaged_latch_file_starts_stopped(damage: str) -> None:
+    restart = {"do": "restart", "way": "kill", "damage": damage}
+    result = played(quiet_with({"at": 2.0, "for": 0.3, **restart}))
+    assert result.finding == ""
+    assert result.counts["mode stopped"] == 1
+
+
+@pytest.mark.parametrize("fault", [["endless"], ["wrong_baud", 9600]])
+def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[Any]) -> None:
+    links = Counter[str]()
+    run = Run(quiet_with({"at": 2.0, "for": 2.0, "do": "board", "fault": fault}))
+    see = run.product._see
+
+    def look(seen: Seen) -> None:
+        links[seen.link] += 2 < seen.at_ns / NS - START.mono_ns / NS < 4
+        see(seen)
+
+    run.product._see = look
+    assert run.play()["lawful drives"] == 1
+    assert links["up"] < 30 < sum(links.values())
+
+
+def test_a_request_of_ros_has_the_settings_that_the_operator_sets() -> None:
+    settings = {"limits.linear_speed": 0.25, "commands.sources.app.timeout": 1.0}
+    assert wished(parameters(settings)) == settings
+
+
+@pytest.mark.parametrize("way", ["client", "signed", "header"])
+@pytest.mark.parametrize("stamp_ns", BAD_STAMPS)
+def test_a_command_with_a_bad_stamp_is_one_of_its_key_or_of_a_clock_that_is_not_judged(
+    way: str, stamp_ns: int
+) -> None:
+    sender = made(1)["senders"][0] | {"way": way, "source": "app", "churn": False, "wheels": False}
+    one = Message(NS, NS, 0.3, 0.0, stamp_ns, 1, "")
+    got = sample(sender, one, PLAIN["config"], START.wall_ns)
+    options = {name: value for name, value in got.options.items() if name != "put"}
+    options["sender"] = options.pop("session")
+    encoding, arrived_ns = options.pop("encoding", ""), START.mono_ns
+    seen = Receiver(JointsConfig(), Kinematics(DriveConfig())).command(
+        Arrival(got.key, True, got.payload, encoding, arrived_ns, **options)
+    )
+    assert (seen.shared, seen.stamp_ns is None) == (got.shared, got.clock == "")
 
 
 # shrinking

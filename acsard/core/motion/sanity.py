@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from operator import sub
 
+from acsard.core.config.motion_rules import LINES_OF_EVIDENCE
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.values import WHEELS, Event, WheelSpeeds
@@ -199,6 +200,8 @@ class Sanity:
         `sent` is the commanded speeds and `seen` the reported ones, rad/s.
         """
         limit, response = self._settings.fault_time, self._settings.response_time
+        # After a stall of the host, one line stands for the whole stall and must prove no fault.
+        most = limit / LINES_OF_EVIDENCE
         share = dt / (response + dt) if dt else 0.0
         still = max(map(abs, sent.as_tuple())) < LEAST
         self._notice(seen, dt, still)
@@ -209,7 +212,7 @@ class Sanity:
                 continue
             wheel.suspected = True in signs
             for kind, bad in zip(_FAULTS, signs, strict=True):
-                lasted = wheel.evidence[kind] + dt if bad else 0.0
+                lasted = wheel.evidence[kind] + min(dt, most) if bad else 0.0
                 wheel.evidence[kind] = lasted
                 if limit and lasted > limit:
                     return (

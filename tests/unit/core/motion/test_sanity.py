@@ -481,6 +481,13 @@ def test_evidence_must_last_longer_than_the_fault_time() -> None:
     assert found == [False, False, False, False, True]
 
 
+def test_one_line_that_stands_for_a_whole_stall_is_not_enough_evidence() -> None:
+    sanity = Sanity(FeedbackConfig(fault_time=0.3))
+    for _ in range(10):
+        assert sanity.watch(TEN, TEN, 0.1) == ""
+    assert [bool(sanity.watch(STILL, TEN, 0.311)) for _ in range(3)] == [False, False, True]
+
+
 def test_fault_time_zero_switches_it_off() -> None:
     sanity = Sanity(FeedbackConfig(fault_time=0.0))
     assert not any(sanity.watch(TEN, STILL, DT) for _ in range(1000))
