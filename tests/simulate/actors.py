@@ -20,9 +20,11 @@ import msgspec
 
 from tests.simulate.liveness import Liveness
 from tests.simulate.plan import Plan
+from tests.simulate.plugging import Plugging
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.reasons import Reasons
 from tests.simulate.reports import Echo, Reports, judge_state
 from tests.simulate.roads import NS, Message, messages, read_reply, sample
 
@@ -76,6 +78,8 @@ class Run:
         self.reports, self.echo = Reports(), Echo()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
+        self.plugging = Plugging(self.witness.period_ns)
+        self.reasons = Reasons(self)
         self.failure: BrokenError | None = None
         self.todo: list[tuple[int, int, Callable[[], None]]] = []
         self._order = 0
@@ -87,6 +91,8 @@ class Run:
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
+        self._full_ns = self._blocked_ns = -NS
+        """When the disk was last seen full, and the output was last seen blocked."""
         self.epilogue = False
         self.moved_ns = -1
         self.product = Product(plan["config"], self._see)
@@ -184,6 +190,7 @@ class Run:
         true_ns = at_ns - START_NS + self.slept_ns
         self.witness.command(sender, message, one, true_ns)
         self.liveness.command(sender, one)
+        self.reasons.command(sender, message, one)
         shared = one.clock in self.witness.shared_clocks
         self.reports.command(sender, message, one, at_ns, shared)
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
@@ -260,7 +267,9 @@ class Run:
                     if not text.startswith("nothing changes"):
                         witness.set_limits(self.true_ns, event["settings"], true_ns)
                 case "set_pose" | "reset_odometry":
-                    self.pose.placed()
+                    x, y, yaw = event.get("pose", (0.0, 0.0, 0.0))
+                    at_once = self.true_ns - true_ns < 2 * witness.period_ns
+                    self.pose.placed((x, y, yaw) if at_once else None)
 
         self._calls[ticket] = event, true_ns, answered
         product.ask(at_ns, verb, ticket, payload, via, attachment)
@@ -374,6 +383,7 @@ class Run:
         self.resumed_ns = product.now_ns
         product.step_wall(lasts_ns / NS)
         self.witness.suspended(true_ns + lasts_ns)
+        self.reasons.restart()
         self.at(self.true_ns + 20_000_000, lambda: self.plug(False))
 
     def _restart(self, event: dict[str, Any], after_ns: int) -> None:
@@ -396,6 +406,7 @@ class Run:
             self._linked = False
             witness.new_life(self.true_ns)
             self.reports = Reports()
+            self.reasons.restart()
             self.pose.doubt()
 
         self.at(after_ns + 1000, start)
@@ -434,11 +445,25 @@ class Run:
                 _, _, answered = self._calls.pop(ticket)
                 answered(reply)
 
+    def _late_answers(self, true_ns: int) -> None:
+        """Judge that no call waits for long while the host runs and the disk takes the latches."""
+        woke_ns = self.resumed_ns - START_NS + self.slept_ns
+        calm_ns = max(self._full_ns, self._stalled_ns, woke_ns)
+        for call, arrived_ns, _ in self._calls.values():
+            if true_ns - max(arrived_ns, calm_ns) > NS:
+                text = f"{call['verb']} by {call['by']} came at {arrived_ns / NS:.3f} s"
+                raise BrokenError("every call has an answer", true_ns, text)
+
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
+        if self.product.disk.full:
+            self._full_ns = true_ns
+        if witness.blocked_ns is not None:
+            self._blocked_ns = true_ns
         if self._calls:
             self._take_answers()
+            self._late_answers(true_ns)
         witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
             self.pose.placed()
@@ -458,11 +483,14 @@ class Run:
             if any(witness.last):
                 self.moved_ns = at_ns + offset
         self.liveness.look(true_ns)
+        self.reasons.look(true_ns, self._stalled_ns)
         if seen.estimates:
             lies, truth = {name for name, _ in self.active}, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
             witness.wheels(true_ns, truth[4])
         self.pose.end_step()
+        calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
+        self.plugging.see(true_ns, seen, self.product, calm_ns)
         if self.log is not None:
             self.log(
                 {

@@ -379,6 +379,20 @@ FAULTS = (
         "",
     ),
     fault(
+        "robot reason",
+        "a robot that stands says `no command`, whatever the cause is",
+        ROBOT,
+        'return f"{chosen(self._choice)}{self.session.note}"',
+        'return "no command"',
+    ),
+    fault(
+        "robot waits",
+        "`state` names no source whose commands are late or not proved yet",
+        ARBITER,
+        "return source.doubted(now_ns) or COMMAND",
+        "return COMMAND",
+    ),
+    fault(
         "robot unsent",
         "a line that never left counts as obeyed",
         ROBOT,
@@ -408,6 +422,29 @@ FAULTS = (
         "self.restarted = False",
     ),
     fault(
+        "session unplugged",
+        "the link stays up for half a second behind an unplugging",
+        SESSION,
+        "        if not port_open or opened != self._opened:",
+        "        if (not port_open and self.silent(now.mono_ns - NS_PER_S // 2)) or (\n"
+        "            opened != self._opened\n"
+        "        ):",
+    ),
+    fault(
+        "session first",
+        "the first line to a board that was plugged in waits for a second",
+        SESSION,
+        "        if self.silent(now_ns):\n",
+        "        if now_ns - self._opened_ns < NS_PER_S:\n            return None\n"
+        "        if self.silent(now_ns):\n",
+        Edit(
+            SESSION,
+            '        self._link.sign("opened" if port_open else "closed")',
+            "        self._opened_ns = now_ns\n"
+            '        self._link.sign("opened" if port_open else "closed")',
+        ),
+    ),
+    fault(
         "gate late",
         "a line that was made before a stall leaves after it",
         "core/link/serial_output.py",
@@ -429,6 +466,24 @@ FAULTS = (
         "moving and turns < 0.1 * size,",
         "moving and turns < 0.97 * size,",
     ),
+    # bus
+    fault(
+        "bus reasons",
+        "a message that is too big is counted as one that cannot be read",
+        COMMANDS,
+        'raise DecodeError("too_big", f"{len(arrival.payload)} bytes")',
+        'raise DecodeError("malformed", f"{len(arrival.payload)} bytes")',
+    ),
+    fault(
+        "bus answers",
+        "a call that is refused has no answer",
+        LOOP,
+        "            if reply is not None:\n                self._bus.reply(reply)\n"
+        "                self._bus.retire",
+        "            if reply is not None and answer.success:\n"
+        "                self._bus.reply(reply)\n"
+        "                self._bus.retire",
+    ),
     # odometry
     fault(
         "odometry turn",
@@ -443,6 +498,14 @@ FAULTS = (
         PATH,
         "_wrapped(self._yaw, turn)",
         "_wrapped(self._yaw, 1.2 * turn)",
+    ),
+    fault(
+        "odometry set",
+        "set_pose takes x for y",
+        ODOMETRY,
+        "self._path.set(pose)\n        self._steps.clear()\n        self._uncertainty",
+        "self._path.set(Pose(pose.y, pose.x, pose.yaw))\n        self._steps.clear()\n"
+        "        self._uncertainty",
     ),
     # latch file
     fault(

@@ -35,16 +35,23 @@ class PoseWitness:
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False
+        self._asked: Pose | None = None
+        """The pose that a call of this step has set, if its time is known."""
+        self._expected: tuple[Pose, Pose] | None = None
+        """The true pose at the last sample before a call, and the pose that the call has set."""
         self._room = 0.0
         self._last: tuple[int, Pose] | None = None
 
     def doubt(self) -> None:
         """The encoders missed a part of the drive: restart the comparison at the next estimate."""
-        self._anchor = self._last = None
+        self._anchor = self._last = self._expected = None
 
-    def placed(self) -> None:
-        """The pose was set: the estimates of this step are still the old ones."""
-        self._placed = True
+    def placed(self, asked: Pose | None = None) -> None:
+        """The pose was set: the estimates of this step are still the old ones.
+
+        `asked` is the new pose, None if it is not certain that this step has set it.
+        """
+        self._placed, self._asked = True, asked
 
     def see(
         self,
@@ -69,8 +76,12 @@ class PoseWitness:
     def end_step(self) -> None:
         """Forget the pose if it was set in this step."""
         if self._placed:
-            self._placed = False
+            last, asked = self._last, self._asked
+            self._placed, self._asked = False, None
             self.doubt()
+            true = None if last is None else self._true_at(last[0])
+            if true is not None and asked is not None:
+                self._expected = true, asked
 
     def _one(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
@@ -89,6 +100,9 @@ class PoseWitness:
         if true is None:
             return
         by_time = 0.1 * self.speed_at(at_ns)
+        if self._expected is not None:
+            self._put(now_ns, self._expected, true, pose, by_time)
+            self._expected = None
         if self._anchor is None:
             self._anchor = true, pose
             self._room = by_time
@@ -112,6 +126,16 @@ class PoseWitness:
                 "the pose stays within its covariance", now_ns,
                 f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",
             )  # fmt: skip
+
+    def _put(
+        self, now_ns: int, expected: tuple[Pose, Pose], true: Pose, pose: Pose, room: float
+    ) -> None:
+        """Judge the first estimate behind a call: it has the pose asked for, and moved since."""
+        x, y, yaw = _through(expected, true)
+        off, turned = math.hypot(pose[0] - x, pose[1] - y), math.remainder(pose[2] - yaw, math.tau)
+        if off > ROOM_M + room or abs(turned) > ROOM_RAD + room / self.track:
+            text = f"{expected[1]} was asked for, and {pose} is {off:.3f} m, {turned:.3f} rad off"
+            raise BrokenError("the pose is put where a call asks for it", now_ns, text)
 
     def speed_at(self, at_ns: int) -> float:
         """Return the true speed about then, m/s, with that of the rim in a turn."""

@@ -154,6 +154,8 @@ class Product:
         self.dropped = 0
         """Samples that the inbox had no room for, of this daemon."""
         self.echo = False
+        self.unplugged_ns = self.plugged_ns = START_NS
+        """When the board was last unplugged, and plugged in: a daemon that starts finds it so."""
         self._world = World(self._config, keeper=self.disk)
         self._began()
 
@@ -294,6 +296,7 @@ class Product:
         self._world.mcu.reset(self.now_ns, deaf_ns)
 
     def unplug(self) -> None:
+        self.unplugged_ns = self.now_ns
         self._world.port.unplug()
         self._world.port.trouble = "the device is gone"
 
@@ -318,6 +321,7 @@ class Product:
             world.mcu.advance(self.now_ns)
         world.port.trouble = ""
         world.port.plug(world.mcu)
+        self.plugged_ns = self.now_ns
 
     def truth(self) -> tuple[int, float, float, float, float]:
         """Return the time of the board, the true pose, and the true speed of the fastest wheel."""
@@ -378,6 +382,7 @@ class Product:
             world.mcu._see = world._see
         if old.port.mcu is not None:
             world.port.plug(world.mcu)
+        self.plugged_ns = self.now_ns
         world.port.blocked = old.port.blocked
         self._world, self.alive = world, True
         self._began()

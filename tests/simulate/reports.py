@@ -6,7 +6,7 @@ of its speed while the board says nothing.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from typing import Any
 
 from tests.simulate.ages import MARGIN_NS
@@ -15,6 +15,13 @@ from tests.simulate.roads import NS, Message, Sample, stable
 
 KEPT = 4000
 """Commands that are remembered: those of the longest timeout, 3 s, at 400 Hz by three senders."""
+
+REFUSED_AS = {
+    "garbage": "malformed", "not a number": "not_finite", "delete": "not_a_put",
+    "wildcard": "wildcard", "huge": "too_big", "stranger": "unknown_source",
+    "fields": "wrong_shape",
+}  # fmt: skip
+"""The reason by which each kind of junk is counted."""
 
 ECHO_LINES, ECHO_CHANGE = 40, 6.0
 """Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as
@@ -31,11 +38,17 @@ class Reports:
         self._order: deque[int] = deque()
         self._followed: dict[str, int] = {}
         """The highest number that the robot has followed, by clock."""
+        self._junk: Counter[str] = Counter()
+        """Junk that arrived, by the reason for which it is refused."""
 
     def command(
         self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int, loose: bool
     ) -> None:
         """Take note of a command; `loose` if other senders stamp by the same clock."""
+        if message.junk in REFUSED_AS:
+            # A twist is no list of joints, so it names none of the wheels.
+            names_no_wheel = message.junk == "fields" and sample.key.startswith("wheel_cmd/")
+            self._junk["wrong_wheels" if names_no_wheel else REFUSED_AS[message.junk]] += 1
         known = None
         if sample.clock and stable(sender) and not (loose or sender["churn"]):
             known = sample.clock, message.number
@@ -64,6 +77,14 @@ class Reports:
             )  # fmt: skip
         self._followed[clock] = number
         return clock
+
+    def judge_junk(self, at_ns: int, state: dict[str, Any], dropped: int) -> None:
+        """Hold the counters of junk against what arrived; `dropped` messages were never read."""
+        for reason in {*REFUSED_AS.values(), "wrong_wheels"}:
+            expected, counted = self._junk[reason], state["counters"].get(f"command_{reason}", 0)
+            if not expected - dropped <= counted <= expected:
+                text = f"{expected} arrived, {counted} are counted as {reason}"
+                raise BrokenError("every bad command is counted by its reason", at_ns, text)
 
 
 def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -> None:
