@@ -25,7 +25,7 @@ from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.reasons import Reasons
-from tests.simulate.reports import Echo, Reports, judge_state
+from tests.simulate.reports import Echo, Reports, judge_pose, judge_state
 from tests.simulate.roads import NS, Message, messages, read_reply, sample
 
 
@@ -339,7 +339,10 @@ class Run:
         """Judge what `state` says, unless the daemon has just slept or stood still."""
         product, since_ns = self.product, self.true_ns - NS // 10
         if product.alive and self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
-            judge_state(self.true_ns, product.state(), self._fed_ns, self.witness.quiet_ns)
+            state, quiet_ns = product.state(), self.witness.quiet_ns
+            judge_state(self.true_ns, state, self._fed_ns, quiet_ns)
+            if self.pose.latest is not None and not self._calls:
+                judge_pose(self.true_ns, state, self.pose.latest, self._fed_ns, quiet_ns)
 
     def _block(self, blocked: bool) -> None:
         self.liveness.event()
@@ -349,7 +352,7 @@ class Run:
     def _troubled(self, name: str) -> None:
         self.witness.troubles[name] = self.true_ns
         if name in LIARS:
-            self.pose.doubt()
+            self.pose.doubt(name == "mute")
 
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
         self.active.remove(fault)
@@ -406,6 +409,7 @@ class Run:
             self._linked = False
             witness.new_life(self.true_ns)
             self.reports = Reports()
+            self.pose.latest = None
             self.reasons.restart()
             self.pose.doubt()
 

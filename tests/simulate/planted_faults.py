@@ -507,6 +507,28 @@ FAULTS = (
         "self._path.set(Pose(pose.y, pose.x, pose.yaw))\n        self._steps.clear()\n"
         "        self._uncertainty",
     ),
+    fault(
+        "odometry gap",
+        "a gap while the robot moves does not make the pose less certain",
+        ODOMETRY,
+        "        if rolled.unknown > 0.0:\n            self._stand",
+        "        if rolled.unknown > 1e9:\n            self._stand",
+        Edit(
+            ODOMETRY,
+            "self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))",
+            "self._gaps.interrupt(twist)",
+        ),
+    ),
+    fault(
+        "odometry silent",
+        "the pose goes on at the last speed while the board is silent",
+        ROBOT,
+        "        if not feedback:\n            return ()",
+        "        if not feedback:\n"
+        '            if link != "up" and session.good_lines:\n'
+        "                self._odometry._path.advance(0.01 * self._odometry.twist.linear, 0.0)\n"
+        "            return ()",
+    ),
     # latch file
     fault(
         "latches kept",

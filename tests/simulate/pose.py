@@ -17,6 +17,16 @@ LIARS = {
 }  # fmt: skip
 """Board faults with which the encoders lie, or say nothing while the robot may move."""
 
+GAP_NS = 3 * NS // 10
+"""A gap of the estimates of this length and more is judged by itself."""
+
+MOVES = 0.1
+"""Speed, m/s, from which on a robot certainly moves before a gap."""
+
+VAGUE = 0.05
+"""Variance, m2, from which on a gap may be lost in it: the variance of a robot whose heading is
+nearly unknown also falls."""
+
 SIGMAS = 6.0
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
@@ -41,10 +51,19 @@ class PoseWitness:
         """The true pose at the last sample before a call, and the pose that the call has set."""
         self._room = 0.0
         self._last: tuple[int, Pose] | None = None
+        self.latest: Pose | None = None
+        """The pose of the last estimate, None if it was set since."""
+        self._before: tuple[int, Pose, Pose, float, float] | None = None
+        """Time, pose, true pose, true speed and variance at the last estimate before a silence."""
 
-    def doubt(self) -> None:
-        """The encoders missed a part of the drive: restart the comparison at the next estimate."""
+    def doubt(self, mute: bool = False) -> None:
+        """The encoders missed a part of the drive: restart the comparison at the next estimate.
+
+        A board that was only `mute` leaves a gap, which is judged by itself.
+        """
         self._anchor = self._last = self._expected = None
+        if not mute:
+            self._before = None
 
     def placed(self, asked: Pose | None = None) -> None:
         """The pose was set: the estimates of this step are still the old ones.
@@ -65,19 +84,28 @@ class PoseWitness:
         at_ns, x, y, yaw, _ = truth
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         lies = not LIARS.isdisjoint(faults)
+        silent_only = not lies or faults & LIARS == {"mute"}
         if lies:
-            self.doubt()
+            self.doubt(silent_only)
+        before = self._before
+        if before is not None and silent_only:
+            self._gap(now_ns, before, estimates[0], offset_ns, (x, y, yaw))
         for sampled_ns, ex, ey, eyaw, covariance, _ in estimates:
             # A sum is finite only if each of its numbers is.
             if not math.isfinite(ex + ey + eyaw + sum(covariance)):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
             self._one(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
+        sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, _), _ = estimates[-1]
+        self.latest = ex, ey, eyaw
+        if silent_only:
+            last_ns = sampled_ns + offset_ns
+            self._before = last_ns, self.latest, (x, y, yaw), self.speed_at(last_ns), xx + yy
 
     def end_step(self) -> None:
         """Forget the pose if it was set in this step."""
         if self._placed:
             last, asked = self._last, self._asked
-            self._placed, self._asked = False, None
+            self._placed, self._asked, self.latest = False, None, None
             self.doubt()
             true = None if last is None else self._true_at(last[0])
             if true is not None and asked is not None:
@@ -126,6 +154,31 @@ class PoseWitness:
                 "the pose stays within its covariance", now_ns,
                 f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",
             )  # fmt: skip
+
+    def _gap(
+        self,
+        now_ns: int,
+        before: tuple[int, Pose, Pose, float, float],
+        estimate: Any,
+        offset_ns: int,
+        true: Pose,
+    ) -> None:
+        """Judge the first estimate after a gap: its covariance grew by the motion in the gap."""
+        then_ns, pose, true_then, speed, variance = before
+        sampled_ns, ex, ey, _, (xx, _, _, yy, _, _), _ = estimate
+        if sampled_ns + offset_ns - then_ns < GAP_NS or speed < MOVES:
+            return
+        if variance > VAGUE:
+            variance = 0.0
+        x, y, _ = _through((true_then, pose), true)
+        off, sigma = math.hypot(ex - x, ey - y), math.sqrt(max(0.0, xx + yy - variance))
+        if off > SIGMAS * sigma + ROOM_M + 0.1 * speed:
+            text = f"{off:.3f} m off after {(sampled_ns + offset_ns - then_ns) / NS:.3f} s"
+            raise BrokenError(
+                "a gap while moving is in the covariance",
+                now_ns,
+                f"{text}, sigma grew {sigma:.3f} m",
+            )
 
     def _put(
         self, now_ns: int, expected: tuple[Pose, Pose], true: Pose, pose: Pose, room: float

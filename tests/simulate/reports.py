@@ -46,9 +46,9 @@ class Reports:
     ) -> None:
         """Take note of a command; `loose` if other senders stamp by the same clock."""
         if message.junk in REFUSED_AS:
-            # A twist is no list of joints, so it names none of the wheels.
-            names_no_wheel = message.junk == "fields" and sample.key.startswith("wheel_cmd/")
-            self._junk["wrong_wheels" if names_no_wheel else REFUSED_AS[message.junk]] += 1
+            # A twist on a key of wheel speeds is wrong in two ways.
+            twice_wrong = message.junk in ("fields", "garbage") and "wheel_cmd/" in sample.key
+            self._junk["unreadable" if twice_wrong else REFUSED_AS[message.junk]] += 1
         known = None
         if sample.clock and stable(sender) and not (loose or sender["churn"]):
             known = sample.clock, message.number
@@ -80,9 +80,12 @@ class Reports:
 
     def judge_junk(self, at_ns: int, state: dict[str, Any], dropped: int) -> None:
         """Hold the counters of junk against what arrived; `dropped` messages were never read."""
-        for reason in {*REFUSED_AS.values(), "wrong_wheels"}:
+        for reason in REFUSED_AS.values():
             expected, counted = self._junk[reason], state["counters"].get(f"command_{reason}", 0)
-            if not expected - dropped <= counted <= expected:
+            most = expected
+            if reason in ("malformed", "wrong_shape"):
+                most += self._junk["unreadable"]
+            if not expected - dropped <= counted <= most:
                 text = f"{expected} arrived, {counted} are counted as {reason}"
                 raise BrokenError("every bad command is counted by its reason", at_ns, text)
 
@@ -95,6 +98,17 @@ def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -
             "state has no speed of a silent board", at_ns,
             f"last heard {fed_ns / NS:.3f} s, and state says {said}",
         )  # fmt: skip
+
+
+def judge_pose(
+    at_ns: int, state: dict[str, Any], pose: tuple[float, float, float], fed_ns: int, quiet_ns: int
+) -> None:
+    """Hold the pose in `state` against that of the last estimate, while the board is silent."""
+    said = state["x"], state["y"], state["yaw"]
+    moved = max(abs(a - b) for a, b in zip(said, pose, strict=True))
+    if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and moved > 1e-6:
+        text = f"last heard {fed_ns / NS:.3f} s; the pose was {pose}, and state says {said}"
+        raise BrokenError("the pose of a silent board stays", at_ns, text)
 
 
 def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:

@@ -26,7 +26,7 @@ from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, Seen, problems
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.reasons import kind_of
-from tests.simulate.reports import Reports
+from tests.simulate.reports import Reports, judge_pose
 from tests.simulate.roads import NS, Message, messages, sample
 
 PLAIN = next(p for p in map(made, range(99)) if "odd configuration" not in p["kinds"])
@@ -305,6 +305,32 @@ def test_a_pose_that_is_put_elsewhere_than_a_call_asked_for_is_a_finding() -> No
     put((2.0, -3.0, 0.5))
     with pytest.raises(BrokenError, match="put where a call asks for it"):
         put((-3.0, 2.0, 0.5))
+
+
+@pytest.mark.parametrize(("grown", "finding"), [(0.01, False), (0.0, True)])
+def test_a_gap_while_moving_that_leaves_the_covariance_as_it_was_is_a_finding(
+    grown: float, finding: bool
+) -> None:
+    witness = PoseWitness(PLAIN["config"])
+
+    def see(at_s: float, x: float, true_x: float, variance: float) -> None:
+        at_ns = int(at_s * NS)
+        estimate = at_ns, x, 0.0, 0.0, (variance, 0.0, 0.0, variance, 0.0, 0.01), ()
+        witness.see(at_ns, [estimate], (at_ns, true_x, 0.0, 0.0, 0.0), 0, set())
+
+    for n in range(3):
+        see(n * 0.01, n * 0.005, n * 0.005, 0.01)
+    witness.doubt(mute=True)
+    with pytest.raises(BrokenError, match="in the covariance") if finding else nullcontext():
+        see(1.0, 0.01, 0.3, 0.01 + grown)
+
+
+def test_a_pose_in_state_that_moves_while_the_board_is_silent_is_a_finding() -> None:
+    state = {"x": 1.0, "y": 2.0, "yaw": 0.5}
+    judge_pose(2 * NS, state, (1.0, 2.0, 0.5), NS, NS // 10)
+    judge_pose(2 * NS, state, (0.9, 2.0, 0.5), 2 * NS - NS // 20, NS // 10)
+    with pytest.raises(BrokenError, match="the pose of a silent board stays"):
+        judge_pose(2 * NS, state, (0.9, 2.0, 0.5), NS, NS // 10)
 
 
 class Board(NamedTuple):
