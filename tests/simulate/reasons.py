@@ -152,7 +152,8 @@ class Reasons:
         if witness.pending or witness.churns or stalled_ns > now_ns - NS:
             return
         self._looked_ns = now_ns
-        self._calm_ns = max(run.liveness.event_ns, stalled_ns)
+        # A board that greets after a reset disarms all, and then the robot becomes ready again.
+        self._calm_ns = max(run.liveness.event_ns, stalled_ns, self._ready_ns)
         wishing = [
             source
             for source, senders in self._heard.items()
