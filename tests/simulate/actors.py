@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.simulate.damage import Damage
 from tests.simulate.liveness import Liveness
 from tests.simulate.plan import Plan
 from tests.simulate.plugging import Plugging
@@ -75,7 +76,7 @@ class Run:
         """Monotonic time of the last resume: before it nothing can have arrived."""
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
-        self.reports, self.echo = Reports(), Echo()
+        self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
         self.plugging = Plugging(self.witness.period_ns)
@@ -88,6 +89,8 @@ class Run:
         self._ticket = 0
         self.active: list[tuple[str, tuple[Any, ...]]] = []
         self._fed_ns = 0
+        self._plain = "link_check" not in plan["config"]["mcu"]
+        """The serial lines have no check, so that a whole line always counts."""
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
@@ -370,6 +373,7 @@ class Run:
         self.liveness.event()
         if not self.product.plugged:
             self.product.plug(new)
+            self.damage.forget()
             self._disarmed(self.true_ns)
             self._linked = False
 
@@ -410,6 +414,7 @@ class Run:
             witness.new_life(self.true_ns)
             self.reports = Reports()
             self.pose.latest = None
+            self.damage.forget()
             self.reasons.restart()
             self.pose.doubt()
 
@@ -418,6 +423,7 @@ class Run:
     # what the product shows
 
     def _fed(self, at_ns: int, data: bytes) -> None:
+        self.damage.fed(data)
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
         true_ns = at_ns - START_NS + self.slept_ns
@@ -488,6 +494,8 @@ class Run:
                 self.moved_ns = at_ns + offset
         self.liveness.look(true_ns)
         self.reasons.look(true_ns, self._stalled_ns)
+        if self._plain and not self.echo.on:
+            self.damage.look(true_ns, lambda: int(self.product.state()["counters"]["lines"]))
         if seen.estimates:
             lies, truth = {name for name, _ in self.active}, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)

@@ -445,6 +445,21 @@ FAULTS = (
         ),
     ),
     fault(
+        "session deaf",
+        "behind a damaged line the next five lines are ignored",
+        SESSION,
+        "        if line.startswith(IDENTITY):",
+        "        self._deaf = getattr(self, '_deaf', 0) - 1\n"
+        "        if self._deaf > 0:\n            return None\n"
+        "        if line.startswith(IDENTITY):",
+        Edit(
+            SESSION,
+            "            self._reject(error.reason, line)\n            self._bad()",
+            "            self._reject(error.reason, line)\n            self._bad()\n"
+            "            self._deaf = 6",
+        ),
+    ),
+    fault(
         "gate late",
         "a line that was made before a stall leaves after it",
         "core/link/serial_output.py",

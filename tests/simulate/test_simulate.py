@@ -19,6 +19,7 @@ from tests.scenarios.world import START
 from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, played
+from tests.simulate.damage import Damage
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.plugging import Plugging
@@ -363,6 +364,19 @@ def test_the_judge_sees_a_board_that_comes_and_goes(
     judged = pytest.raises(BrokenError, match=promise) if promise else nullcontext()
     with judged:
         Plugging(NS // 100).see(at_ns, seen, board, 0)
+
+
+@pytest.mark.parametrize(("lost", "finding"), [(2, False), (3, True)])
+def test_whole_lines_that_are_not_heard_behind_a_damaged_one_are_a_finding(
+    lost: int, finding: bool
+) -> None:
+    damage, whole = Damage(), b"ap00.10,bp00.10,cp00.10,dp00.10\r\n"
+    damage.fed(whole + whole[9:])
+    with pytest.raises(BrokenError, match="are heard behind") if finding else nullcontext():
+        for n in range(1, 9):
+            damage.fed(whole[:7])
+            damage.fed(whole[7:])
+            damage.look(n * NS, lambda n=n: max(0, n - lost))  # type: ignore[misc]
 
 
 # shrinking
