@@ -87,7 +87,7 @@ class _Heard:
         """Arrival of the last command, and of the last one that is a speed."""
         self.armed_ns = -1
         self.clock: _Clock | None = None
-        self.foreign = False
+        self.foreign = self.shared = False
 
 
 class Reasons:
@@ -102,16 +102,21 @@ class Reasons:
         """Forget all senders: another daemon starts, or the robot's clock stood."""
         self._clocks: dict[str, _Clock] = {}
         self._heard: dict[str, dict[str, _Heard]] = {}
+        self._junk: set[str] = set()
+        """Sources with refused messages, any of which may undo the zero of a shared identity."""
 
     def command(self, sender: dict[str, Any], message: Message, one: Sample) -> None:
         """Take note of a command that the witness has noted just before."""
+        source = sender["source"]
+        if message.junk:
+            self._junk.add(source)
         if message.junk not in ("", "cancels") or sender["churn"]:
             return
-        source = sender["source"]
         wish = self.run.witness.wishes[-1][1]
         at_ns, delay_ns = wish.arrived_ns, wish.arrived_ns - message.sent_ns
         heard = self._heard.setdefault(source, {}).setdefault(one.identity, _Heard())
         heard.arrived_ns, heard.armed_ns = at_ns, wish.armed_ns
+        heard.shared = one.shared
         heard.foreign = sender["way"] in FOREIGN
         if wish.v or wish.w:
             heard.speed_ns = at_ns
@@ -194,9 +199,9 @@ class Reasons:
         witness, found = self.run.witness, set[str]()
         timeout_ns = witness.timeout[source]
         for heard in self._live(source, now_ns):
-            clock, certain = heard.clock, True
+            clock, certain = heard.clock, not (heard.shared and source in self._junk)
             if clock is not None:
-                certain = clock.known(heard.armed_ns, timeout_ns)
+                certain &= clock.known(heard.armed_ns, timeout_ns)
                 may_be_known = not heard.foreign or clock.may_be_known(now_ns, timeout_ns)
                 if not clock.steady and may_be_known:
                     found.add("late")
