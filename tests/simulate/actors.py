@@ -18,12 +18,15 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.simulate.damage import Damage
 from tests.simulate.liveness import Liveness
 from tests.simulate.plan import Plan
+from tests.simulate.plugging import Plugging
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import DIALECTS, BrokenError, Witness
-from tests.simulate.reports import Echo, Reports, judge_state
+from tests.simulate.reasons import Reasons
+from tests.simulate.reports import Echo, Reports, judge_pose, judge_state
 from tests.simulate.roads import NS, Message, messages, parameters, read_reply, sample
 
 
@@ -73,9 +76,11 @@ class Run:
         """Monotonic time of the last resume: before it nothing can have arrived."""
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
-        self.reports, self.echo = Reports(), Echo()
+        self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
+        self.plugging = Plugging(self.witness.period_ns)
+        self.reasons = Reasons(self)
         self.failure: BrokenError | None = None
         self.todo: list[tuple[int, int, Callable[[], None]]] = []
         self._order = 0
@@ -88,9 +93,13 @@ class Run:
         self._fed_ns = 0
         self._ended = b""
         """The last byte of the board that reached the daemon."""
+        self._plain = "link_check" not in plan["config"]["mcu"]
+        """The serial lines have no check, so that a whole line always counts."""
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
+        self._full_ns = self._blocked_ns = -NS
+        """When the disk was last seen full, and the output was last seen blocked."""
         self.epilogue = False
         self.moved_ns = -1
         self.product = Product(plan["config"], self._see)
@@ -188,6 +197,7 @@ class Run:
         true_ns = at_ns - START_NS + self.slept_ns
         self.witness.command(sender, message, one, true_ns)
         self.liveness.command(sender, one)
+        self.reasons.command(sender, message, one)
         shared = one.clock in self.witness.shared_clocks
         self.reports.command(sender, message, one, at_ns, shared)
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
@@ -282,7 +292,9 @@ class Run:
                     if not text.startswith("nothing changes"):
                         witness.set_limits(self.true_ns, event["settings"], true_ns)
                 case "set_pose" | "reset_odometry":
-                    self.pose.placed()
+                    x, y, yaw = event.get("pose", (0.0, 0.0, 0.0))
+                    at_once = self.true_ns - true_ns < 2 * witness.period_ns
+                    self.pose.placed((x, y, yaw) if at_once else None)
 
         self._calls[ticket] = event, true_ns, answered
         product.ask(at_ns, service, ticket, payload, via, attachment)
@@ -353,7 +365,10 @@ class Run:
         """Judge what `state` says, unless the daemon has just slept or stood still."""
         product, since_ns = self.product, self.true_ns - NS // 10
         if product.alive and self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
-            judge_state(self.true_ns, product.state(), self._fed_ns, self.witness.quiet_ns)
+            state, quiet_ns = product.state(), self.witness.quiet_ns
+            judge_state(self.true_ns, state, self._fed_ns, quiet_ns)
+            if self.pose.latest is not None and not self._calls:
+                judge_pose(self.true_ns, state, self.pose.latest, self._fed_ns, quiet_ns)
 
     def _block(self, blocked: bool) -> None:
         self.liveness.event()
@@ -364,7 +379,7 @@ class Run:
         if name not in DIALECTS:
             self.witness.troubles[name] = self.true_ns
         if name in LIARS:
-            self.pose.doubt()
+            self.pose.doubt(name == "mute")
 
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
         self.active.remove(fault)
@@ -382,6 +397,7 @@ class Run:
         self.liveness.event()
         if not self.product.plugged:
             self.product.plug(new)
+            self.damage.forget()
             self._disarmed(self.true_ns)
             self._linked = False
 
@@ -398,6 +414,7 @@ class Run:
         self.resumed_ns = product.now_ns
         product.step_wall(lasts_ns / NS)
         self.witness.suspended(true_ns + lasts_ns)
+        self.reasons.restart()
         self.at(self.true_ns + 20_000_000, lambda: self.plug(False))
 
     def _restart(self, event: dict[str, Any], after_ns: int) -> None:
@@ -427,6 +444,9 @@ class Run:
             self._linked = False
             witness.new_life(self.true_ns)
             self.reports = Reports()
+            self.pose.latest = None
+            self.damage.forget()
+            self.reasons.restart()
             self.pose.begin()
 
         self.at(after_ns + 1000, start)
@@ -437,6 +457,7 @@ class Run:
         before, self._ended = self._ended, data[-1:]
         if b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
             self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
+        self.damage.fed(data)
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
         if any(name == "endless" for name, _ in self.active):
@@ -470,11 +491,25 @@ class Run:
                 _, _, answered = self._calls.pop(ticket)
                 answered(reply)
 
+    def _late_answers(self, true_ns: int) -> None:
+        """Judge that no call waits for long while the host runs and the disk takes the latches."""
+        woke_ns = self.resumed_ns - START_NS + self.slept_ns
+        calm_ns = max(self._full_ns, self._stalled_ns, woke_ns)
+        for call, arrived_ns, _ in self._calls.values():
+            if true_ns - max(arrived_ns, calm_ns) > NS:
+                text = f"{call['verb']} by {call['by']} came at {arrived_ns / NS:.3f} s"
+                raise BrokenError("every call has an answer", true_ns, text)
+
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
+        if self.product.disk.full:
+            self._full_ns = true_ns
+        if witness.blocked_ns is not None:
+            self._blocked_ns = true_ns
         if self._calls:
             self._take_answers()
+            self._late_answers(true_ns)
         witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
             self.pose.placed()
@@ -496,11 +531,16 @@ class Run:
             if any(witness.last):
                 self.moved_ns = at_ns + offset
         self.liveness.look(true_ns)
+        self.reasons.look(true_ns, self._stalled_ns)
+        if self._plain and not self.echo.on:
+            self.damage.look(true_ns, lambda: int(self.product.state()["counters"]["lines"]))
         if seen.estimates:
             lies, truth = {name for name, _ in self.active}, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
             witness.wheels(true_ns, truth[4])
         self.pose.end_step()
+        calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
+        self.plugging.see(true_ns, seen, self.product, calm_ns)
         if self.log is not None:
             self.log(
                 {

@@ -46,6 +46,11 @@ class Liveness:
         self._latest: dict[str, tuple[int, str]] = {}
         self._lawful: set[str] | None = None
 
+    @property
+    def event_ns(self) -> int:
+        """Return the time of the last event."""
+        return self._event_ns
+
     def event(self) -> None:
         """Note that something happened beside commands."""
         self._event_ns = self.run.true_ns
@@ -113,6 +118,7 @@ class Liveness:
             run.plug(False)
         product.disk.fill(False)
         judge_counts(run.true_ns, product.state(), run.witness.delivered - product.dropped)
+        run.reports.judge_junk(run.true_ns, product.state(), product.dropped)
         size, kind = product.largest()
         run.counts["largest container"] = max(run.counts["largest container"], size)
         if size > MOST_HELD:

@@ -379,6 +379,20 @@ FAULTS = (
         "",
     ),
     fault(
+        "robot reason",
+        "a robot that stands says `no command`, whatever the cause is",
+        ROBOT,
+        'return f"{chosen(self._choice)}{self.session.note}"',
+        'return "no command"',
+    ),
+    fault(
+        "robot waits",
+        "`state` names no source whose commands are late or not proved yet",
+        ARBITER,
+        "return source.doubted(now_ns) or COMMAND",
+        "return COMMAND",
+    ),
+    fault(
         "robot unsent",
         "a line that never left counts as obeyed",
         ROBOT,
@@ -408,6 +422,44 @@ FAULTS = (
         "self.restarted = False",
     ),
     fault(
+        "session unplugged",
+        "the link stays up for half a second behind an unplugging",
+        SESSION,
+        "        if not port_open or opened != self._opened:",
+        "        if (not port_open and self.silent(now.mono_ns - NS_PER_S // 2)) or (\n"
+        "            opened != self._opened\n"
+        "        ):",
+    ),
+    fault(
+        "session first",
+        "the first line to a board that was plugged in waits for a second",
+        SESSION,
+        "        if self.silent(now_ns):\n",
+        "        if now_ns - self._opened_ns < NS_PER_S:\n            return None\n"
+        "        if self.silent(now_ns):\n",
+        Edit(
+            SESSION,
+            '        self._link.sign("opened" if port_open else "closed")',
+            "        self._opened_ns = now_ns\n"
+            '        self._link.sign("opened" if port_open else "closed")',
+        ),
+    ),
+    fault(
+        "session deaf",
+        "behind a damaged line the next five lines are ignored",
+        SESSION,
+        "        if line.startswith(IDENTITY):",
+        "        self._deaf = getattr(self, '_deaf', 0) - 1\n"
+        "        if self._deaf > 0:\n            return None\n"
+        "        if line.startswith(IDENTITY):",
+        Edit(
+            SESSION,
+            "            self._reject(error.reason, line)\n            self._bad()",
+            "            self._reject(error.reason, line)\n            self._bad()\n"
+            "            self._deaf = 6",
+        ),
+    ),
+    fault(
         "gate late",
         "a line that was made before a stall leaves after it",
         "core/link/serial_output.py",
@@ -429,6 +481,24 @@ FAULTS = (
         "moving and turns < 0.1 * size,",
         "moving and turns < 0.97 * size,",
     ),
+    # bus
+    fault(
+        "bus reasons",
+        "a message that is too big is counted as one that cannot be read",
+        COMMANDS,
+        'raise DecodeError("too_big", f"{len(arrival.payload)} bytes")',
+        'raise DecodeError("malformed", f"{len(arrival.payload)} bytes")',
+    ),
+    fault(
+        "bus answers",
+        "a call that is refused has no answer",
+        LOOP,
+        "            if reply is not None:\n                self._bus.reply(reply)\n"
+        "                self._bus.retire",
+        "            if reply is not None and answer.success:\n"
+        "                self._bus.reply(reply)\n"
+        "                self._bus.retire",
+    ),
     # odometry
     fault(
         "odometry turn",
@@ -443,6 +513,36 @@ FAULTS = (
         PATH,
         "_wrapped(self._yaw, turn)",
         "_wrapped(self._yaw, 1.2 * turn)",
+    ),
+    fault(
+        "odometry set",
+        "set_pose takes x for y",
+        ODOMETRY,
+        "self._path.set(pose)\n        self._steps.clear()\n        self._uncertainty",
+        "self._path.set(Pose(pose.y, pose.x, pose.yaw))\n        self._steps.clear()\n"
+        "        self._uncertainty",
+    ),
+    fault(
+        "odometry gap",
+        "a gap while the robot moves does not make the pose less certain",
+        ODOMETRY,
+        "        if rolled.unknown > 0.0:\n            self._stand",
+        "        if rolled.unknown > 1e9:\n            self._stand",
+        Edit(
+            ODOMETRY,
+            "self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))",
+            "self._gaps.interrupt(twist)",
+        ),
+    ),
+    fault(
+        "odometry silent",
+        "the pose goes on at the last speed while the board is silent",
+        ROBOT,
+        "        if not feedback:\n            return ()",
+        "        if not feedback:\n"
+        '            if link != "up" and session.good_lines:\n'
+        "                self._odometry._path.advance(0.01 * self._odometry.twist.linear, 0.0)\n"
+        "            return ()",
     ),
     # latch file
     fault(

@@ -17,6 +17,16 @@ LIARS = {
 }  # fmt: skip
 """Board faults with which the encoders lie, or say nothing while the robot may move."""
 
+GAP_NS = 3 * NS // 10
+"""A gap of the estimates of this length and more is judged by itself."""
+
+MOVES = 0.1
+"""Speed, m/s, from which on a robot certainly moves before a gap."""
+
+VAGUE = 0.05
+"""Variance, m2, from which on a gap may be lost in it: the variance of a robot whose heading is
+nearly unknown also falls."""
+
 SIGMAS = 6.0
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
@@ -36,23 +46,39 @@ class PoseWitness:
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False
+        self._asked: Pose | None = None
+        """The pose that a call of this step has set, if its time is known."""
+        self._expected: tuple[Pose, Pose] | None = None
+        """The true pose at the last sample before a call, and the pose that the call has set."""
         self._room = 0.0
         self._last: tuple[int, Pose] | None = None
+        self.latest: Pose | None = None
+        """The pose of the last estimate, None if it was set since."""
+        self._before: tuple[int, Pose, Pose, float, float] | None = None
+        """Time, pose, true pose, true speed and variance at the last estimate before a silence."""
 
-    def doubt(self) -> None:
+    def doubt(self, mute: bool = False) -> None:
         """The encoders missed a part of the drive: restart the comparison at the next estimate.
 
         The pose may not jump all the same.
+
+        A board that was only `mute` leaves a gap, which is judged by itself.
         """
-        self._anchor = None
+        self._anchor = self._expected = None
+        if not mute:
+            self._before = None
 
     def begin(self) -> None:
         """Note that a new daemon or a new pose begins: nothing before it counts."""
-        self._anchor = self._last = None
+        self.doubt()
+        self._last = None
 
-    def placed(self) -> None:
-        """The pose was set: the estimates of this step are still the old ones."""
-        self._placed = True
+    def placed(self, asked: Pose | None = None) -> None:
+        """The pose was set: the estimates of this step are still the old ones.
+
+        `asked` is the new pose, None if it is not certain that this step has set it.
+        """
+        self._placed, self._asked = True, asked
 
     def see(
         self,
@@ -66,19 +92,32 @@ class PoseWitness:
         at_ns, x, y, yaw, _ = truth
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         lies = not LIARS.isdisjoint(faults)
+        silent_only = not lies or faults & LIARS == {"mute"}
         if lies:
-            self.doubt()
+            self.doubt(silent_only)
+        before = self._before
+        if before is not None and silent_only:
+            self._gap(now_ns, before, estimates[0], offset_ns, (x, y, yaw))
         for sampled_ns, ex, ey, eyaw, covariance, _ in estimates:
             # A sum is finite only if each of its numbers is.
             if not math.isfinite(ex + ey + eyaw + sum(covariance)):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
             self._one(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
+        sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, _), _ = estimates[-1]
+        self.latest = ex, ey, eyaw
+        if silent_only:
+            last_ns = sampled_ns + offset_ns
+            self._before = last_ns, self.latest, (x, y, yaw), self.speed_at(last_ns), xx + yy
 
     def end_step(self) -> None:
         """Forget the pose if it was set in this step."""
         if self._placed:
-            self._placed = False
+            last, asked = self._last, self._asked
+            self._placed, self._asked, self.latest = False, None, None
             self.begin()
+            true = None if last is None else self._true_at(last[0])
+            if true is not None and asked is not None:
+                self._expected = true, asked
 
     def _one(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
@@ -97,6 +136,9 @@ class PoseWitness:
         if true is None:
             return
         by_time = 0.1 * self.speed_at(at_ns)
+        if self._expected is not None:
+            self._put(now_ns, self._expected, true, pose, by_time)
+            self._expected = None
         if self._anchor is None:
             self._anchor = true, pose
             self._room = by_time
@@ -120,6 +162,41 @@ class PoseWitness:
                 "the pose stays within its covariance", now_ns,
                 f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",
             )  # fmt: skip
+
+    def _gap(
+        self,
+        now_ns: int,
+        before: tuple[int, Pose, Pose, float, float],
+        estimate: Any,
+        offset_ns: int,
+        true: Pose,
+    ) -> None:
+        """Judge the first estimate after a gap: its covariance grew by the motion in the gap."""
+        then_ns, pose, true_then, speed, variance = before
+        sampled_ns, ex, ey, _, (xx, _, _, yy, _, _), _ = estimate
+        if sampled_ns + offset_ns - then_ns < GAP_NS or speed < MOVES:
+            return
+        if variance > VAGUE:
+            variance = 0.0
+        x, y, _ = _through((true_then, pose), true)
+        off, sigma = math.hypot(ex - x, ey - y), math.sqrt(max(0.0, xx + yy - variance))
+        if off > SIGMAS * sigma + ROOM_M + 0.1 * speed:
+            text = f"{off:.3f} m off after {(sampled_ns + offset_ns - then_ns) / NS:.3f} s"
+            raise BrokenError(
+                "a gap while moving is in the covariance",
+                now_ns,
+                f"{text}, sigma grew {sigma:.3f} m",
+            )
+
+    def _put(
+        self, now_ns: int, expected: tuple[Pose, Pose], true: Pose, pose: Pose, room: float
+    ) -> None:
+        """Judge the first estimate behind a call: it has the pose asked for, and moved since."""
+        x, y, yaw = _through(expected, true)
+        off, turned = math.hypot(pose[0] - x, pose[1] - y), math.remainder(pose[2] - yaw, math.tau)
+        if off > ROOM_M + room or abs(turned) > ROOM_RAD + room / self.track:
+            text = f"{expected[1]} was asked for, and {pose} is {off:.3f} m, {turned:.3f} rad off"
+            raise BrokenError("the pose is put where a call asks for it", now_ns, text)
 
     def speed_at(self, at_ns: int) -> float:
         """Return the true speed about then, m/s, with that of the rim in a turn."""

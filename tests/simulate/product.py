@@ -173,6 +173,8 @@ class Product:
         self.dropped = 0
         """Samples that the inbox had no room for, of this daemon."""
         self.echo = False
+        self.unplugged_ns = self.plugged_ns = START_NS
+        """When the board was last unplugged, and plugged in: a daemon that starts finds it so."""
         self._world = World(self._config, keeper=self.disk)
         self._began()
 
@@ -342,6 +344,7 @@ class Product:
         self._world.mcu.reset(self.now_ns, deaf_ns)
 
     def unplug(self) -> None:
+        self.unplugged_ns = self.now_ns
         self._world.port.unplug()
         self._world.port.trouble = "the device is gone"
 
@@ -366,6 +369,7 @@ class Product:
             world.mcu.advance(self.now_ns)
         world.port.trouble = ""
         world.port.plug(world.mcu)
+        self.plugged_ns = self.now_ns
 
     def truth(self) -> tuple[int, float, float, float, float]:
         """Return the time of the board, the true pose, and the true speed of the fastest wheel."""
@@ -443,6 +447,7 @@ class Product:
             world.mcu._see = world._see
         if old.port.mcu is not None:
             world.port.plug(world.mcu)
+        self.plugged_ns = self.now_ns
         world.port.blocked = old.port.blocked
         self._world, self.alive = world, True
         self._began()

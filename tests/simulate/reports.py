@@ -6,7 +6,7 @@ of its speed while the board says nothing.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from typing import Any
 
 from tests.simulate.ages import MARGIN_NS
@@ -15,6 +15,13 @@ from tests.simulate.roads import NS, Message, Sample, stable
 
 KEPT = 15_000
 """Commands that are remembered: those of the longest timeout, 10 s, at 400 Hz by three senders."""
+
+REFUSED_AS = {
+    "garbage": "malformed", "not a number": "not_finite", "delete": "not_a_put",
+    "wildcard": "wildcard", "huge": "too_big", "stranger": "unknown_source",
+    "fields": "wrong_shape",
+}  # fmt: skip
+"""The reason by which each kind of junk is counted."""
 
 ECHO_LINES, ECHO_CHANGE = 40, 6.0
 """Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as
@@ -31,11 +38,17 @@ class Reports:
         self._order: deque[int] = deque()
         self._followed: dict[str, int] = {}
         """The highest number that the robot has followed, by clock."""
+        self._junk: Counter[str] = Counter()
+        """Junk that arrived, by the reason for which it is refused."""
 
     def command(
         self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int, loose: bool
     ) -> None:
         """Take note of a command; `loose` if other senders stamp by the same clock."""
+        if message.junk in REFUSED_AS:
+            # A twist on a key of wheel speeds is wrong in two ways.
+            twice_wrong = message.junk in ("fields", "garbage") and "wheel_cmd/" in sample.key
+            self._junk["unreadable" if twice_wrong else REFUSED_AS[message.junk]] += 1
         known = None
         if sample.clock and stable(sender) and not (loose or sender["churn"]):
             known = sample.clock, message.number
@@ -65,6 +78,17 @@ class Reports:
         self._followed[clock] = number
         return clock
 
+    def judge_junk(self, at_ns: int, state: dict[str, Any], dropped: int) -> None:
+        """Hold the counters of junk against what arrived; `dropped` messages were never read."""
+        for reason in REFUSED_AS.values():
+            expected, counted = self._junk[reason], state["counters"].get(f"command_{reason}", 0)
+            most = expected
+            if reason in ("malformed", "wrong_shape"):
+                most += self._junk["unreadable"]
+            if not expected - dropped <= counted <= most:
+                text = f"{expected} arrived, {counted} are counted as {reason}"
+                raise BrokenError("every bad command is counted by its reason", at_ns, text)
+
 
 def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -> None:
     """Hold the speeds in `state` against the time at which the board was last heard."""
@@ -74,6 +98,17 @@ def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -
             "state has no speed of a silent board", at_ns,
             f"last heard {fed_ns / NS:.3f} s, and state says {said}",
         )  # fmt: skip
+
+
+def judge_pose(
+    at_ns: int, state: dict[str, Any], pose: tuple[float, float, float], fed_ns: int, quiet_ns: int
+) -> None:
+    """Hold the pose in `state` against that of the last estimate, while the board is silent."""
+    said = state["x"], state["y"], state["yaw"]
+    moved = max(abs(a - b) for a, b in zip(said, pose, strict=True))
+    if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and moved > 1e-6:
+        text = f"last heard {fed_ns / NS:.3f} s; the pose was {pose}, and state says {said}"
+        raise BrokenError("the pose of a silent board stays", at_ns, text)
 
 
 def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:

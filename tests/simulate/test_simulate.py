@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -24,12 +24,16 @@ from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
 from tests.simulate.ages import Ages
+from tests.simulate.damage import Damage
 from tests.simulate.differences import CORRECTED, REWORDED
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
+from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, Seen, problems
 from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.reasons import kind_of
+from tests.simulate.reports import Reports, judge_pose
 from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
 from tests.simulate.unjudged import Unjudged
 
@@ -311,6 +315,41 @@ def test_a_stop_that_had_no_answer_may_be_gone_after_a_restart() -> None:
     assert witness.stops == [2 * NS]
 
 
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        ("send a zero first: app must send a zero before it can drive", ("neutral", "app")),
+        ("app is new: it drives once its delays have been steady for 0.25 s", ("proof", "app")),
+        ("commands of nav arrive more than 0.5 s too late: the network", ("late", "nav")),
+        ("teleop has the same priority and came first: wait", ("priority", "teleop")),
+        ("waiting for a command: no source has sent one", ("command", "")),
+        ("", ("", "")),
+        ("no command", ("?", "")),
+    ],
+)
+def test_the_words_of_a_reason_are_sorted_into_a_kind_and_a_source(
+    words: str, kind: tuple[str, str]
+) -> None:
+    assert kind_of(words) == kind
+
+
+def state_of(counters: dict[str, int]) -> dict[str, Any]:
+    return {"counters": counters}
+
+
+def test_junk_that_is_counted_by_another_reason_is_a_finding() -> None:
+    reports, sender = Reports(), made(1)["senders"][0] | {"way": "plain", "wheels": False}
+    for n, junk in enumerate(("huge", "delete", "fields")):
+        one = Message(n, n, 0.1, 0.0, 0, n, junk)
+        reports.command(sender, one, sample(sender, one, PLAIN["config"], 0), n, False)
+    right = {"command_too_big": 1, "command_not_a_put": 1, "command_wrong_shape": 1}
+    reports.judge_junk(NS, state_of(right), 0)
+    reports.judge_junk(NS, state_of(right | {"command_too_big": 0}), 1)
+    wrong = right | {"command_too_big": 0, "command_malformed": 1}
+    with pytest.raises(BrokenError, match="counted by its reason"):
+        reports.judge_junk(NS, state_of(wrong), 0)
+
+
 def with_a_set_before_sigterm(settings: dict[str, float]) -> Plan:
     """A plan whose `set` has no answer when SIGTERM ends the daemon: the disk is full."""
     call = {"verb": "set", "settings": settings, "late": 0.0, "lost": False, "twice": False}
@@ -384,6 +423,96 @@ def test_a_command_with_a_bad_stamp_is_one_of_its_key_or_of_a_clock_that_is_not_
         Arrival(got.key, True, got.payload, encoding, arrived_ns, **options)
     )
     assert (seen.shared, seen.stamp_ns is None) == (got.shared, got.clock == "")
+
+
+# the pose and the board that comes and goes
+
+
+def test_a_pose_that_is_put_elsewhere_than_a_call_asked_for_is_a_finding() -> None:
+    def put(pose: tuple[float, float, float]) -> None:
+        witness = PoseWitness(PLAIN["config"])
+        for n, where in enumerate(((0.0, 0.0, 0.0), pose)):
+            at_ns = n * NS // 100
+            estimate = at_ns, *where, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), ()
+            witness.see(at_ns, [estimate], (at_ns, 5.0, 5.0, 0.0, 0.0), 0, set())
+            if not n:
+                witness.placed((2.0, -3.0, 0.5))
+            witness.end_step()
+
+    put((2.0, -3.0, 0.5))
+    with pytest.raises(BrokenError, match="put where a call asks for it"):
+        put((-3.0, 2.0, 0.5))
+
+
+@pytest.mark.parametrize(("grown", "finding"), [(0.01, False), (0.0, True)])
+def test_a_gap_while_moving_that_leaves_the_covariance_as_it_was_is_a_finding(
+    grown: float, finding: bool
+) -> None:
+    witness = PoseWitness(PLAIN["config"])
+
+    def see(at_s: float, x: float, true_x: float, variance: float) -> None:
+        at_ns = int(at_s * NS)
+        estimate = at_ns, x, 0.0, 0.0, (variance, 0.0, 0.0, variance, 0.0, 0.01), ()
+        witness.see(at_ns, [estimate], (at_ns, true_x, 0.0, 0.0, 0.0), 0, set())
+
+    for n in range(3):
+        see(n * 0.01, n * 0.005, n * 0.005, 0.01)
+    witness.doubt(mute=True)
+    with pytest.raises(BrokenError, match="in the covariance") if finding else nullcontext():
+        see(1.0, 0.01, 0.3, 0.01 + grown)
+
+
+def test_a_pose_in_state_that_moves_while_the_board_is_silent_is_a_finding() -> None:
+    state = {"x": 1.0, "y": 2.0, "yaw": 0.5}
+    judge_pose(2 * NS, state, (1.0, 2.0, 0.5), NS, NS // 10)
+    judge_pose(2 * NS, state, (0.9, 2.0, 0.5), 2 * NS - NS // 20, NS // 10)
+    with pytest.raises(BrokenError, match="the pose of a silent board stays"):
+        judge_pose(2 * NS, state, (0.9, 2.0, 0.5), NS, NS // 10)
+
+
+class Board(NamedTuple):
+    """What the judge of the plugging knows of the board."""
+
+    plugged: bool
+    unplugged_ns: int = 0
+    plugged_ns: int = 0
+
+
+@pytest.mark.parametrize(
+    ("link", "after_ms", "line", "promise"),
+    [
+        ("up", 29, None, ""),
+        ("up", 31, None, "an unplugged board is seen"),
+        ("down", 9000, None, ""),
+        ("stale", 499, b"", ""),
+        ("stale", 501, b"", "a board that is plugged in gets a line"),
+        ("stale", 501, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", ""),
+        ("stale", 9, b"ap00.00,bp00.01,cp00.01,dp00.00\r\n", "the first line is a zero"),
+    ],
+)
+def test_the_judge_sees_a_board_that_comes_and_goes(
+    link: str, after_ms: int, line: bytes | None, promise: str
+) -> None:
+    at_ns = after_ms * NS // 1000
+    lines = [(at_ns, line)] if line else []
+    seen = Seen(at_ns, at_ns, "waiting", "no board", None, link, lines, [])
+    board: Any = Board(line is not None)
+    judged = pytest.raises(BrokenError, match=promise) if promise else nullcontext()
+    with judged:
+        Plugging(NS // 100).see(at_ns, seen, board, 0)
+
+
+@pytest.mark.parametrize(("lost", "finding"), [(2, False), (3, True)])
+def test_whole_lines_that_are_not_heard_behind_a_damaged_one_are_a_finding(
+    lost: int, finding: bool
+) -> None:
+    damage, whole = Damage(), b"ap00.10,bp00.10,cp00.10,dp00.10\r\n"
+    damage.fed(whole + whole[9:])
+    with pytest.raises(BrokenError, match="are heard behind") if finding else nullcontext():
+        for n in range(1, 9):
+            damage.fed(whole[:7])
+            damage.fed(whole[7:])
+            damage.look(n * NS, lambda n=n: max(0, n - lost))  # type: ignore[misc]
 
 
 # shrinking

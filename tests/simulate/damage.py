@@ -1,0 +1,65 @@
+"""The promise about a damaged wire: the daemon hears whole lines again behind damaged ones.
+
+A line is whole if it has the four speeds and nothing else. The daemon may lose two whole lines
+behind a damaged one, because it finds the ends of the lines again in them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from tests.simulate.promises import BrokenError
+
+WHOLE = re.compile(rb"a[pn]\d\d\.\d\d,b[pn]\d\d\.\d\d,c[pn]\d\d\.\d\d,d[pn]\d\d\.\d\d(?:, *)?\r?")
+
+LOST = 2
+"""Whole lines behind a damaged one that the daemon need not hear."""
+
+JUDGED = 3
+"""Whole lines behind these, all of which the daemon must have counted."""
+
+MAX_LINE = 4096
+"""Bytes without an end of line that are kept."""
+
+
+class Damage:
+    """The lines that the board sent, and how many whole ones followed the last damaged one."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Note that the port was opened again, or that something else interrupted the lines."""
+        self._held = b""
+        self._whole = -1
+        """Whole lines since the last damaged one, -1 before the first damaged one."""
+        self._counted: int | None = None
+        """Lines that the daemon had counted behind the lines that it may lose."""
+        self._then = 0
+
+    def fed(self, data: bytes) -> None:
+        """Take bytes that reached the daemon."""
+        *ends, rest = (self._held + data).split(b"\n")
+        for line in ends:
+            if WHOLE.fullmatch(line):
+                self._whole += self._whole >= 0
+            elif line not in (b"", b"\r"):
+                self._whole, self._counted = 0, None
+        self._held = rest[-MAX_LINE:]
+
+    def look(self, at_ns: int, lines: Callable[[], int]) -> None:
+        """Judge a step. `lines` returns the number of good lines that the daemon has counted."""
+        if self._whole < LOST:
+            return
+        if self._counted is None:
+            self._counted, self._then = lines(), self._whole
+            return
+        expected = self._whole - self._then
+        if expected < JUDGED:
+            return
+        counted = lines() - self._counted
+        if counted < expected:
+            text = f"{expected} whole lines came, and {counted} are counted"
+            raise BrokenError("whole lines are heard behind damaged ones", at_ns, text)
+        self._whole, self._counted = -1, None

@@ -1,0 +1,49 @@
+"""The promises about a board that is unplugged and plugged in again.
+
+Times are in ns of the robot's monotonic clock, which stands while the host sleeps.
+"""
+
+from __future__ import annotations
+
+from tests.simulate.product import Product, Seen
+from tests.simulate.promises import LINE, BrokenError
+from tests.simulate.roads import NS
+
+SEEN_NS = 20_000_000
+"""The daemon knows within this time and a period that the board was unplugged."""
+
+FIRST_LINE_NS = NS // 2
+"""The first line leaves within this time after the board was plugged in."""
+
+
+class Plugging:
+    """Judges what the daemon says and sends about the time at which the board comes and goes."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._judged_ns = -1
+        """The plugging of which the first line was judged."""
+
+    def see(self, true_ns: int, seen: Seen, product: Product, calm_ns: int) -> None:
+        """Judge a step. At `calm_ns` the last stall of the host or of the output was over."""
+        if not product.plugged:
+            late_ns = seen.decided_ns - product.unplugged_ns
+            if seen.link == "up" and late_ns > SEEN_NS + self._period_ns:
+                text = f"unplugged for {late_ns / NS:.3f} s, and the link is {seen.link}"
+                raise BrokenError("an unplugged board is seen", true_ns, text)
+            return
+        plugged_ns = product.plugged_ns
+        if plugged_ns == self._judged_ns:
+            return
+        # A line of which the kernel took only a part is not judged here.
+        for at_ns, line in seen.lines:
+            if at_ns >= plugged_ns and line.endswith(b"\n"):
+                self._judged_ns = plugged_ns
+                match = LINE.match(line)
+                if match is not None and any(float(speed[1:]) for speed in match.groups()):
+                    text = f"{line!r} is the first line after the board was plugged in"
+                    raise BrokenError("the first line is a zero", true_ns, text)
+                return
+        if seen.decided_ns - max(plugged_ns, calm_ns) > FIRST_LINE_NS:
+            text = f"plugged in at {plugged_ns / NS:.3f} s of its clock"
+            raise BrokenError("a board that is plugged in gets a line", true_ns, text)

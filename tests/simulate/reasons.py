@@ -1,0 +1,224 @@
+"""The words of a robot that stands although a sender wishes a speed, held against the true cause.
+
+The pages say that `state` has the reason for each refusal: in `reason`, or in the `waits_for` of
+the source. Here the words are sorted into kinds of causes, and only the kind is judged. A kind is
+right if the omniscient view allows it. The view knows which senders stamp, how steady their
+network is, what arrived when, and since when nothing has happened beside commands.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from tests.simulate.ages import MARGIN_NS
+from tests.simulate.promises import BrokenError
+from tests.simulate.roads import FOREIGN, NS, Message, Sample
+
+if TYPE_CHECKING:
+    from tests.simulate.actors import Run
+
+KINDS = (
+    ("neutral", re.compile(r"\b(\w+) must send a zero\b")),
+    ("proof", re.compile(r"\b(\w+) is new: ")),
+    ("late", re.compile(r"\bcommands of (\w+) arrive .* too late\b")),
+    ("priority", re.compile(r"\b(\w+) has (?:priority|the same priority)\b")),
+    ("command", re.compile(r"^(?:waiting for )?a command()\b")),
+    ("", re.compile(r"^()$")),
+)
+"""The kinds of causes, and the words by which each is known, with the name of the source."""
+
+EVERY_NS = NS // 5
+"""Time between two looks at `state`, which takes longer to build than a step."""
+
+STEADY_NS = 15_000_000
+"""Range of the true delays of a sender whose commands are certainly never late."""
+
+PAUSE_NS = 19 * NS // 10
+"""After a silence of this length a proof that was not over may begin again."""
+
+FORGOTTEN_NS = 200 * NS
+"""After a silence of this length a clock may be new again."""
+
+
+def kind_of(words: str) -> tuple[str, str]:
+    """Return the kind of cause that the words name and the source in them, "?" for no kind."""
+    for kind, pattern in KINDS:
+        match = pattern.search(words)
+        if match is not None:
+            return kind, match[1]
+    return "?", ""
+
+
+class _Clock:
+    """The true delays of one sender's stamps since the daemon started."""
+
+    def __init__(self, at_ns: int, delay_ns: int) -> None:
+        self.first_ns = self.last_ns = at_ns
+        """Arrival of the first message from which its proof may begin, and of the last one."""
+        self.least_ns = self.most_ns = delay_ns
+        self.proved = False
+        """Its proof was certainly over once."""
+        self.unsure = False
+        """Its proof may have been over before a silence, or not."""
+        self.odd = False
+        """It is adjusted or shared, or its messages overtake each other."""
+
+    @property
+    def steady(self) -> bool:
+        return not self.odd and self.most_ns - self.least_ns <= STEADY_NS
+
+    def known(self, at_ns: int, timeout_ns: int) -> bool:
+        """Return whether its proof certainly was over at this time."""
+        return self.steady and at_ns - self.first_ns > 5 * min(timeout_ns, 2 * NS) + NS
+
+    def may_be_known(self, at_ns: int, timeout_ns: int) -> bool:
+        """Return whether its proof may have been over at this time."""
+        return (
+            self.odd or self.unsure or at_ns - self.first_ns > min(timeout_ns, 2 * NS) - MARGIN_NS
+        )
+
+
+class _Heard:
+    """The last message of one sender on one source."""
+
+    def __init__(self) -> None:
+        self.arrived_ns = self.speed_ns = -1
+        """Arrival of the last command, and of the last one that is a speed."""
+        self.armed_ns = -1
+        self.clock: _Clock | None = None
+        self.foreign = self.shared = False
+
+
+class Reasons:
+    """What arrived at one daemon, and what it says while it stands."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self._ready_ns = self._looked_ns = self._calm_ns = -1
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all senders: another daemon starts, or the robot's clock stood."""
+        self._clocks: dict[str, _Clock] = {}
+        self._heard: dict[str, dict[str, _Heard]] = {}
+        self._junk: set[str] = set()
+        """Sources with refused messages, any of which may undo the zero of a shared identity."""
+
+    def command(self, sender: dict[str, Any], message: Message, one: Sample) -> None:
+        """Take note of a command that the witness has noted just before."""
+        source = sender["source"]
+        if message.junk:
+            self._junk.add(source)
+        if message.junk not in ("", "cancels") or sender["churn"]:
+            return
+        wish = self.run.witness.wishes[-1][1]
+        at_ns, delay_ns = wish.arrived_ns, wish.arrived_ns - message.sent_ns
+        heard = self._heard.setdefault(source, {}).setdefault(one.identity, _Heard())
+        heard.arrived_ns, heard.armed_ns = at_ns, wish.armed_ns
+        heard.shared = one.shared
+        heard.foreign = sender["way"] in FOREIGN
+        if wish.v or wish.w:
+            heard.speed_ns = at_ns
+        if not one.clock:
+            heard.clock = None
+            return
+        clock = self._clock(one.clock, at_ns, delay_ns)
+        clock.odd |= bool(sender["clock"] or sender.get("twice") or sender.get("swap"))
+        clock.odd |= one.clock in self.run.witness.shared_clocks
+        clock.proved |= clock.known(at_ns, self.run.witness.timeout[source])
+        heard.clock = clock
+
+    def _clock(self, name: str, at_ns: int, delay_ns: int) -> _Clock:
+        """Return the clock of this name with one more delay."""
+        clock = self._clocks.get(name)
+        if clock is None:
+            clock = self._clocks[name] = _Clock(at_ns, delay_ns)
+        silent_ns = at_ns - clock.last_ns
+        if silent_ns > FORGOTTEN_NS or (silent_ns > PAUSE_NS and not clock.proved):
+            # Its proof may begin again, unless it was over.
+            clock.first_ns, clock.unsure, clock.proved = at_ns, True, False
+        clock.last_ns = at_ns
+        clock.least_ns = min(clock.least_ns, delay_ns)
+        clock.most_ns = max(clock.most_ns, delay_ns)
+        return clock
+
+    def look(self, now_ns: int, stalled_ns: int) -> None:
+        """Judge `state` if the robot has been ready for a while and a sender wishes a speed."""
+        run, witness = self.run, self.run.witness
+        if witness.mode != "ready":
+            self._ready_ns = -1
+            return
+        if self._ready_ns < 0:
+            self._ready_ns = now_ns
+        tick_ns = 2 * witness.period_ns + MARGIN_NS
+        if now_ns - max(self._ready_ns, self._looked_ns + EVERY_NS) < tick_ns:
+            return
+        if witness.pending or witness.churns or stalled_ns > now_ns - NS:
+            return
+        self._looked_ns = now_ns
+        # A board that greets after a reset disarms all, and then the robot becomes ready again.
+        self._calm_ns = max(run.liveness.event_ns, stalled_ns, self._ready_ns)
+        wishing = [
+            source
+            for source, senders in self._heard.items()
+            for heard in senders.values()
+            if self._waits(source, heard, now_ns, tick_ns)
+        ]
+        if wishing:
+            self._judge(now_ns, wishing, run.product.state())
+
+    def _waits(self, source: str, heard: _Heard, now_ns: int, tick_ns: int) -> bool:
+        """Return whether the daemon certainly has a speed of this sender, and it is live."""
+        age_ns = now_ns - heard.speed_ns
+        return (
+            heard.speed_ns == heard.arrived_ns > self._calm_ns + tick_ns
+            and tick_ns < age_ns < self.run.witness.timeout[source] - tick_ns
+            and not (heard.clock and heard.clock.odd)
+        )
+
+    def _judge(self, now_ns: int, wishing: list[str], state: dict[str, Any]) -> None:
+        """Hold the words of `state` against what may be the cause."""
+        self.run.counts["reason looks"] += 1
+        name = "every refusal has its reason in state"
+        words = {one["name"]: one["waits_for"] for one in state["sources"]}
+        for source in wishing:
+            kind, _ = kind_of(words[source])
+            allowed = self._allowed(source, now_ns)
+            if kind not in allowed:
+                text = f"{source} waits for {words[source]!r}, allowed is {sorted(allowed)}"
+                raise BrokenError(name, now_ns, text)
+        kind, named = kind_of(state["reason"])
+        allowed = self._allowed(named, now_ns) - {"priority"} if named in words else set()
+        if kind not in allowed:
+            text = f"{state['reason']!r}, allowed is {sorted(allowed)}, {wishing} wish a speed"
+            raise BrokenError(name, now_ns, text)
+
+    def _allowed(self, source: str, now_ns: int) -> set[str]:
+        """Return the kinds of causes that this source may wait for now, if it has live senders."""
+        witness, found = self.run.witness, set[str]()
+        timeout_ns = witness.timeout[source]
+        for heard in self._live(source, now_ns):
+            clock, certain = heard.clock, not (heard.shared and source in self._junk)
+            if clock is not None:
+                certain &= clock.known(heard.armed_ns, timeout_ns)
+                may_be_known = not heard.foreign or clock.may_be_known(now_ns, timeout_ns)
+                if not clock.steady and may_be_known:
+                    found.add("late")
+                # A foreign clock that was known is not new again, however late it becomes.
+                if not (clock.known(now_ns, timeout_ns) or (heard.foreign and clock.proved)):
+                    found.add("proof")
+            armed = heard.armed_ns > self._calm_ns and certain
+            if witness.neutral_first and not armed:
+                found.add("neutral")
+        mine = witness.priority[source]
+        for other, priority in witness.priority.items():
+            if other != source and priority >= mine and self._live(other, now_ns):
+                found.add("priority")
+        return found
+
+    def _live(self, source: str, now_ns: int) -> list[_Heard]:
+        """Return the senders of this source that may be live."""
+        longest_ns = self.run.witness.timeout[source] + MARGIN_NS
+        senders = self._heard.get(source, {}).values()
+        return [heard for heard in senders if now_ns - heard.arrived_ns <= longest_ns]
