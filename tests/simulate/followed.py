@@ -26,6 +26,9 @@ EVEN_NS = 20_000_000
 UNBROKEN_NS = NS
 """A longer silence begins a new run of even delays."""
 
+KNOWN_NS = 240 * NS
+"""The daemon knows a clock for this time at least."""
+
 Who = tuple[str, str]
 """Source and identity of a sender."""
 
@@ -204,35 +207,40 @@ class Followed:
             )  # fmt: skip
 
     def _adjusted_needs_zero(self, true_ns: int, found: Command) -> None:
-        """A foreign clock that was stepped by far more than the timeout needs a zero afterwards.
+        """A foreign clock that was stepped by more than the timeout needs a zero afterwards.
 
-        A network that delays its commands meanwhile may hide the step, and so may another
-        adjustment or a robot that slept.
+        A clock that was set forward makes delays shorter, so a network that delays the commands at
+        the same time may hide that. Another step, or a robot that slept, may hide any step.
         """
         witness, sender, message = self._witness, found.sender, found.message
         before = self._before.get(found.clock)
         self._before[found.clock] = found
         if before is None or before.message.sent_ns >= message.sent_ns:
             return
-        since_ns = before.message.sent_ns
-        adjusted = [
-            one
-            for one in sender["clock"]
-            if one[1] * NS <= message.sent_ns
-            and (one[2] if one[0] == "slew" else one[1]) * NS > since_ns
-        ]
-        hidden = (
-            len(adjusted) != 1
-            or sender["congestion"]
-            or sender["jitter"] > EVEN_NS / NS / 2
+        since_ns, slewed_s, steps = before.message.sent_ns, 0.0, []
+        for kind, at_s, *rest in sender["clock"]:
+            if kind == "slew":
+                lasted_ns = min(message.sent_ns, rest[0] * NS) - max(since_ns, at_s * NS)
+                slewed_s += abs(rest[1]) * max(0.0, lasted_ns / NS)
+            elif since_ns < at_s * NS <= message.sent_ns:
+                steps.append((at_s, rest[0]))
+        if (
+            len(steps) != 1
+            or not witness.neutral_first
+            or message.sent_ns - since_ns > KNOWN_NS
             or before.true_ns < witness.ages.learned_ns
             or found.clock in witness.shared_clocks
             or found.who[0] in witness.churned
-        )
-        if hidden or not witness.neutral_first or adjusted[0][0] == "slew":
+        ):
             return
-        _, at_s, by_s = adjusted[0]
-        if abs(by_s) * NS < 2 * max(witness.timeout[found.who[0]], NS // 4) + NS // 10:
+        at_s, by_s = steps[0]
+        timeout_s = max(witness.timeout[found.who[0]], NS // 4) / NS
+        late_s = (before.true_ns - since_ns) / NS - sender["delay"]
+        if by_s > 0.0:
+            if sender["congestion"] or sender["jitter"] > EVEN_NS / NS / 2:
+                return
+            late_s = timeout_s
+        if abs(by_s) < timeout_s + max(0.0, late_s) + slewed_s + 0.15:
             return
         witness.counts["clocks that jumped"] += 1
         if self._zero_ns.get(found.who, -1) < at_s * NS:

@@ -207,13 +207,6 @@ FAULTS = (
         "and source.priority == first[0].priority\n",
         "and source.priority <= first[0].priority\n",
     ),
-    fault(
-        "arbiter jumped",
-        "a sender whose clock was set drives on without a zero",
-        ARBITER,
-        "            sender.require_neutral()\n        else:",
-        "            pass\n        else:",
-    ),
     # neutral
     fault(
         "neutral pause",
