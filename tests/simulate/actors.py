@@ -18,7 +18,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.simulate.course import Course
 from tests.simulate.damage import Damage
+from tests.simulate.followed import Followed
 from tests.simulate.liveness import Liveness
 from tests.simulate.plan import Plan
 from tests.simulate.plugging import Plugging
@@ -77,6 +79,7 @@ class Run:
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
         self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
+        self.followed, self.course = Followed(self.witness), Course(self.witness)
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
         self.plugging = Plugging(self.witness.period_ns)
@@ -167,7 +170,8 @@ class Run:
             else:
                 for own in (sender["id"], f"session of {sender['id']}"):
                     seen[own] += 1
-            self.witness.churns |= sender["churn"]
+            if sender["churn"]:
+                self.witness.churned.add(sender["source"])
             queue = messages(sender, plan["seed"], plan["seconds"], START_NS + WALL_OFFSET_NS)
             queue.reverse()
             if queue:
@@ -195,7 +199,8 @@ class Run:
         at_ns = self._arrival(message.arrives_ns)
         one = sample(sender, message, self.plan["config"], self.product.wall_ns)
         true_ns = at_ns - START_NS + self.slept_ns
-        self.witness.command(sender, message, one, true_ns)
+        wish = self.witness.command(sender, message, one, true_ns)
+        self.followed.command(sender, message, one, at_ns, wish)
         self.liveness.command(sender, one)
         self.reasons.command(sender, message, one)
         shared = one.clock in self.witness.shared_clocks
@@ -443,7 +448,7 @@ class Run:
             self.liveness.event()
             self._linked = False
             witness.new_life(self.true_ns)
-            self.reports = Reports()
+            self.reports, self.followed = Reports(), Followed(witness)
             self.pose.latest = None
             self.damage.forget()
             self.reasons.restart()
@@ -521,6 +526,7 @@ class Run:
             clock = self.reports.follows(true_ns, seen.followed_ns)
             if clock:
                 witness.ages.clocks[clock].followed = True
+        self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.linked = seen.link == "up"
         witness.cut |= not witness.linked
@@ -530,6 +536,8 @@ class Run:
                 self.echo.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
+        driven = self.followed.wish if seen.mode == "driving" and not witness.pending else None
+        self.course.step(true_ns, driven, witness.last, len(seen.lines))
         self.liveness.look(true_ns)
         self.reasons.look(true_ns, self._stalled_ns)
         if self._plain and not self.echo.on:

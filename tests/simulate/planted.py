@@ -40,8 +40,8 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 FIRST_SEED = 1
 
 MEASURED_WITH = (
-    "plan", "roads", "actors", "ages", "course", "damage", "followed", "jerk", "liveness", "plugging",
-    "pose", "product", "promises", "reasons", "reports",
+    "plan", "roads", "actors", "ages", "course", "damage", "followed", "jerk", "liveness",
+    "plugging", "pose", "product", "promises", "reasons", "reports",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""
 

@@ -192,6 +192,21 @@ FAULTS = (
         "known.senders[sender].notice(arrived_ns)",
         "known.senders[sender].noticed_ns = 0",
     ),
+    fault(
+        "arbiter equal",
+        "of two sources of equal priority the last that came takes the robot",
+        ARBITER,
+        "live[0].came_ns < first[1].came_ns",
+        "live[0].came_ns > first[1].came_ns",
+        Edit(ARBITER, "and kept in live\n", "and False\n"),
+    ),
+    fault(
+        "arbiter keeps",
+        "a source of lower priority keeps the robot from one that comes later",
+        ARBITER,
+        "and source.priority == first[0].priority\n",
+        "and source.priority <= first[0].priority\n",
+    ),
     # neutral
     fault(
         "neutral pause",
@@ -234,6 +249,15 @@ FAULTS = (
         NEUTRAL,
         "            self._armed = True\n        elif",
         "            pass\n        elif",
+    ),
+    fault(
+        "neutral newest",
+        "a newer command counts only when half of the timeout is over",
+        NEUTRAL,
+        "        self.twist, self.arrived_ns, self._doubted_ns",
+        "        if live and now_ns - (self.arrived_ns or 0) < self._timeout_ns // 2:\n"
+        "            return\n"
+        "        self.twist, self.arrived_ns, self._doubted_ns",
     ),
     # freshness
     Fault(
@@ -355,6 +379,29 @@ FAULTS = (
         LIFECYCLE,
         "self._latch(inactive=self._made(now, by, f\"switched off by {by or 'request'}\"))",
         "self._off_ns = now.mono_ns",
+    ),
+    fault(
+        "limits jerk",
+        "the robot speeds up at once, whatever jerk is allowed",
+        LIMITS,
+        "    if axis.jerk and abs(target) > abs(speed):",
+        "    if False and axis.jerk and abs(target) > abs(speed):",
+    ),
+    fault(
+        "limits saturated",
+        "a robot that turns harder at its limit gives up more speed than its curve asks for",
+        LIMITS,
+        "        twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)\n",
+        "        twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)\n"
+        "        if twist.linear != linear:\n"
+        "            twist = Twist(0.9 * twist.linear, twist.angular)\n",
+    ),
+    fault(
+        "kinematics curvature",
+        "a robot at the limit of its wheels turns less than commanded",
+        KINEMATICS,
+        "return Twist(twist.linear * scale, twist.angular * scale)",
+        "return Twist(twist.linear * scale, twist.angular * scale * scale)",
     ),
     # robot
     fault(

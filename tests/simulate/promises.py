@@ -16,6 +16,7 @@ from collections import Counter, deque
 from typing import Any
 
 from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
+from tests.simulate.jerk import STEP, Slope
 from tests.simulate.roads import NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
@@ -105,7 +106,9 @@ class Witness:
         self.counts: Counter[str] = Counter()
         self.shared_clocks: frozenset[str] = frozenset()
         """Clocks that several senders of the plan stamp by."""
-        self.churns = False
+        self.churned: set[str] = set()
+        """Sources on which a program takes a new name for each message: it may fill their tables
+        of senders."""
         self._stalled = -NS, -NS
         """Begin and end of the host's last stall, or of several that follow each other."""
         self.stops: list[int] = []
@@ -133,6 +136,8 @@ class Witness:
         """Since when the kernel takes no line."""
         self.braking: tuple[int, tuple[float, ...]] | None = None
         """When a robot that must not move was first seen to move, and its wheel speeds."""
+        self._jerks = "linear_jerk" in self.limits
+        """Jerk is limited: the plans limit it on both axes, or on none."""
         self.linked = True
         """The daemon says that the link to the board is up."""
         self.cut = False
@@ -166,6 +171,8 @@ class Witness:
         self.wished_ns = at_ns
         self.coasting: tuple[int, tuple[float, ...]] | None = None
         """Since when no wish explains the motion, and the wheel speeds then."""
+        self._slopes = [Slope() for _ in range(4)]
+        """Of the linear and then of the angular speed, forwards and backwards."""
         self.delivered = 0
         if not self.config["control"].get("auto_activate", True):
             self.dormant_ns = at_ns
@@ -173,8 +180,8 @@ class Witness:
 
     def command(
         self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int
-    ) -> None:
-        """Take note of a command that reached the daemon."""
+    ) -> Wish | None:
+        """Take note of a command that reached the daemon; return None if it cannot be read."""
         self.delivered += 1
         source = sender["source"]
         if message.junk not in ("", "cancels"):
@@ -182,7 +189,7 @@ class Witness:
                 other = self.senders.setdefault((source, sample.identity), Sender())
                 self._arm(other, arrived_ns)
                 other.zeros.clear()
-            return
+            return None
         if message.junk == "cancels":
             v, w = 0.0, 0.0
         else:
@@ -207,6 +214,7 @@ class Witness:
             known.zeros.clear()
         wish.armed_ns = known.armed_ns
         self.wishes.append((source, wish))
+        return wish
 
     def _arm(self, known: Sender, now_ns: int) -> None:
         """Arm a shared identity by the latest zero that the pause has passed behind."""
@@ -363,6 +371,8 @@ class Witness:
         wheels = self._decoded.get(line) or self._read(at_ns, line)
         if wheels is None:
             return
+        if self._jerks:
+            self._jerk(at_ns, wheels, made_ns - self.last_ns)
         if wheels == ZERO:
             self.last, self.last_ns, self.coasting, self.braking = ZERO, made_ns, None, None
             self._driven = [(at_ns, 0.0)] * 4
@@ -467,26 +477,59 @@ class Witness:
         ew = self.radius * 0.011 / self.half
         seconds = min(dt / NS, max(0.05, 1.5 * self.period_ns / NS)) + 0.002
         saturated = max(map(abs, wheels)) > self._most("wheel_speed", at_ns) - 0.1
+        spare = 1.0
+        """By how much both speeds were scaled down together, at least, so that no wheel is over its
+        limit. Before that, each of them was within its own limits."""
+        axes: list[tuple[str, float, float, float]] = []
         for name, new, old, room in (("linear", v, v0, ev), ("angular", w, w0, ew)):
             speed = self._most(f"{name}_speed", at_ns)
             if abs(new) > max(speed, abs(old)) + room:
                 raise BrokenError("no speed is over its limit", at_ns, f"{name} {new:.4f}")
-            up = self._most(f"{name}_acceleration", at_ns)
             down = self._most(f"{name}_deceleration", at_ns)
             if self.mode in ("stopped", "fault", "shutdown"):
                 down = max(down, self._most(f"{name}_stop_deceleration", at_ns))
-            gained = abs(new) - abs(old) if new * old >= 0 else abs(new)
-            if gained > up * seconds + 2 * room:
-                raise BrokenError(
-                    "no acceleration is over its limit", at_ns,
-                    f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
-                )  # fmt: skip
+            falls = down * (dt / NS + 0.002) + 2 * room
             lost = abs(old) - abs(new) if new * old >= 0 else abs(old)
-            if lost > down * (dt / NS + 0.002) + 2 * room and not (saturated or self.cut):
+            if lost > falls and not self.cut:
+                if not saturated or new * old < 0:
+                    raise BrokenError(
+                        "no deceleration is over its limit", at_ns,
+                        f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
+                    )  # fmt: skip
+                spare = max(spare, (abs(old) - falls) / max(abs(new), room))
+            axes.append((name, new, old, room))
+        for name, new, old, room in axes:
+            up = self._most(f"{name}_acceleration", at_ns)
+            gained = spare * abs(new) - abs(old) if new * old >= 0 else abs(new)
+            if gained > up * seconds + 2 * room * spare:
+                promise = "acceleration" if spare == 1.0 else "deceleration"
                 raise BrokenError(
-                    "no deceleration is over its limit", at_ns,
-                    f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
+                    f"no {promise} is over its limit", at_ns,
+                    f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s, scaled by {spare:.3f}",
                 )  # fmt: skip
+
+    def _jerk(self, at_ns: int, wheels: tuple[float, ...], dt: int) -> None:
+        """Judge the change of the acceleration while a speed grows."""
+        rim, longest_s = self._most("wheel_speed", at_ns), max(0.05, 1.5 * self.period_ns / NS)
+        saturated = max(map(abs, wheels)) > rim - STEP or _fastest(self.last) > rim - STEP
+        lost = saturated or self.cut or self.pending or dt > RAMP_NS
+        room = 0.51 * STEP * self.radius
+        slopes = iter(self._slopes)
+        axes = zip(("linear", "angular"), self.twist(wheels), (room, room / self.half), strict=True)
+        for name, speed, rounded in axes:
+            up, jerk = self._most(f"{name}_acceleration", at_ns), f"{name}_jerk"
+            unsure = lost or not self.limits.get(jerk) or jerk in self.unsure
+            for sign in (1.0, -1.0):
+                slope = next(slopes)
+                if unsure or at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
+                    slope.lose(sign * speed, rounded, up)
+                elif not slope.take(
+                    sign * speed, min(dt / NS, longest_s), self.limits[jerk], up, rounded
+                ):
+                    raise BrokenError(
+                        "no jerk is over its limit", at_ns,
+                        f"{name} {speed:.4f} over {self.limits[jerk]:g}",
+                    )  # fmt: skip
 
     def ramp_ns(self, stop: bool, wheels: tuple[float, ...] | None = None) -> int:
         """Return how long the softest limits of this drive allow a ramp to rest to take.
@@ -598,10 +641,10 @@ class Witness:
 
     def _lowest(self, at_ns: int) -> int:
         """Return the highest priority of a source that certainly sends now."""
-        if self.churns:
-            return 0
         found = 0
         for source, wish in self.wishes:
+            if source in self.churned:
+                continue
             age = at_ns - wish.arrived_ns
             live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS
             if live and wish.certain and wish.arrived_ns > self.armed_since_ns + MARGIN_NS:
@@ -623,9 +666,14 @@ class Witness:
                 return False
         return True
 
-    def clamped(self, v: float, w: float) -> tuple[float, float]:
-        """Return a wish scaled down to the limits with its curvature kept."""
-        limits, scale = self.softest, 1.0
+    def clamped(
+        self, v: float, w: float, limits: dict[str, float] | None = None
+    ) -> tuple[float, float]:
+        """Return a wish scaled down to the limits with its curvature kept.
+
+        Without limits it is scaled to the highest ones of this drive.
+        """
+        limits, scale = limits or self.softest, 1.0
         scale = min(scale, limits["linear_speed"] / abs(v) if v else 1.0)
         scale = min(scale, limits["angular_speed"] / abs(w) if w else 1.0)
         right, left = self.radii

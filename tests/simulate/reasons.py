@@ -154,7 +154,7 @@ class Reasons:
         tick_ns = 2 * witness.period_ns + MARGIN_NS
         if now_ns - max(self._ready_ns, self._looked_ns + EVERY_NS) < tick_ns:
             return
-        if witness.pending or witness.churns or stalled_ns > now_ns - NS:
+        if witness.pending or witness.churned or stalled_ns > now_ns - NS:
             return
         self._looked_ns = now_ns
         # A board that greets after a reset disarms all, and then the robot becomes ready again.

@@ -26,6 +26,8 @@ from tests.simulate.actors import Result, Run, played
 from tests.simulate.ages import Ages
 from tests.simulate.damage import Damage
 from tests.simulate.differences import CORRECTED, REWORDED
+from tests.simulate.followed import Followed
+from tests.simulate.jerk import Slope
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.plugging import Plugging
@@ -513,6 +515,46 @@ def test_whole_lines_that_are_not_heard_behind_a_damaged_one_are_a_finding(
             damage.fed(whole[:7])
             damage.fed(whole[7:])
             damage.look(n * NS, lambda n=n: max(0, n - lost))  # type: ignore[misc]
+
+
+def followed_in_turn(*sent: tuple[float, str, float, float]) -> None:
+    """Have the robot follow each command of two `signed` senders: time, sender, speed, by."""
+    witness = witnessed()
+    followed = Followed(witness)
+    base = made(1)["senders"][0] | {
+        "way": "signed", "source": "app", "wheels": False, "delay": 0.0, "churn": False,
+        "jitter": 0.0, "congestion": [], "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0,
+        "ahead": 0.0, "drift": 0.0, "loss": 0.0, "twice": 0.0, "swap": 0.0,
+    }  # fmt: skip
+    for number, (at_s, name, v, by_s) in enumerate(sent):
+        sender = base | {"id": name, "clock": [["step", 5.0, by_s]] if by_s else []}
+        at_ns = int(at_s * NS)
+        one = Message(at_ns, at_ns, v, 0.0, at_ns, number, "")
+        found = sample(sender, one, PLAIN["config"], 0)
+        wish = witness.command(sender, one, found, at_ns)
+        followed.command(sender, one, found, at_ns, wish)
+        followed.step(at_ns + 1, at_ns + 1, at_ns, "driving", "up")
+
+
+def test_a_second_sender_that_is_followed_before_the_first_is_silent_is_a_finding() -> None:
+    followed_in_turn((4.0, "a", 0.3, 0.0), (6.0, "b", 0.3, 0.0))
+    with pytest.raises(BrokenError, match="the first of equal priority keeps the robot"):
+        followed_in_turn((4.0, "a", 0.3, 0.0), (4.05, "b", 0.3, 0.0))
+
+
+def test_a_clock_that_was_set_and_drives_without_a_zero_is_a_finding() -> None:
+    followed_in_turn((4.0, "a", 0.3, -2.0), (7.0, "a", 0.0, -2.0), (7.1, "a", 0.3, -2.0))
+    with pytest.raises(BrokenError, match="a clock that jumped needs a zero"):
+        followed_in_turn((4.0, "a", 0.3, -2.0), (7.1, "a", 0.3, -2.0))
+
+
+def test_a_slope_that_grows_faster_than_the_jerk_is_seen_through_the_rounding() -> None:
+    for jerk, allowed in ((2.0, True), (6.0, False)):
+        slope, found = Slope(), True
+        for n in range(30):
+            speed = round(jerk * (n * 0.01) ** 2 / 2 / 0.0005) * 0.0005
+            found = slope.take(speed, 0.01, 2.0, 4.0, 0.00026) and found
+        assert found is allowed
 
 
 # shrinking

@@ -139,6 +139,8 @@ class Arbiter:
         }
         self._ranking = sorted(self._sources.values(), key=lambda source: -source.priority)
         self._holder: _Source | None = None
+        self._followed: Sender | None = None
+        """The sender that the robot followed in the last step."""
         self._since_ns = 0
         self._freshness = Freshness()
 
@@ -160,7 +162,7 @@ class Arbiter:
         self._since_ns = since_ns
         for source in self._ranking:
             source.require_neutral()
-        self._holder = None
+        self._holder = self._followed = None
 
     def accept(self, command: Command) -> Objection:
         """Take a command and return "", or return the reason to refuse it."""
@@ -203,6 +205,7 @@ class Arbiter:
     def choose(self, now_ns: int) -> Choice:
         """Return the command that the robot follows now."""
         first: tuple[_Source, Sender] | None = None
+        kept = self._followed
         for source in self._ranking:
             if not source.senders or not (live := source.live(now_ns)):
                 continue
@@ -210,17 +213,27 @@ class Arbiter:
                 source.priority == first[0].priority and live[0].came_ns < first[1].came_ns
             ):
                 first = source, live[0]
+            if (
+                kept is not None
+                and kept in live
+                and source.priority == first[0].priority
+                and kept.armed(now_ns)
+            ):
+                # A sender that came before it may have become armed only now.
+                first = source, kept
+                break
         if first is None:
-            self._holder = None
+            self._holder = self._followed = None
             for source in self._ranking:
                 if source.senders and (wait := source.doubted(now_ns)) is not None:
                     return Choice(wait=wait)
             return IDLE
         source, sender = first
-        self._holder = source
+        self._holder, self._followed = source, None
         if not sender.armed(now_ns):
             wait = source.neutral(sender, _lasts(now_ns - sender.came_ns))
             return Choice(source.name, None, wait, sender=sender.name)
+        self._followed = sender
         wait = NOTHING
         if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
             wait = Wait("zeros", source.name, lasts=lasts, kept=self._kept(source, now_ns))
@@ -229,7 +242,7 @@ class Arbiter:
     def _kept(self, holder: _Source, now_ns: int) -> str:
         """Return the name of a sender of speeds that the holder's zeros keep waiting, or ""."""
         for source in self._ranking:
-            senders = source.live(now_ns)[source is holder :]
+            senders = (each for each in source.live(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
                 return f"another sender of {source.name}" if source is holder else source.name
         return ""

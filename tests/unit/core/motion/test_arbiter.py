@@ -264,6 +264,19 @@ def test_the_second_sender_of_a_source_has_it_once_the_first_is_silent_and_keeps
     assert bench.choice().twist == BACK
 
 
+def test_a_sender_that_came_first_and_is_armed_later_waits_until_the_other_is_silent() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, sender="unarmed")
+    bench.wait(50).send(HIGH, REST, sender="armed")
+    assert bench.choice().sender == "armed"
+    for n in range(20):
+        bench.wait(50).send(HIGH, GO, sender="armed")
+        bench.send(HIGH, BACK if n % 5 else REST, sender="unarmed")
+        assert bench.choice().sender == "armed"
+    bench.wait(260).send(HIGH, BACK, sender="unarmed")
+    assert bench.choice().sender == "unarmed"
+
+
 def test_a_zero_of_the_second_sender_brakes_nobody_who_came_first() -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a")

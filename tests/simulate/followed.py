@@ -1,0 +1,250 @@
+"""Which command the robot may follow: the arrival that it reports, held against all senders.
+
+The robot reports when the command arrived that it follows, so the simulator knows its sender.
+`deploy/clients/README.md` says which sender that must be. A command counts here only if the daemon
+certainly accepts it: it has no stamp, or its delays were the lowest and even for long enough.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from tests.simulate.ages import Wish
+from tests.simulate.product import HELD
+from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.roads import FOREIGN, NS, Message, Sample, stable
+
+KEPT = 4000
+"""Commands that are remembered."""
+
+OBEYED_NS = 20_000_000
+"""A command that was accepted is obeyed within this time and one period."""
+
+EVEN_NS = 20_000_000
+"""Delays within this time of their lowest are even."""
+
+UNBROKEN_NS = NS
+"""A longer silence begins a new run of even delays."""
+
+KNOWN_NS = 240 * NS
+"""The daemon knows a clock for this time at least."""
+
+Who = tuple[str, str]
+"""Source and identity of a sender."""
+
+
+class Command(NamedTuple):
+    """A command that arrived, by the robot's clock and as the omniscient view knows it."""
+
+    arrived_ns: int
+    true_ns: int
+    who: Who
+    sender: dict[str, Any]
+    message: Message
+    clock: str
+    v: float
+    w: float
+
+
+class Run:
+    """A run of even delays of one clock."""
+
+    def __init__(self, at_ns: int, age: int) -> None:
+        self.begun_ns = self.last_ns = at_ns
+        self.low = self.high = age
+        self.followed = False
+        """The robot has followed a command of this run, so the daemon knows its delays."""
+
+
+class Followed:
+    """The commands that arrived at one daemon, and the one that it follows."""
+
+    def __init__(self, witness: Witness) -> None:
+        self._witness = witness
+        self._arrived: dict[int, Command | None] = {}
+        """By arrival; None if several arrived at that time."""
+        self._runs: dict[str, Run] = {}
+        self._newest: dict[str, int] = {}
+        """The highest number that arrived, by clock."""
+        self._waiting: dict[Who, Command] = {}
+        """Commands that certainly count from the next step on."""
+        self._count = 0
+        """Commands that arrived since the last step."""
+        self._sure: dict[Who, Command] = {}
+        """The newest command of each sender that certainly counts."""
+        self._holder: Command | None = None
+        """The command that was followed in the last step."""
+        self._zero_ns: dict[Who, int] = {}
+        """When the newest zero of each sender was sent, of those that arrived."""
+        self._before: dict[str, Command] = {}
+        """The newest command of each adjusted clock that was followed."""
+        self._armed_since_ns = witness.armed_since_ns
+        self._mode = ""
+
+    def command(
+        self,
+        sender: dict[str, Any],
+        message: Message,
+        sample: Sample,
+        at_ns: int,
+        wish: Wish | None,
+    ) -> None:
+        """Take note of a message that arrived at `at_ns` by the robot's clock.
+
+        `wish` is None if the message is no command that can be read.
+        """
+        self._count += 1
+        if wish is None:
+            return
+        who = sender["source"], sample.identity
+        found = Command(at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w)
+        if not (wish.v or wish.w or message.junk):
+            self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
+        self._arrived[at_ns] = None if at_ns in self._arrived else found
+        if len(self._arrived) > KEPT:
+            del self._arrived[next(iter(self._arrived))]
+        if self._certain(found, sample, wish):
+            self._waiting[who] = found
+
+    def _certain(self, found: Command, sample: Sample, wish: Wish) -> bool:
+        """Return whether the daemon certainly accepts this command."""
+        witness, sender, message = self._witness, found.sender, found.message
+        if found.who[0] in witness.churned or message.junk:
+            return False
+        if not sample.clock:
+            return wish.certain
+        if sample.clock in witness.shared_clocks or not stable(sender):
+            return False
+        newest = self._newest.get(sample.clock, 0)
+        self._newest[sample.clock] = max(newest, message.number)
+        least = witness.ages.clocks[sample.clock].least_ns
+        age, at_ns = wish.arrived_ns - message.sent_ns, wish.arrived_ns
+        run = self._runs.get(sample.clock)
+        if (
+            run is None
+            or at_ns - run.last_ns > UNBROKEN_NS
+            or run.begun_ns < witness.ages.learned_ns
+            or max(run.high, age) - min(run.low, age) > EVEN_NS
+        ):
+            run = self._runs[sample.clock] = Run(at_ns, age)
+        run.low, run.high, run.last_ns = min(run.low, age), max(run.high, age), at_ns
+        proof_ns = 3 * NS + 2 * min(witness.timeout[found.who[0]], 2 * NS)
+        proven = run.followed or (not sender.get("jitter") and at_ns - run.begun_ns > proof_ns)
+        lowest = least is not None and age <= least + EVEN_NS
+        return proven and lowest and message.number > newest
+
+    @property
+    def wish(self) -> tuple[float, float] | None:
+        """The speeds of the command that the robot follows, None if that is not known."""
+        return None if self._holder is None else (self._holder.v, self._holder.w)
+
+    def forget(self) -> None:
+        """Note that the daemon may have forgotten all commands."""
+        self._sure.clear()
+        self._holder = None
+
+    def step(
+        self, true_ns: int, decided_ns: int, followed_ns: int | None, mode: str, link: str
+    ) -> None:
+        """Judge the command that the robot follows in a step that began at `decided_ns`."""
+        witness = self._witness
+        armed_since_ns = witness.armed_since_ns
+        disarmed = armed_since_ns != self._armed_since_ns or (mode == "fault" != self._mode)
+        self._armed_since_ns, self._mode = armed_since_ns, mode
+        if disarmed or witness.pending or link != "up":
+            self.forget()
+        elif self._count <= HELD:
+            self._sure.update(self._waiting)
+        self._waiting.clear()
+        self._count = 0
+        found = None if followed_ns is None else self._arrived.get(followed_ns)
+        if found is not None:
+            self._first_keeps(true_ns, decided_ns, found)
+            self._highest_wins(true_ns, decided_ns, found)
+            self._newest_counts(true_ns, decided_ns, found)
+            if found.clock and not stable(found.sender):
+                self._adjusted_needs_zero(true_ns, found)
+            if found.clock in self._runs:
+                run = self._runs[found.clock]
+                run.followed |= found.true_ns >= run.begun_ns
+        self._holder = found
+
+    def _first_keeps(self, true_ns: int, decided_ns: int, found: Command) -> None:
+        """The robot leaves a sender that is not silent only for a source of higher priority."""
+        holder, witness = self._holder, self._witness
+        if holder is None or holder.who == found.who:
+            return
+        priority = witness.priority
+        left_ns = witness.timeout[holder.who[0]] - (decided_ns - holder.arrived_ns)
+        if priority[found.who[0]] <= priority[holder.who[0]] and left_ns > witness.period_ns:
+            if holder.sender["way"] in FOREIGN and not stable(holder.sender):
+                return  # it was set, so it must send a zero again
+            raise BrokenError(
+                "the first of equal priority keeps the robot", true_ns,
+                f"{found.who} is followed, {holder.who} was, {left_ns / NS:.3f} s before its end",
+            )  # fmt: skip
+
+    def _highest_wins(self, true_ns: int, decided_ns: int, found: Command) -> None:
+        witness = self._witness
+        priority = witness.priority[found.who[0]]
+        for (source, identity), other in self._sure.items():
+            if witness.priority[source] <= priority:
+                continue
+            age = decided_ns - other.arrived_ns
+            if OBEYED_NS + witness.period_ns < age < witness.timeout[source] - witness.period_ns:
+                raise BrokenError(
+                    "the highest priority wins", true_ns,
+                    f"{found.who} is followed, {source} by {identity} sent {age / NS:.3f} s ago",
+                )  # fmt: skip
+
+    def _newest_counts(self, true_ns: int, decided_ns: int, found: Command) -> None:
+        newest, late_ns = self._sure.get(found.who), OBEYED_NS + self._witness.period_ns
+        if newest is not None and found.arrived_ns < newest.arrived_ns < decided_ns - late_ns:
+            raise BrokenError(
+                "the newest command is obeyed at once", true_ns,
+                f"{found.who} sent one {(decided_ns - newest.arrived_ns) / NS:.3f} s ago, and "
+                f"that of {(decided_ns - found.arrived_ns) / NS:.3f} s ago is followed",
+            )  # fmt: skip
+
+    def _adjusted_needs_zero(self, true_ns: int, found: Command) -> None:
+        """A foreign clock that was stepped by more than the timeout needs a zero afterwards.
+
+        A clock that was set forward makes delays shorter, so a network that delays the commands at
+        the same time may hide that. Another step, or a robot that slept, may hide any step.
+        """
+        witness, sender, message = self._witness, found.sender, found.message
+        before = self._before.get(found.clock)
+        self._before[found.clock] = found
+        if before is None or before.message.sent_ns >= message.sent_ns:
+            return
+        since_ns, slewed_s, steps = before.message.sent_ns, 0.0, []
+        for kind, at_s, *rest in sender["clock"]:
+            if kind == "slew":
+                lasted_ns = min(message.sent_ns, rest[0] * NS) - max(since_ns, at_s * NS)
+                slewed_s += abs(rest[1]) * max(0.0, lasted_ns / NS)
+            elif since_ns < at_s * NS <= message.sent_ns:
+                steps.append((at_s, rest[0]))
+        if (
+            len(steps) != 1
+            or not witness.neutral_first
+            or message.sent_ns - since_ns > KNOWN_NS
+            or before.true_ns < witness.ages.learned_ns
+            or found.clock in witness.shared_clocks
+            or found.who[0] in witness.churned
+        ):
+            return
+        at_s, by_s = steps[0]
+        timeout_s = max(witness.timeout[found.who[0]], NS // 4) / NS
+        late_s = (before.true_ns - since_ns) / NS - sender["delay"]
+        if by_s > 0.0:
+            if sender["congestion"] or sender["jitter"] > EVEN_NS / NS / 2:
+                return
+            late_s = timeout_s
+        if abs(by_s) < timeout_s + max(0.0, late_s) + slewed_s + 0.15:
+            return
+        witness.counts["clocks that jumped"] += 1
+        if self._zero_ns.get(found.who, -1) < at_s * NS:
+            raise BrokenError(
+                "a clock that jumped needs a zero", true_ns,
+                f"{found.who} was set by {by_s:g} s at {at_s:.3f} s and has sent no zero since",
+            )  # fmt: skip
