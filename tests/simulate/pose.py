@@ -50,6 +50,8 @@ class PoseWitness:
         """The pose that a call of this step has set, if its time is known."""
         self._expected: tuple[Pose, Pose] | None = None
         """The true pose at the last sample before a call, and the pose that the call has set."""
+        self._asked_ns = 0
+        """The time of that sample."""
         self._room = 0.0
         self._last: tuple[int, Pose] | None = None
         self.latest: Pose | None = None
@@ -116,8 +118,8 @@ class PoseWitness:
             self._placed, self._asked, self.latest = False, None, None
             self.begin()
             true = None if last is None else self._true_at(last[0])
-            if true is not None and asked is not None:
-                self._expected = true, asked
+            if last is not None and true is not None and asked is not None:
+                self._expected, self._asked_ns = (true, asked), last[0]
 
     def _one(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
@@ -137,7 +139,8 @@ class PoseWitness:
             return
         by_time = 0.1 * self.speed_at(at_ns)
         if self._expected is not None:
-            self._put(now_ns, self._expected, true, pose, by_time)
+            if at_ns - self._asked_ns < NS // 5:  # behind a silence nobody knows the way since
+                self._put(now_ns, self._expected, true, pose, by_time)
             self._expected = None
         if self._anchor is None:
             self._anchor = true, pose

@@ -124,7 +124,8 @@ class Reasons:
             heard.clock = None
             return
         clock = self._clock(one.clock, at_ns, delay_ns)
-        clock.odd |= bool(sender["clock"] or sender.get("twice") or sender.get("swap"))
+        wild = (sender.get(name) for name in ("clock", "twice", "swap", "bad_stamps"))
+        clock.odd |= any(wild)
         clock.odd |= one.clock in self.run.witness.shared_clocks
         clock.proved |= clock.known(at_ns, self.run.witness.timeout[source])
         heard.clock = clock
