@@ -112,7 +112,9 @@ class Followed:
         if found.who[0] in witness.churned or message.junk:
             return False
         if not sample.clock:
-            return wish.certain
+            # A zero of a shared identity counts only behind its pause.
+            armed = not witness.neutral_first or wish.armed_ns > witness.armed_since_ns
+            return wish.certain and (armed or not sample.shared)
         if sample.clock in witness.shared_clocks or not stable(sender):
             return False
         newest = self._newest.get(sample.clock, 0)

@@ -512,7 +512,9 @@ class Witness:
         """Judge the change of the acceleration while a speed grows."""
         rim, longest_s = self._most("wheel_speed", at_ns), max(0.05, 1.5 * self.period_ns / NS)
         saturated = max(map(abs, wheels)) > rim - STEP or _fastest(self.last) > rim - STEP
-        lost = saturated or self.cut or self.pending or dt > RAMP_NS
+        # A line that goes at once, or late, belongs to a step of another length than its interval.
+        uneven = abs(dt - self.period_ns) > self.period_ns // 20
+        lost = saturated or self.cut or self.pending or uneven
         room = 0.51 * STEP * self.radius
         slopes = iter(self._slopes)
         axes = zip(("linear", "angular"), self.twist(wheels), (room, room / self.half), strict=True)
