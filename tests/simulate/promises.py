@@ -643,10 +643,12 @@ class Witness:
 
     def _lowest(self, at_ns: int) -> int:
         """Return the highest priority of a source that certainly sends now."""
+        if self.churned:
+            return 0
         found = 0
         for source, wish in self.wishes:
-            if source in self.churned:
-                continue
+            if self.neutral_first and wish.shared and wish.armed_ns <= self.armed_since_ns:
+                continue  # a zero of a shared identity counts only behind its pause
             age = at_ns - wish.arrived_ns
             live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS
             if live and wish.certain and wish.arrived_ns > self.armed_since_ns + MARGIN_NS:
