@@ -198,9 +198,13 @@ class Timeline:
         style, slots = self._style, self._slots
         if style.speaks is not False:
             slots.read(end_ns, lines, size < FULL_READ)
+        spoke = style.speaks
         style.read(lines, (end_ns - before) / self._usual_ns)
         if style.speaks is False:
             slots.forget()
+            if spoke:
+                # No reply was assigned to a line while the board seemed to report by itself.
+                self._prompts.restart()
         self._prompts.read(end_ns, lines)
 
     def spoilt(self) -> None:

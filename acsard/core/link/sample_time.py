@@ -409,6 +409,13 @@ class PromptedTimes:
     def forget(self) -> None:
         """Forget all lines: they are answered or will never be."""
         self._left.clear()
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget which line was answered last: the next reply answers the newest one that it can.
+
+        The lines stay, because replies to the last ones are still on the way.
+        """
         self._delay: float | None = None
         self._spread = self._least = 0.0
         """Mean deviation of the usual delay, and the least delay; both ns."""

@@ -335,6 +335,30 @@ def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> 
     assert total == pytest.approx(0.8, abs=0.0003)
 
 
+def test_a_board_that_answers_each_line_again_after_sparse_replies_gets_no_old_lines() -> None:
+    """While only every fifth line is answered, the board seems to report by its own clock.
+
+    Its replies are then assigned to no line, so the lines that left before must not count later.
+    """
+    bench = Bench(counts=0)
+    timeline = bench.timeline
+    for number in range(596):
+        timeline.left(bench.now_ns + 2 * MS)
+        bench.now_ns += 10 * MS
+        if number % 5 == 0:
+            read(bench, 0, 1)
+    assert timeline._style.speaks
+    lines = []
+    for number in range(60):
+        timeline.left(bench.now_ns + 2 * MS)
+        bench.now_ns += 10 * MS
+        if number >= 7:
+            lines += read(bench, 0, 1 if number > 7 else 8)  # the host stood still for eight lines
+    assert timeline._style.speaks is False
+    assert max(line.dt for line in lines) <= 0.08  # the duration of the stall
+    assert sum(line.dt for line in lines) == pytest.approx(0.6, abs=0.06)
+
+
 def stall(style: ReplyStyle, lines: int, periods: float, left: int) -> None:
     for _ in range(left):
         style.left()
