@@ -422,14 +422,13 @@ def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
     with running(board, tmp_path, mcu) as (_, _, bus), bus.commanding(0.5) as commander:
         drives(board)
         for fault in ("noise", "drop"):
-            before = board.status()
-            board.command(f"{fault} to 211")
-            board.command(f"{fault} from 307")
-            speeds = []
-            while (status := passes(board, 5)).virtual_ns < before.virtual_ns + length_s * 1e9:
-                speeds += [motor.speed for motor in status.motors]
-            board.command(f"{fault} to 0")
-            board.command(f"{fault} from 0")
+            before, status, speeds = bad_wire(board, fault, length_s)
+            for _ in range(2):
+                if not is_checked or status.skipped_ns == before.skipped_ns:
+                    break
+                # The machine was so busy that the simulated board stood still, so lines came late.
+                drives(board)
+                before, status, speeds = bad_wire(board, fault, length_s)
             points, wrong = status.set_points - before.set_points, status.wrong - before.wrong
             heard = status.to_board.lines - before.to_board.lines
             bad = status.to_board.damaged + status.to_board.lost
@@ -453,6 +452,22 @@ def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
     if is_checked:
         assert board.status().wrong == 0
         assert counted.trips == 0
+
+
+def bad_wire(board: Board, fault: str, length_s: float) -> tuple[Status, Status, list[float]]:
+    """Damage lines both ways for a while.
+
+    Return the board's status before and after, and the speeds of all motors in between, rad/s.
+    """
+    before = board.status()
+    board.command(f"{fault} to 211")
+    board.command(f"{fault} from 307")
+    speeds: list[float] = []
+    while (status := passes(board, 5)).virtual_ns < before.virtual_ns + length_s * 1e9:
+        speeds += [motor.speed for motor in status.motors]
+    board.command(f"{fault} to 0")
+    board.command(f"{fault} from 0")
+    return before, status, speeds
 
 
 def rejects(bus: Bus) -> dict[str, int]:

@@ -83,8 +83,11 @@ def faults(
 
 
 def undisturbed(took: list[Fault]) -> list[float]:
-    """Return the times to a zero in which other work of this machine had no part."""
-    return [one.zero for one in took if one.waited <= DISTURBED_S]
+    """Return the times to a zero without the time in which the processor had other work.
+
+    Times that other work of this machine determined are left out.
+    """
+    return [one.zero - one.waited for one in took if one.waited <= DISTURBED_S]
 
 
 def within(took: list[Fault], bound: float) -> bool:
