@@ -166,10 +166,13 @@ def drives(person: Person, bus: Bus) -> None:
         raise AssertionError(f"{error}; it said {told}") from None
 
 
-WAYS = ("a key", "the button", "a long press", "escape", "stop", "hidden")
+WAYS = ("a key", "stop", "hidden")
+NIGHTLY = ("the button", "a long press", "escape")
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    "way", [*WAYS, *(pytest.param(way, marks=pytest.mark.soak) for way in NIGHTLY)]
+)
 def test_whatever_a_person_does_while_it_drives_stops_it(
     browser: Browser, skidding: tuple[Daemon, Bus, Page], way: str
 ) -> None:

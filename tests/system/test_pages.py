@@ -133,6 +133,7 @@ def test_each_call_that_proves_a_promise_finds_tests() -> None:
 
 
 @pytest.mark.network
+@pytest.mark.soak
 def test_the_broken_board_of_the_firmware_page_is_found_broken(tmp_path: Path) -> None:
     page, place = "deploy/firmware/README.md", with_acsard(tmp_path)
     board = find(page, "acsard sim --link").split()[1:]
@@ -259,6 +260,7 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
 
 
 @pytest.mark.network
+@pytest.mark.soak
 @pytest.mark.timeout(2 * INSTALL_S)
 def test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs(
     clone: Path,

@@ -99,7 +99,6 @@ def end(container: Container, way: Way) -> None:
     ("kind", "way", "times"),
     [
         ("stop", "watchdog", 1),
-        ("fault", "kill", 1),
         ("inactive", "restart", 1),
         *(
             pytest.param(kind, way, 8, marks=pytest.mark.soak)
