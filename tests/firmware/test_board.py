@@ -435,6 +435,7 @@ def test_the_milliseconds_are_the_board_s(board: Board, host: Host) -> None:
     assert said == pytest.approx((ended.virtual_ns - began.virtual_ns) / MS, abs=25)
 
 
+@pytest.mark.nightly
 def test_the_counts_wrap_and_go_on(board: Board, host: Host) -> None:
     replies = host.drive((40.0, -40.0, 40.0, -40.0), 4.0)
     total = [0] * 4
@@ -498,6 +499,7 @@ def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host:
 
 
 @pytest.mark.parametrize("speed", [20.0, 40.0, 60.0])
+@pytest.mark.nightly
 def test_it_keeps_up_with_fast_wheels(runner: Path, firmware: Path, speed: float) -> None:
     with Board(runner, firmware, "--free-speed", "70,70,70,70") as board, Host(board.path) as host:
         host.drive((speed, -speed, speed, -speed), 1.0)
@@ -710,6 +712,7 @@ def test_a_healthy_robot_is_never_cut(board: Board, host: Host) -> None:
     assert told.trips == 0
 
 
+@pytest.mark.nightly
 def test_coarse_encoders_are_driven_reported_and_never_cut(runner: Path, tmp_path: Path) -> None:
     coarse = build_firmware(tmp_path, "'-DCOUNTS_PER_TURN=2 * 4 * 12'")
     with Board(runner, coarse, "--counts", "96") as board, Host(board.path) as host:
@@ -738,6 +741,7 @@ def test_at_the_lowest_pwm_frequency_the_duty_rises_to_the_top(
 
 
 @pytest.mark.parametrize("baud_rate", [9600, 57600])
+@pytest.mark.nightly
 def test_it_speaks_at_other_baud_rates(runner: Path, tmp_path: Path, baud_rate: int) -> None:
     slow = build_firmware(tmp_path, f"-DBAUD_RATE={baud_rate}UL")
     with Board(runner, slow, "--baud", str(baud_rate)) as board, Host(board.path) as host:

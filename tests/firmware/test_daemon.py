@@ -541,6 +541,7 @@ def test_a_lost_line_is_found_again_and_neutral_comes_first(
     ids=["counts-5", "counts-60", "plain-60"],
 )
 @pytest.mark.timeout(180)
+@pytest.mark.nightly
 def test_by_counts_a_fifth_of_the_lines_lost_loses_no_distance(
     board: Board, tmp_path: Path, mcu: Mcu, length_s: int
 ) -> None:

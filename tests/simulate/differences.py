@@ -49,6 +49,7 @@ REWORDED: tuple[tuple[str, str], ...] = (
         "which other program uses the processor? "
         "(`top` shows it; as a service acsard has priority)",
     ),
+    ("and this daemon reads", "but this daemon reads"),
     ("heard nothing of the", "received nothing from the"),
     ("and heard too little for a link", "and received too little for a link"),
     (
@@ -144,6 +145,10 @@ CORRECTED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     (
+        "a start with a latch file that cannot be written gives each latch a new number",
+        ("acsard/runtime/kept_latches.py",),
+    ),
+    (
         "an echo is found up to seven lines later, and also of checked lines without samples",
         (LINK + "echo.py", LINK + "negotiation.py", LINK + "session.py"),
     ),
@@ -173,6 +178,16 @@ CORRECTED: tuple[tuple[str, tuple[str, ...]], ...] = (
     (
         "replies that are lost soon after the board became faster cost no distance",
         (LINK + "clock_of_answers.py",),
+    ),
+    (
+        "a sender that is armed later does not take the robot from one of the same priority that "
+        "drives",
+        (MOTION + "arbiter.py",),
+    ),
+    ("one feedback line after a stall proves no wheel fault", (MOTION + "sanity.py",)),
+    (
+        "a board that answers each line again is assigned no line from before it seemed to report",
+        (LINK + "clock_of_answers.py", LINK + "feedback.py"),
     ),
     (
         "after a second without an answer a zero counts only once the board answers again",

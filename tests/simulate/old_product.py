@@ -18,19 +18,17 @@ MODULES = {
     "acsard.core.incoming.commands": "acsard.incoming.commands",
     "acsard.core.incoming.queries": "acsard.incoming.queries",
     "acsard.core.messages.encodings": "acsard.messages.encodings",
+    "acsard.core.simulator.baud_mismatch": "acsard.sim.garble",
+    "acsard.core.simulator.fake_mcu": "acsard.sim.fake_mcu",
     "acsard.core.simulator.simulated_robot": "acsard.sim.watched",
     "acsard.core.values": "acsard.values",
     "acsard.daemon.latch_rules": "acsard.runtime.kept_latches",
+    "acsard.daemon.pacing": "acsard.runtime.period",
 }
 """Maps the present name of a module to its old one."""
 
 for present, old in MODULES.items():
     sys.modules[present] = importlib.import_module(old)
-# The old daemon had one function for each stop of its own. It kept the numbers of the latches
-# when the file could not be written.
-latch_rules: Any = sys.modules["acsard.daemon.latch_rules"]
-latch_rules.doubted = latch_rules.stopped
-
 # The present plans use one fault of the simulated board that has another name now.
 fake_mcu: Any = importlib.import_module("acsard.sim.fake_mcu").FakeMcu
 fake_mcu.free_running = fake_mcu.unprompted
@@ -44,7 +42,8 @@ product: Any = importlib.util.module_from_spec(spec)
 sys.modules[spec.name] = product
 spec.loader.exec_module(product)
 
-START_NS, WALL_OFFSET_NS, Seen = product.START_NS, product.WALL_OFFSET_NS, product.Seen
+START_NS, WALL_OFFSET_NS = product.START_NS, product.WALL_OFFSET_NS
+HELD, Seen = product.HELD, product.Seen
 
 
 def old_config(config: dict[str, Any]) -> dict[str, Any]:

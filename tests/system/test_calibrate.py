@@ -329,7 +329,10 @@ def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["stop", "teleop", "interrupt"])
+@pytest.mark.parametrize(
+    "how",
+    ["stop", *(pytest.param(how, marks=pytest.mark.nightly) for how in ("teleop", "interrupt"))],
+)
 def test_whatever_else_ends_a_leg_is_reported(tmp_path: Path, how: str) -> None:
     with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()

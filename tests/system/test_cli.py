@@ -234,6 +234,7 @@ def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
         (["echo", "cmd/nobody"], "robot acsar is there, but no program sends on cmd/nobody now"),
     ],
 )
+@pytest.mark.nightly
 def test_who_waits_for_what_does_not_come_is_told_why_once_and_goes_on_waiting(
     shared: Daemon, bus: Bus, words: list[str], why: str
 ) -> None:

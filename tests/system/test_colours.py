@@ -101,6 +101,7 @@ def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
 
 @pytest.mark.variations(4)
 @pytest.mark.parametrize(("words", "text"), SCREENS, ids=[" ".join(one) for one, _ in SCREENS])
+@pytest.mark.nightly
 def test_no_screen_has_a_colour_where_nobody_wants_one(
     shared: Daemon, bus: Bus, tmp_path: Path, words: list[str], text: str
 ) -> None:
@@ -135,6 +136,7 @@ def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Pa
     ],
     ids=" ".join,
 )  # fmt: skip
+@pytest.mark.nightly
 def test_nothing_that_goes_into_a_pipe_has_one(shared: Daemon, bus: Bus, words: list[str]) -> None:
     env = environment(TERM="xterm-256color", FORCE_COLOR="1")
     env.pop("NO_COLOR", None)

@@ -602,6 +602,7 @@ def test_a_port_that_is_taken_is_a_sentence(shared: Daemon, tmp_path: Path) -> N
 
 
 @SLOW
+@pytest.mark.nightly
 def test_nobody_who_looks_costs_nothing(shows: Shows, viewer: Viewer, bus: Bus) -> None:
     def cost() -> float:
         """Return the processor time while the daemon publishes 300 odometry messages, s."""

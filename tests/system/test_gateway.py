@@ -153,7 +153,7 @@ def listening(endpoint: str) -> zenoh.Config:
     return config
 
 
-@pytest.mark.parametrize("answers", [True, False])
+@pytest.mark.parametrize("answers", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
     tmp_path: Path, certificates: Certificates, answers: bool
 ) -> None:

@@ -264,7 +264,9 @@ def test_a_server_that_is_killed_at_a_question_takes_its_child_with_it(
             run(lambda: _then_fail(story))
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.nightly)]
+)
 def test_a_server_that_ends_or_hangs_takes_its_child_with_it(
     daemon: Daemon, standing: Bus, tmp_path: Path, number: signal.Signals
 ) -> None:

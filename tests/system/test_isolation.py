@@ -323,13 +323,20 @@ Forms = Mapping[Identity, Sequence[str]]
 def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
     """Each attack takes half a minute in the long runs.
 
-    The most different ones run briefly every time.
+    The most different ones run briefly: every second one each time, the others at night.
     """
+    brief = [(form, who) for who in a_moment for form in a_moment[who]]
+    nightly, soak = pytest.mark.nightly, pytest.mark.soak
     return [
-        pytest.param(form, who, seconds, marks=marks)
-        for forms, seconds, marks in ((a_moment, 1.5, ()), (half_a_minute, 30.0, pytest.mark.soak))
-        for who in forms
-        for form in forms[who]
+        *(
+            pytest.param(*attack, 1.5, marks=nightly if n % 2 else ())
+            for n, attack in enumerate(brief)
+        ),
+        *(
+            pytest.param(form, who, 30.0, marks=soak)
+            for who in half_a_minute
+            for form in half_a_minute[who]
+        ),
     ]
 
 
@@ -339,9 +346,10 @@ def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
         {"viewer": (*FORMS, *LARGE), "unlisted": (*FORMS, *LARGE[:3])},
         {
             "viewer": (
-                "subscribe", "ask", "publish", "querier", "come_and_go", "as_peer", "may_stop",
+                "subscribe", "ask", "many", "publish", "querier", "come_and_go", "as_router",
+                "as_peer", "may_stop", "may_call", "may_ask",
             ),
-            "unlisted": ("sessions", "flood"),
+            "unlisted": ("publish", "sessions", "flood"),
         },
     ),
 )  # fmt: skip
@@ -359,11 +367,12 @@ def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
     attacks(
         {"viewer": (*FORMS, *LARGE), "unlisted": ("publish", "sessions", "come_and_go", "flood")},
         {
-            "viewer": ("subscribe", "as_peer"),
+            "viewer": ("subscribe", "publish", "querier", "as_peer"),
             "unlisted": ("sessions",),
         },
     ),
 )
+@pytest.mark.nightly
 def test_who_attacks_the_fleets_router_does_not_disturb_the_robot_behind_it(
     tmp_path: Path, form: str, who: Identity, seconds: float
 ) -> None:
@@ -399,7 +408,7 @@ def test_a_bus_that_is_locked_costs_messages_and_no_period(
     assert counters["bus_stuck"] >= 1
 
 
-@pytest.mark.parametrize("form", ["many", "subscribe"])
+@pytest.mark.parametrize("form", ["many", pytest.param("subscribe", marks=pytest.mark.nightly)])
 def test_behind_the_gateway_not_even_wildcards_disturb(
     tmp_path: Path, gateway: Gateway, form: str
 ) -> None:

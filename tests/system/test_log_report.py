@@ -87,6 +87,7 @@ def test_nothing_is_wider_than_the_window_of_a_phone_or_a_desk(tmp_path: Path) -
             print(f"{width}: {browser.js('document.documentElement.scrollWidth')} px wide")
 
 
+@pytest.mark.nightly
 def test_pictures_of_it_are_as_wide_as_a_phone_and_a_desk_and_as_high_as_it_is(
     tmp_path: Path,
 ) -> None:

@@ -242,6 +242,7 @@ def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: sign
 
 
 @pytest.mark.network
+@pytest.mark.nightly
 def test_a_person_at_a_real_port_is_asked_after_each_motor(tmp_path: Path) -> None:
     with Program(acsard("sim", "--fault", "reversed_wheel=c"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]

@@ -1251,6 +1251,7 @@ REPORT = """(() => {
 })()"""
 
 
+@pytest.mark.nightly
 def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_nor_interface(
     tmp_path: Path, browser: Browser
 ) -> None:
@@ -1282,6 +1283,7 @@ def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_n
 
 
 @alone
+@pytest.mark.nightly
 def test_curves_that_lie_on_each_other_are_told_apart_and_say_their_values(page: Phone) -> None:
     browser = page.browser
     browser.size(*DESKTOP, touch=False)
@@ -1314,6 +1316,7 @@ ABOVE = """(() => {
 
 
 @alone
+@pytest.mark.nightly
 def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
     page: Phone,
 ) -> None:

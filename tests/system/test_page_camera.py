@@ -210,6 +210,7 @@ def test_pictures_that_nobody_reads_cost_little_memory(filmed: Filmed) -> None:
     asyncio.run(story())
 
 
+@pytest.mark.nightly
 def test_a_client_that_reads_a_picture_too_slowly_is_cut_off(filmed: Filmed) -> None:
     server = filmed.server
     filmed.stream.more = 900_000

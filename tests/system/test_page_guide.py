@@ -171,7 +171,7 @@ NIGHTLY = ("the button", "a long press", "escape")
 
 
 @pytest.mark.parametrize(
-    "way", [*WAYS, *(pytest.param(way, marks=pytest.mark.soak) for way in NIGHTLY)]
+    "way", [*WAYS, *(pytest.param(way, marks=pytest.mark.nightly) for way in NIGHTLY)]
 )
 def test_whatever_a_person_does_while_it_drives_stops_it(
     browser: Browser, skidding: tuple[Daemon, Bus, Page], way: str

@@ -133,7 +133,7 @@ def test_each_call_that_proves_a_promise_finds_tests() -> None:
 
 
 @pytest.mark.network
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_the_broken_board_of_the_firmware_page_is_found_broken(tmp_path: Path) -> None:
     page, place = "deploy/firmware/README.md", with_acsard(tmp_path)
     board = find(page, "acsard sim --link").split()[1:]
@@ -152,6 +152,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
 
 
 @pytest.mark.network
+@pytest.mark.nightly
 def test_the_laptop_of_the_fleet_page_does_what_its_role_may(fleet: Fleet) -> None:
     place = with_acsard(fleet.where)
     (place / "fleet").mkdir()
@@ -172,6 +173,7 @@ def test_the_laptop_of_the_fleet_page_does_what_its_role_may(fleet: Fleet) -> No
 
 
 @pytest.mark.network
+@pytest.mark.nightly
 def test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page(tmp_path: Path) -> None:
     page, place = "deploy/zenoh/README.md", with_acsard(tmp_path)
     for words in ("tls init", "tls add router", "tls add robot$n", "tls add laptop", "tls router"):
@@ -238,7 +240,6 @@ def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: 
             os.killpg(program.pid, signal.SIGTERM)  # the shell, and the daemon under it
 
 
-@pytest.mark.soak
 @pytest.mark.network
 @pytest.mark.timeout(2 * INSTALL_S)
 def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> None:
@@ -260,8 +261,8 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
 
 
 @pytest.mark.network
-@pytest.mark.soak
 @pytest.mark.timeout(2 * INSTALL_S)
+@pytest.mark.nightly
 def test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs(
     clone: Path,
 ) -> None:

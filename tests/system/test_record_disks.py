@@ -241,6 +241,7 @@ def test_for_want_of_inodes_one_recording_goes_and_no_other_where_that_does_not_
         ring.close()
 
 
+@pytest.mark.nightly
 def test_a_directory_that_is_read_only_is_reported_and_costs_only_records(tmp_path: Path) -> None:
     with disk(tmp_path, "size=1m", "ro") as path:
         with both(tmp_path, path / "record") as (daemon, bus, beside):
@@ -256,6 +257,7 @@ def test_a_directory_that_is_read_only_is_reported_and_costs_only_records(tmp_pa
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+@pytest.mark.nightly
 def test_two_seconds_a_sync_cost_no_period(tmp_path: Path) -> None:
     source, library, syncs = (tmp_path / name for name in ("slow.c", "slow.so", "syncs"))
     source.write_text(SLOW)

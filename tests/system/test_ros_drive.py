@@ -39,6 +39,7 @@ def test_the_line_of_the_pages_drives(tmp_path: Path, way: str) -> None:
     ("way", "number"),
     [("rmw", signal.SIGINT), ("rmw", signal.SIGTERM), ("bridge", signal.SIGINT)],
 )
+@pytest.mark.nightly
 def test_whoever_ends_it_in_the_middle_ends_it_with_zeros(
     tmp_path: Path, way: str, number: signal.Signals
 ) -> None:

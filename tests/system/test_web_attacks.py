@@ -449,6 +449,7 @@ def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus, before: bytes)
 
 
 @pytest.mark.parametrize("headers", [0, 60])
+@pytest.mark.nightly
 def test_answers_that_nobody_reads_cost_little_memory(table: Table, bus: Bus, headers: int) -> None:
     """Sixty clients without a token send requests without end, and read no answer."""
     page, place = table.page, URL(table.page.away)
@@ -491,6 +492,7 @@ def test_a_viewer_that_floods_with_pings_is_cut_off(
         run(story)
 
 
+@pytest.mark.nightly
 def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
     """A header of one byte a second, no bytes at all, and a body that is announced but not sent."""
     begun = time.monotonic()

@@ -196,7 +196,7 @@ def _stopped(connect: Callable[[], http.client.HTTPConnection], told: dict[str, 
     return max(0.0, took - 4 * lost(begun, begun + took))
 
 
-@pytest.mark.parametrize("most", [1024, pytest.param(65536, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("most", [1024, pytest.param(65536, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("crowd", CROWDS)
 def test_a_crowd_costs_little_and_keeps_no_stop_and_no_phone_out(
     hosts: Hosts, robot: Daemon, where: Path, crowd: str, most: int, tmp_path: Path

@@ -102,6 +102,7 @@ def test_a_certificate_in_no_list_is_reported_with_77(robot: Robot) -> None:
     ],
     ids=lambda words: words[0],
 )
+@pytest.mark.nightly
 def test_tools_say_that_a_certificate_is_in_no_list(robot: Robot, words: tuple[str, ...]) -> None:
     ended = robot.tool("unlisted", *words)
     assert ended.code != 0
@@ -112,6 +113,7 @@ def test_tools_say_that_a_certificate_is_in_no_list(robot: Robot, words: tuple[s
 @pytest.mark.parametrize(
     "words", [("call", "stop"), ("fleet", "--once")], ids=lambda words: words[0]
 )
+@pytest.mark.nightly
 def test_who_names_many_robots_by_a_certificate_of_no_list_is_told_so(
     robot: Robot, words: tuple[str, ...]
 ) -> None:
@@ -141,6 +143,7 @@ def test_who_means_all_robots_by_a_certificate_of_no_list_is_told_how_to_find_ou
     ],
     ids=lambda words: words[0] if isinstance(words, tuple) else "",
 )
+@pytest.mark.nightly
 def test_a_wrong_id_is_asked_about_before_any_list(
     robot: Robot, words: tuple[str, ...], key: str
 ) -> None:
@@ -176,6 +179,7 @@ def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_certificate_that_ends_while_a_client_follows_is_reported(
     robot: Robot, tmp_path: Path
 ) -> None:
@@ -241,6 +245,7 @@ async def _drive(robot: Robot) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_an_async_drive_of_a_viewer_raises_the_same(robot: Robot) -> None:
     import asyncio
 

@@ -24,6 +24,7 @@ BEFORE = (
 """The files that are copied to the server, and the user that zenohd's package makes."""
 
 
+@pytest.mark.nightly
 def test_a_router_runs_on_the_places_that_the_page_makes_as_a_user_of_its_own(
     container: Container,
 ) -> None:

@@ -201,6 +201,7 @@ def drawn(container: Container) -> dict[str, object]:
     return until(ended, 60.0, "a report, or why there is none")
 
 
+@pytest.mark.nightly
 def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare: Container) -> None:
     recording = recorded_before(bare)
     bare.write(CONFIGURATION, "")  # the simulator
