@@ -29,9 +29,11 @@ MODULES = {
 
 for present, old in MODULES.items():
     sys.modules[present] = importlib.import_module(old)
-# The present plans use one fault of the simulated board that has another name now.
+# The present plans use faults of the simulated board that have other names now.
 fake_mcu: Any = importlib.import_module("acsard.sim.fake_mcu").FakeMcu
 fake_mcu.free_running = fake_mcu.unprompted
+fake_mcu.wrong_baud = fake_mcu.other_baud
+fake_mcu.watchdog_fed_by_bad_lines = fake_mcu.fed_by_anything
 
 spec = importlib.util.spec_from_file_location(
     "present_product", Path(__file__).with_name("product.py")
