@@ -213,7 +213,8 @@ COMMANDS: dict[str, How] = {
     ),
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
-    ".venv/bin/pytest -m '(slow or network or systemd or firmware) and not (soak or nightly)'": PYTEST,
+    ".venv/bin/pytest "
+    "-m '(slow or network or systemd or firmware) and not (soak or nightly)'": PYTEST,
     ".venv/bin/pytest -m 'nightly and not soak'": PYTEST,
     ".venv/bin/pytest -m languages": PYTEST,
     ".venv/bin/pytest -m soak -s": PYTEST,
