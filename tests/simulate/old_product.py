@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import struct
 import sys
 from pathlib import Path
 from typing import Any
+
+from tests.simulate.roads import parameters
 
 MODULES = {
     "acsard.core.config.parsing": "acsard.config.parsing",
@@ -26,6 +29,9 @@ MODULES = {
     "acsard.daemon.pacing": "acsard.runtime.period",
 }
 """Maps the present name of a module to its old one."""
+
+RENAMED = b"commands.neutral_pause", b"commands.pause"
+"""The present and the old name of a setting."""
 
 for present, old in MODULES.items():
     sys.modules[present] = importlib.import_module(old)
@@ -56,6 +62,23 @@ def old_config(config: dict[str, Any]) -> dict[str, Any]:
     return config | {"commands": commands}
 
 
+def old_parameters(payload: bytes) -> bytes:
+    """Return a request of ROS to set parameters with the old names of the settings.
+
+    `tests.simulate.roads.parameters` made the request and shows its layout.
+    """
+    data, at, settings = payload[4:], 4, {}
+    for _ in range(struct.unpack_from("<I", data)[0]):
+        at += -at % 4
+        length = struct.unpack_from("<I", data, at)[0]
+        name = data[at + 4 : at + 4 + length - 1].replace(*RENAMED).decode()
+        at += 4 + length + 2
+        at += -at % 8
+        settings[name] = struct.unpack_from("<d", data, at + 8)[0]
+        at += 16 + 28
+    return parameters(settings)
+
+
 def problems(config: dict[str, Any]) -> list[str]:
     """Return the problems of this configuration, in words; none if it is legal."""
     found: list[str] = product.problems(old_config(config))
@@ -73,7 +96,9 @@ class Product(product.Product):  # type: ignore[misc]
     ) -> None:
         """Hand over a service call, with the old names of settings."""
         if service == "set":
-            payload = payload.replace(b"commands.neutral_pause", b"commands.pause")
+            payload = payload.replace(*RENAMED)
+        elif service.startswith("parameters/set"):
+            payload = old_parameters(payload)
         super().ask(at_ns, service, ticket, payload, via, attachment)
 
     def end(self, way: str) -> None:
