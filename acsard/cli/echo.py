@@ -2,7 +2,7 @@
 works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one file for
 `acsard calibrate --log`: acsard echo wheel_states imu --csv > drive.csv. --short prints pose and
 speeds as text: acsard echo odom -n 1 --short. If --id names several robots, each line names its
-robot.
+robot, and -n N prints N messages of each.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import msgspec
@@ -48,12 +48,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="print the rows of a log (one or more of wheel_states, imu and sim/pose)",
     )
-    parser.add_argument("-n", type=count, metavar="N", help="end after N messages")
+    parser.add_argument("-n", type=count, metavar="N", help="end after N messages of each robot")
     parser.add_argument(
         "--timeout",
         type=float,
         metavar="S",
-        help="end with exit code 1 if no message comes for S seconds",
+        help="end with exit code 1 if nothing is printed for S seconds",
     )
     add_bus(parser, MANY)
 
@@ -75,39 +75,71 @@ def main(args: argparse.Namespace) -> int:
     with connected_to_many(args) as (robot, many):
         samples = robot.samples(topic, args.timeout)
         unexplained = topic
+        quota = Quota(args.n, {""})
         if many:
             samples = follow(robot.session, many, topic).until_silence(args.timeout)
-            _say_who(robot, many)
+            quota = Quota(args.n, _expected(robot, many))
             unexplained = ""
         elif robot.where.tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
             unexplained = ""  # the reason for the silence has just been printed
         with silence_explained(robot, unexplained) as heard:
-            return _print(samples, short_form, args.n, bool(many), heard)
+            return _print(samples, short_form, quota, bool(many), args.timeout, heard)
+
+
+class Quota:
+    """The messages that may still be printed, counted for each robot."""
+
+    def __init__(self, most: int | None, robots: Collection[str]) -> None:
+        """Allow `most` messages of each robot, any number if it is None.
+
+        `robots` are the ids that `used_up` waits for. If there are none, it waits for those seen.
+        """
+        self._most, self._robots, self._counts = most, robots, dict[str, int]()
+
+    def take(self, robot: str) -> bool:
+        """Return whether a message of this robot may be printed, and count it."""
+        count = self._counts.get(robot, 0)
+        if count == self._most:
+            return False
+        self._counts[robot] = count + 1
+        return True
+
+    @property
+    def used_up(self) -> bool:
+        """True if each robot has had all of its messages."""
+        return all(self._counts.get(one) == self._most for one in self._robots or self._counts)
 
 
 def _print(
     samples: Iterator[zenoh.Sample],
     decoder: Decoder[Any] | None,
-    most: int | None,
+    quota: Quota,
     of_many: bool,
+    timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Print a line per message until Ctrl-C, `most` messages, or the end of `samples`.
+    """Print a line per message until Ctrl-C, the end of `quota`, or the end of `samples`.
 
     Args:
         samples: the messages; the iterator ends after a silence of the timeout.
         decoder: decodes messages for their short form; None prints JSON.
-        most: number of messages after which it returns, or None.
+        quota: the messages that are printed. Messages beyond it are skipped.
         of_many: whether each line names its robot.
+        timeout: time in s without a printed message after which it returns, or None.
         heard: called for each message.
     """
+    printed_s = time.monotonic()
     try:
-        for number, sample in enumerate(samples, 1):
+        for sample in samples:
             heard()
             whose = robot_of(str(sample.key_expr)) if of_many else ""
-            print(_shown(decoder, *encoded(sample), whose), flush=True)
-            if number == most:
+            if quota.take(whose):
+                print(_shown(decoder, *encoded(sample), whose), flush=True)
+                printed_s = time.monotonic()
+            elif timeout is not None and time.monotonic() - printed_s > timeout:
+                return 1
+            if quota.used_up:
                 return 0
     except KeyboardInterrupt:
         return 0
@@ -163,8 +195,12 @@ def _record(
     return int(Exit.OK)
 
 
-def _say_who(robot: Client, ids: tuple[str, ...]) -> None:
-    """Print which robots are present now, because a silent robot looks like a missing one."""
+def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
+    """Return the robots that are to be printed: those in `ids`, or for "*" those present now.
+
+    Print which robots are present now, because a silent robot looks like a missing one.
+    """
+    there: list[str] = []
     try:
         there = present(robot.session, ids, robot.where.endpoint)
         missing = [one for one in ids if one not in there and one != ALL]
@@ -173,6 +209,7 @@ def _say_who(robot: Client, ids: tuple[str, ...]) -> None:
     except NoAnswerError as error:
         words = f"{error} Waiting."
     print(f"acsard: {words}", file=sys.stderr)
+    return there if ALL in ids else ids
 
 
 def of_robot(whose: str, line: str) -> str:

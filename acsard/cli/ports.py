@@ -1,6 +1,6 @@
 """List the serial ports: device, stable names, driver, USB id, the process that has it open, and
-the common microcontroller board that it resembles. The tool opens no port. The exit code is 1 if
-there is no port.
+the common microcontroller board that it resembles. If no port resembles a board, the tool says so.
+It opens no port. The exit code is 1 if there is no port.
 """
 
 from __future__ import annotations
@@ -11,6 +11,11 @@ import sys
 import msgspec
 
 from acsard.machine.serial_ports import serial_devices
+
+PLUGGED_IN = (
+    "is the board plugged in, by a cable with data lines? `dmesg | tail` shows the kernel's "
+    "messages"
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -23,11 +28,7 @@ def main(args: argparse.Namespace) -> int:
         print(msgspec.json.encode(found).decode())
         return 0 if found else 1
     if not found:
-        print(
-            "no serial ports: is the board plugged in, by a cable with data lines? `dmesg | "
-            "tail` shows the kernel's messages",
-            file=sys.stderr,
-        )
+        print(f"no serial ports: {PLUGGED_IN}", file=sys.stderr)
         return 1
     for port in found:
         kind = " ".join(filter(None, [port.usb_id, port.driver, port.description]))
@@ -38,7 +39,16 @@ def main(args: argparse.Namespace) -> int:
             print(f"    also        {name}")
         for holder in port.holders:
             print(f"    held by     {holder.name} (pid {holder.pid})")
+    if not any(port.usb_id for port in found):
+        print(f"none of these ports is on USB, so no board is here: {PLUGGED_IN}", file=sys.stderr)
+        return 0
     likely = [port for port in found if port.board]
+    if not likely:
+        print(
+            "no port has the USB id of a common board: unplug the board and run this again; the "
+            "port that is then missing is the board's",
+            file=sys.stderr,
+        )
     if len(likely) == 1:
         port = likely[0]
         name = port.names[0] if port.names else port.device

@@ -40,6 +40,7 @@ SERVICE = Path("/var/lib/acsard/record")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     _directory(parser, None)
+    _own_config(parser, None)
     actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
     shown = actions.add_parser(
         "show",
@@ -101,6 +102,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
     for action in (shown, replay, recover, export, report):
         _directory(action, argparse.SUPPRESS)
+    # For `replay` and `export`, --config is the configuration that they try.
+    for action in (shown, recover, report):
+        _own_config(action, argparse.SUPPRESS)
 
 
 def _directory(parser: argparse.ArgumentParser, default: object) -> None:
@@ -109,6 +113,17 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
         default=default,
         metavar="DIRECTORY",
         help=f"directory of the recordings (default: record.directory, or {SERVICE})",
+    )
+
+
+def _own_config(parser: argparse.ArgumentParser, default: object) -> None:
+    parser.add_argument(
+        "--config",
+        dest="own_config",
+        default=default,
+        metavar="FILE",
+        help="configuration file that names the directory as record.directory (default: "
+        "$ACSARD_CONFIG, ./acsard.toml, /etc/acsard/acsard.toml, or the built-in defaults)",
     )
 
 
@@ -225,7 +240,7 @@ def main_report(args: argparse.Namespace) -> int:
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
-    where = Path(args.directory or load(None)[1].record.directory or SERVICE)
+    where = Path(args.directory or load(args.own_config)[1].record.directory or SERVICE)
     try:
         return where, listed(where)
     except FileNotFoundError:

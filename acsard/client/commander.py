@@ -192,7 +192,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     if state.mode == "waiting":
         return state.reason
     if not heard(state, source):
-        return f"the daemon receives no command of source {source}"
+        return no_command(source)
     if state.source != source:
         return ours.waits_for or state.reason
     # The robot is `ready`: the zeros of this client arrive, but they do not count.
@@ -204,6 +204,11 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         f"another program drives the robot as {source}, {state.sender}: end it, or wait until it "
         "is silent"
     )
+
+
+def no_command(source: str) -> str:
+    """Return the objection to a client whose commands do not arrive at the daemon."""
+    return f"the daemon receives no command of source {source}"
 
 
 def heard(state: RobotState, source: str) -> bool:

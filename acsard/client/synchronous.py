@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.client.commander import SPACING_S, Sender
+from acsard.client.commander import SPACING_S, Sender, no_command
 from acsard.client.driving import UnheardError, drive
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
@@ -371,7 +371,10 @@ class Client:
         )
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """Convert the error to its documented type, and add the role of the certificate in it."""
+        """Convert the error to its documented type.
+
+        If no command arrives, the text also names the role of this client's certificate.
+        """
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))
         if not self.where.tls:
@@ -383,7 +386,9 @@ class Client:
             return error
         if us.role and not has(us.role, COMMAND_ROLE):
             return NotPermittedError(us.words())
-        return NotDrivenError(f"{error}; {us.words()}")
+        # The role may explain why no command arrives. It has no part in a fault or a stop.
+        unexplained = str(error) == no_command(self.source)
+        return NotDrivenError(f"{error}; {us.words()}" if unexplained else str(error))
 
 
 def _no_key(name: str) -> UsageError:

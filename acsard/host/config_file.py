@@ -39,7 +39,8 @@ def find(path: str | None) -> tuple[str, bytes]:
 def writable(path: str | None) -> Path:
     """Return the file that --write changes.
 
-    Raises `MendableError` if it or the library tomlkit is missing.
+    Raises `MendableError` if it or the library tomlkit is missing, or if it is the reference file
+    of a clone of acsard.
     """
     require_tomlkit()
     where, text = find(path)
@@ -49,7 +50,21 @@ def writable(path: str | None) -> Path:
             "file with --config or make an acsard.toml there (it may be empty); a file on "
             "another machine changes nothing on the robot",
         )
+    if _is_reference(Path(where)):
+        raise MendableError(
+            f"--write does not change {where}, because git tracks this file of the clone, and a "
+            f"changed file hinders the next `git pull`: type `cp {where} robot.toml` and add "
+            "--config robot.toml",
+        )
     return Path(where)
+
+
+def _is_reference(file: Path) -> bool:
+    """Return whether this is the `acsard.toml` in the top directory of a clone of acsard."""
+    place = file.resolve()
+    top = place.parent
+    in_clone = (top / ".git").exists() and (top / "acsard" / "__init__.py").is_file()
+    return in_clone and place.name == "acsard.toml"
 
 
 Keys = Mapping[str, object]

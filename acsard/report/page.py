@@ -89,6 +89,8 @@ PROGRAM = """
 const boxes = [], timed = [];
 const look = { responsive: true, displaylogo: false, plotlyServerURL: "",
   modeBarButtons: [["zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]] };
+const MAX_LABEL_PX = 90;  // with the gap to the next one
+const labels = box => ({ "xaxis.nticks": Math.max(2, Math.floor(box.clientWidth / MAX_LABEL_PX)) });
 for (const one of JSON.parse(document.getElementById("pictures").textContent)) {
   const box = document.getElementById(one.name);
   // A finger that scrolls the page must not draw a frame in the picture.
@@ -97,6 +99,9 @@ for (const one of JSON.parse(document.getElementById("pictures").textContent)) {
   boxes.push(box);
   if (one.timed) timed.push(box);
 }
+const fit = () => { for (const box of timed) Plotly.relayout(box, labels(box)); };
+fit();
+addEventListener("resize", fit);
 let following = false;
 for (const box of timed) box.on("plotly_relayout", async change => {
   const all = "xaxis.autorange" in change, [from, to] = box.layout.xaxis.range;
@@ -111,6 +116,7 @@ const paper = on => {
   if (on) for (const one of document.querySelectorAll("details")) one.open = true;
   for (const box of boxes)  // at once: the browser does not wait
     Plotly.relayout(box, on ? { width: box.clientWidth } : { width: null, autosize: true });
+  fit();
 };
 addEventListener("beforeprint", () => paper(true));
 addEventListener("afterprint", () => paper(false));

@@ -5,6 +5,7 @@ Times in the pictures are local times in ms since 1970, because plotly knows no 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -45,13 +46,66 @@ class Line(NamedTuple):
     """Plotly's interpolation between two points."""
     width: float = 1.6
     """Line width, px."""
+    values: Sequence[float] = ()
+    """Values that the page shows when the user points at the curve; () for those of the points."""
 
 
 GAP_PX = 30
 """Height of the gap above each part of a picture, for the title of the part."""
 
+LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
+"""Smallest span of the speeds' scales, m/s and rad/s, for a robot that stands all the time."""
+
 BENEATH = 3.4
 """Width of a curve that another curve nearly covers, px. Its colour shows on both sides."""
+
+
+class Clip(NamedTuple):
+    """A time during which a curve is outside of its diagram, and is drawn at the edge."""
+
+    t: float
+    """Time at which it leaves the diagram, s."""
+    edge: float
+    """Value at the edge at which it is drawn."""
+    value: float
+    """Its value furthest from the edge."""
+
+
+MARKS_APART = 0.02
+"""Smallest distance of two marks of a curve that leaves its diagram, as a share of the width."""
+
+HEADROOM = 0.5
+"""Room for commanded speeds beyond the limited and measured ones, as a share of their span. A
+command that the robot follows after a ramp stays visible; one of 99 m/s does not flatten the rest.
+"""
+
+
+def clipped(
+    points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
+) -> tuple[list[Point], list[Clip]]:
+    """Keep a curve within the scale of other curves.
+
+    Args:
+        points: the curve; NaN interrupts it.
+        others: the curves that determine the scale, with `HEADROOM`.
+        least: smallest span of the scale, for a robot that stands.
+        gap: a curve that leaves the diagram again within this time, s, is marked once.
+    """
+    values = [0.0, *(p.value for curve in others for p in curve if math.isfinite(p.value))]
+    room = HEADROOM * max(max(values) - min(values), least)
+    low, high = min(values) - room, max(values) + room
+    drawn, clips, outside = list[Point](), list[Clip](), -math.inf
+    for t, value in points:
+        edge = min(max(value, low), high) if math.isfinite(value) else value
+        drawn.append(Point(t, edge))
+        if edge == value or math.isnan(value):
+            continue
+        if clips and edge == clips[-1].edge and t <= outside + gap:
+            clips[-1] = clips[-1]._replace(value=max(clips[-1].value, value, key=abs))
+        else:
+            clips.append(Clip(t, edge, value))
+        outside = t
+    return drawn, clips
 
 
 class Part(NamedTuple):
@@ -59,6 +113,8 @@ class Part(NamedTuple):
 
     title: str
     lines: list[Line]
+    beyond: Sequence[Clip] = ()
+    """Places at which the first curve leaves the diagram."""
 
 
 Row = tuple[str, list[Span]]
@@ -126,26 +182,38 @@ class TimeFigures:
 
     def speeds(self) -> Figure:
         """Draw the commanded, limited and measured speeds."""
-        data = self._data
-        parts = [
-            Part(
-                title,
-                [
-                    Line("commanded", COMMANDED, curves["commanded"].points(), "hv"),
-                    Line("limited", LIMITED, curves["limited"].points(), "hv", BENEATH),
-                    Line("measured", MEASURED, curves["measured"].points()),
-                ],
+        data, parts = self._data, list[Part]()
+        gap = MARKS_APART * data.seconds
+        for title, curves, least in (
+            ("forward, m/s", data.linear, LEAST_LINEAR),
+            ("turning, rad/s", data.angular, LEAST_ANGULAR),
+        ):
+            wished, limited, measured = (
+                curves[name].points() for name in ("commanded", "limited", "measured")
             )
-            for title, curves in (
-                ("forward, m/s", data.linear),
-                ("turning, rad/s", data.angular),
-            )
-        ]
+            drawn, clips = clipped(wished, [limited, measured], least, gap)
+            values = [point.value for point in wished] if clips else ()
+            lines = [
+                Line("commanded", COMMANDED, drawn, "hv", values=values),
+                Line("limited", LIMITED, limited, "hv", BENEATH),
+                Line("measured", MEASURED, measured),
+            ]
+            parts.append(Part(title, lines, clips))
         caption = (
             "Commanded is the speed of the source that drives. Limited is the speed sent to the "
             "wheels. Measured is the speed that the wheels reported. Left turns and forward "
             "driving are above zero."
         )
+        furthest = [
+            f"{max((clip.value for clip in part.beyond), key=abs):.4g} {part.title.split()[-1]}"
+            for part in parts
+            if part.beyond
+        ]
+        if furthest:
+            caption += (
+                " A triangle marks a commanded speed outside of the picture; the furthest is "
+                f"{' and '.join(furthest)}."
+            )
         return self._stack("speeds", "Speed", caption, parts, 210)
 
     def wheels(self) -> Figure:
@@ -288,6 +356,8 @@ class TimeFigures:
         axis = {
             "type": "date",
             "range": [self._ms(-0.01 * seconds), self._ms(1.01 * seconds)],
+            # Plotly would turn the labels of a narrow picture, and cut them at its lower edge.
+            "tickangle": 0,
             # Invisible ticks keep the time labels away from the lowest label of the y axis.
             "ticks": "outside", "ticklen": 8, "tickcolor": "rgba(0,0,0,0)",
         }  # fmt: skip
@@ -308,9 +378,14 @@ class TimeFigures:
             axes[f"yaxis{n}"] = {"rangemode": "tozero"}
             notes.append(note(part.title, 0, 1) | {"yref": f"y{n} domain", "yanchor": "bottom"})
             traces += [self._line(line, f"y{n}") for line in part.lines]
+            if part.beyond:
+                traces.append(self._clips(part.lines[0], part.beyond, f"y{n}"))
         axes["annotations"] = notes
         lines = dict.fromkeys((line.name, line.colour) for part in parts for line in part.lines)
         keys = [Key("━", colour, meaning) for meaning, colour in lines]
+        first = parts[0].lines[0]
+        if any(part.beyond for part in parts):
+            keys.append(Key("▲", first.colour, f"{first.name} outside of the picture"))
         return Figure(name, title, caption, keys, px * len(parts) + 70, traces, axes)
 
     def _line(self, line: Line, axis: str) -> Trace:
@@ -321,5 +396,25 @@ class TimeFigures:
             mode="lines",
             yaxis=axis,
             line={"color": line.colour, "width": line.width, "shape": line.shape},
-            hovertemplate=f"{line.name} %{{y:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>",
+            **_hover(line.name, line.values),
         )
+
+    def _clips(self, line: Line, clips: Sequence[Clip], axis: str) -> Trace:
+        """Draw a triangle at each place at which the curve leaves the diagram."""
+        symbols = ["triangle-up" if clip.value > clip.edge else "triangle-down" for clip in clips]
+        return scatter(
+            f"{line.name} outside",
+            [self._ms(clip.t) for clip in clips],
+            [clip.edge for clip in clips],
+            mode="markers",
+            yaxis=axis,
+            marker={"symbol": symbols, "size": 11, "color": line.colour},
+            **_hover(line.name, [clip.value for clip in clips]),
+        )
+
+
+def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
+    """Return plotly's text for the point under the pointer, with `values` if there are any."""
+    shown = "customdata" if values else "y"
+    text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
+    return {"hovertemplate": text} | ({"customdata": numbers(values)} if values else {})

@@ -84,6 +84,34 @@ def test_the_table_of_the_page_has_the_tools_that_are_played_here() -> None:
     assert set(rows) - {"tool"} == TOOLS
 
 
+# Two publishers on one topic
+
+
+@pytest.mark.parametrize(
+    ("road", "other", "least", "most"),
+    [("rmw", 0.1, 0.38, 0.42), ("rmw", 0.0, 0.38, 0.42),
+     ("bridge", 0.1, 0.09, 0.15), ("bridge", 0.0, 0.0, 0.03)],
+)  # fmt: skip
+def test_of_two_publishers_on_a_topic_the_first_drives_by_rmw_and_both_by_the_bridge(
+    world: World, road: Road, other: float, least: float, most: float
+) -> None:
+    first, second = Speaker(world, road, "first"), Speaker(world, road, "second")
+    for _ in range(25):
+        first.send(0.0)
+        second.send(0.0)
+        world.run(0.05)
+    world.run(1.2)
+    speeds = []
+    for _ in range(60):
+        for speaker, speed in ((first, FAST), (second, other)):
+            speaker.send(speed)
+            world.run(0.025)
+            speeds.append(world.state.linear or 0.0)
+    assert least <= min(speeds[60:]) <= max(speeds[60:]) <= most
+    second.hold(0.2, 1.0)
+    assert world.state.linear == pytest.approx(0.2, abs=0.02)
+
+
 # teleop_twist_keyboard
 
 

@@ -350,6 +350,14 @@ def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
         assert f"{robot_id!r} is not a robot's id" in ended.err
 
 
+def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) -> None:
+    ended = tool(shared, "echo", "odom", "-n", "2", "--id", "*")
+    assert (ended.code, len(ended.out.splitlines())) == (0, 2)
+    ended = tool(shared, "echo", "odom", "-n", "1", "--timeout", "0.5", "--id", "acsar,other")
+    assert (ended.code, len(ended.out.splitlines())) == (1, 1)
+    assert "following acsar; not there: other" in ended.err
+
+
 @each("verb", ["top", "hz", "whoami", "set", "drive", "accuracy", "calibrate"])
 @each("ids", ["*", "robot1,robot2"])
 def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str, ids: str) -> None:

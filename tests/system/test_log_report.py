@@ -14,9 +14,9 @@ from plotly.offline import get_plotlyjs
 from acsard.report.page import page
 from tests import pictures
 from tests.pictures import LOOKS
-from tests.system.chromium import DESKTOP, PHONE, browsing
+from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, browsing
 from tests.system.harness import until
-from tests.unit.report.driven import drive_of_two, report_from
+from tests.unit.report.driven import drive_of_two, report_from, report_of
 from tests.unit.report.test_page import EVIL, clock, evil_steps, origin
 
 BROWSER = shutil.which("chromium")
@@ -66,7 +66,35 @@ WIDER = """[...document.querySelectorAll('body *')]
     .filter(([, box]) => box.left < -0.5 || box.right > innerWidth + 0.5)
     .map(([name, box]) => [name, box.left, box.right])"""
 
+CUT = """[...document.querySelectorAll('.picture text')]
+    .filter(one => one.textContent.trim())
+    .map(one => [one.textContent, one.getBoundingClientRect(),
+        one.closest('.picture').getBoundingClientRect()])
+    .filter(([, text, box]) => text.width > 0 && (text.left < box.left - 0.5
+        || text.right > box.right + 0.5 || text.bottom > box.bottom + 0.5))
+    .map(([name]) => name)"""
+
 DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
+
+
+def test_no_label_of_a_picture_is_cut_on_a_phone_also_after_it_is_turned(tmp_path: Path) -> None:
+    path = tmp_path / "new.html"
+    # The labels of two seconds have tenths, and are the widest.
+    report, _ = report_of(lambda world: world.run(2.0))
+    path.write_text(page(report, origin(), get_plotlyjs(), clock), encoding="utf-8")
+    with browsing() as browser:
+        browser.size(*PHONE)
+        browser.open(path.as_uri())
+        until(lambda: browser.js(DRAWN) >= 7, 30.0, "all pictures")
+        for size in (PHONE, SIDEWAYS, PHONE):
+            browser.size(*size)
+            drawn = f"document.querySelector('#loop .main-svg').clientWidth > {0.8 * size[0]}"
+            fits = f"{drawn} && document.documentElement.scrollWidth <= {size[0]}"
+            until(lambda fits=fits: browser.js(fits), 10.0, f"pictures for {size}")  # type: ignore[misc]
+            browser.js("new Promise(done => setTimeout(() => requestAnimationFrame(done), 500))")
+            assert browser.js("innerWidth") == size[0]
+            assert browser.js("document.querySelectorAll('.xtick text').length") >= 2 * 6
+            assert browser.js(CUT) == [], size
 
 
 def test_nothing_is_wider_than_the_window_of_a_phone_or_a_desk(tmp_path: Path) -> None:

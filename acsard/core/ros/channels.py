@@ -35,7 +35,7 @@ builtin_interfaces/msg/Time: int32 sec, uint32 nanosec
 std_msgs/msg/Header: builtin_interfaces/msg/Time stamp, string frame_id
 geometry_msgs/msg/Vector3: float64 x, float64 y, float64 z
 geometry_msgs/msg/Point: float64 x, float64 y, float64 z
-geometry_msgs/msg/Quaternion: float64 x, float64 y, float64 z, float64 w
+geometry_msgs/msg/Quaternion: float64 x 0, float64 y 0, float64 z 0, float64 w 1
 geometry_msgs/msg/Twist: geometry_msgs/msg/Vector3 linear, geometry_msgs/msg/Vector3 angular
 geometry_msgs/msg/TwistStamped: std_msgs/msg/Header header, geometry_msgs/msg/Twist twist
 geometry_msgs/msg/TwistWithCovariance: geometry_msgs/msg/Twist twist, float64[36] covariance
@@ -54,11 +54,13 @@ sensor_msgs/msg/JointState: \
     float64[] position, float64[] velocity, float64[] effort
 diagnostic_msgs/msg/KeyValue: string key, string value
 diagnostic_msgs/msg/DiagnosticStatus: \
+    byte OK=0, byte WARN=1, byte ERROR=2, byte STALE=3, \
     byte level, string name, string message, string hardware_id, \
     diagnostic_msgs/msg/KeyValue[] values
 diagnostic_msgs/msg/DiagnosticArray: \
     std_msgs/msg/Header header, diagnostic_msgs/msg/DiagnosticStatus[] status
 rcl_interfaces/msg/Log: \
+    uint8 DEBUG=10, uint8 INFO=20, uint8 WARN=30, uint8 ERROR=40, uint8 FATAL=50, \
     builtin_interfaces/msg/Time stamp, uint8 level, string name, string msg, \
     string file, string function, uint32 line
 acsard/msg/Counter: string name, int64 count
@@ -73,21 +75,27 @@ acsard/msg/RobotState: \
 """
 """Message definitions, one type in each line.
 
-A line has the name of the type, a colon, and the fields as `type name`, separated by commas. `[]`
-marks a sequence and `[n]` an array.
+A line has the name of the type, a colon, and the constants as `type NAME=value` and the fields as
+`type name` or `type name default`, separated by commas. `[]` marks a sequence and `[n]` an array.
 """
 
 
-def _parsed(text: str) -> dict[str, tuple[Field, ...]]:
+def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
     found = {}
     for line in text.strip().splitlines():
-        name, _, fields = line.partition(":")
-        pairs = [field.split() for field in fields.split(",")]
-        found[name] = tuple((kind, field) for kind, field in pairs)
+        name, _, declared = line.partition(":")
+        pairs = [one.split(maxsplit=1) for one in declared.split(",")]
+        found[name] = tuple((kind, rest) for kind, rest in pairs)
     return found
 
 
-DEFINITIONS = _parsed(_TEXT)
+_DECLARED = _parsed(_TEXT)
+"""The constants and fields of each type, in order, each as its type and the rest of its line."""
+
+DEFINITIONS: dict[str, tuple[Field, ...]] = {
+    name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
+    for name, declared in _DECLARED.items()
+}
 """The fields of each type, in order."""
 
 RULE = "=" * 80
@@ -114,7 +122,7 @@ def _nested(name: str) -> Iterator[str]:
 
 
 def _fields(name: str) -> str:
-    return "".join(f"{_short(kind)} {field}\n" for kind, field in DEFINITIONS[name])
+    return "".join(f"{_short(kind)} {rest}\n" for kind, rest in _DECLARED[name])
 
 
 def _short(kind: str) -> str:

@@ -263,3 +263,21 @@ def test_who_has_no_file_to_write_to_is_sent_to_the_robot(places: Places) -> Non
         writable(None)
     assert "on the robot" in str(raised.value)
     assert "acsard.toml there" in str(raised.value)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_write_leaves_the_reference_file_of_a_clone_as_git_has_it(
+    places: Places, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clone = places.here.parent
+    places.here.write_text("")
+    (clone / ".git").mkdir()
+    assert writable(None) == Path("acsard.toml")  # a repository of the operator's own
+    (clone / "acsard").mkdir()
+    (clone / "acsard" / "__init__.py").touch()
+    with pytest.raises(
+        MendableError, match=r"cp .*acsard\.toml robot\.toml.* --config robot\.toml"
+    ):
+        writable(str(places.here) if named else None)
+    (clone / "robot.toml").write_text("")
+    assert writable("robot.toml") == Path("robot.toml")

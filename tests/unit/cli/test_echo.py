@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import pytest
 
 from acsard.cli import main
-from acsard.cli.echo import _shown, json_line
+from acsard.cli.echo import Quota, _print, _shown, json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Twist, TwistStamped, Vector3
 from acsard.host.errors import Exit
@@ -87,6 +89,46 @@ def test_what_cannot_be_decoded_is_shown_as_the_bytes_it_is(encoding: str, paylo
 )
 def test_echo_survives_any_payload(payload: bytes) -> None:
     assert json_line("", payload).isprintable()
+
+
+def printed(robots: str, senders: str, most: int | None, timeout: float | None = None) -> int:
+    """Print one message of each sender, in this order, and return the exit code."""
+    samples: Any = [
+        SimpleNamespace(
+            key_expr=f"acsard/{sender}/state",
+            encoding="application/json",
+            payload=SimpleNamespace(to_bytes=lambda: b"{}"),
+        )
+        for sender in senders
+    ]
+    return _print(iter(samples), None, Quota(most, robots), True, timeout, lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("robots", "senders", "most", "code", "shown"),
+    [
+        ("abc", "aaabac", 1, 0, "abc"),
+        ("abc", "aabbaccab", 2, 0, "aabbcc"),
+        ("ab", "aacb", 1, 0, "acb"),
+        ("", "ba", 1, 0, "b"),
+        ("abc", "aaab", 1, 1, "ab"),
+        ("ab", "aaab", None, 1, "aaab"),
+    ],
+)
+def test_a_number_of_messages_counts_for_each_robot(
+    robots: str, senders: str, most: int | None, code: int, shown: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    assert printed(robots, senders, most) == code
+    lines = capsys.readouterr().out.splitlines()
+    assert "".join(msgspec.json.decode(line)["robot"] for line in lines) == shown
+
+
+def test_a_robot_that_talks_on_does_not_hide_the_silence_of_another(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert printed("ab", "aaab", 1, timeout=-1.0) == 1
+    assert len(capsys.readouterr().out.splitlines()) == 1
 
 
 def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(

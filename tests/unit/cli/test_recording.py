@@ -69,6 +69,24 @@ def test_the_list_has_a_line_for_each_recording_with_its_events(
     )
 
 
+def test_the_configuration_names_the_directory_of_the_recordings(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(f'[record]\ndirectory = "{where}"\n')
+    other = tmp_path / "other.toml"
+    other.write_text("")
+    assert main(["recording", "--config", str(file)]) == 0
+    assert "000001-20270115T080000Z.mcap" in capsys.readouterr().out
+    for words in (
+        ["--config", str(file), "show", "1"],
+        ["show", "1", "--config", str(file)],
+        ["--config", str(file), "replay", "1", "--config", str(other)],
+    ):
+        assert main(["recording", *words]) == 0
+        assert capsys.readouterr().out
+
+
 def test_the_list_tells_a_start_from_a_file_that_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,6 +15,7 @@ from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Command
+from acsard.daemon.bus.identity import Identity
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 
@@ -109,6 +110,37 @@ def test_a_key_that_there_is_not_is_the_one_reason_that_is_reported(
     assert f"acsard/acsar/{name}" in told
     assert "did you mean" in told
     assert "daemon" not in told
+
+
+@pytest.mark.parametrize(
+    ("objection", "names_role"),
+    [
+        ("fault: rear_left wheel is stuck", False),
+        ("stopped by request", False),
+        ("app is not one of commands.sources: nav", False),
+        ("the daemon receives no command of source app", True),
+    ],
+)
+def test_over_tls_the_role_is_named_only_if_no_command_arrives(
+    session: Session, monkeypatch: pytest.MonkeyPatch, objection: str, names_role: bool
+) -> None:
+    ours = client_of(session)
+    ours.where = ours.where._replace(tls="certificates")
+    monkeypatch.setattr(ours, "whoami", lambda: Identity("operator", "anna", "anna/1"))
+    found = ours.unheard(UnheardError(objection))
+    assert type(found) is client.NotDrivenError
+    assert str(found).startswith(objection)
+    assert ("your certificate anna is operator" in str(found)) == names_role
+
+
+def test_over_tls_a_viewer_is_refused_whatever_the_robot_objects(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = client_of(session)
+    ours.where = ours.where._replace(tls="certificates")
+    monkeypatch.setattr(ours, "whoami", lambda: Identity("viewer", "anna", "anna/1"))
+    found = ours.unheard(UnheardError("fault: rear_left wheel is stuck"))
+    assert isinstance(found, client.NotPermittedError)
 
 
 def test_a_drive_of_which_nothing_arrives_ends_with_an_error_that_the_docs_name(

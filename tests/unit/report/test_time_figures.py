@@ -11,8 +11,9 @@ import plotly.graph_objects as library
 import pytest
 
 from acsard.core.config.parsing import parse
+from acsard.core.thinning import Point
 from acsard.report.plot_elements import Figure
-from acsard.report.time_figures import TimeFigures
+from acsard.report.time_figures import Clip, TimeFigures, clipped
 from tests.scenarios.taped import Tape, happenings
 from tests.scenarios.world import START, World
 from tests.unit.report.driven import drive_of_two, report_from, report_of, two_drivers
@@ -68,6 +69,47 @@ def test_speeds_are_drawn_at_local_times(figures: dict[str, Figure]) -> None:
     zero_ms = 1000 * (START.wall_ns / 1e9 + OFFSET_S)
     times = [(ms - zero_ms) / 1000 for ms in column(drawn["x"])]
     assert times == pytest.approx([point.t for point in points], abs=0.02)
+
+
+def faster_than_any_robot(world: World) -> None:
+    """Drive at 0.3 m/s, with one command of 99 m/s and -50 rad/s in between."""
+    world.drive(0.3, seconds=1.0, source="nav")
+    world.send(99.0, -50.0, "nav")
+    world.run(0.05)
+    world.drive(0.3, seconds=1.0, source="nav")
+
+
+def test_one_command_of_99_m_s_does_not_flatten_the_speeds() -> None:
+    report, _ = report_of(faster_than_any_robot)
+    figure = TimeFigures(report, OFFSET_S).speeds()
+    library.Figure(data=figure.data, layout=figure.layout)
+    for axis, wish in (("y", 99.0), ("y2", -50.0)):
+        measured = max(abs(one) for one in column(trace(figure, "measured", axis)["y"]))
+        commanded = trace(figure, "commanded", axis)
+        assert max(abs(one) for one in column(commanded["y"])) < max(2.0 * measured, 0.5)
+        assert wish in column(commanded["customdata"])
+        mark = trace(figure, "commanded outside", axis)
+        assert column(mark["customdata"]) == [wish]
+        assert mark["marker"]["symbol"] == ["triangle-up" if wish > 0 else "triangle-down"]
+    assert "the furthest is 99 m/s and -50 rad/s." in figure.caption
+    assert ("▲", "commanded outside of the picture") in [(k.sign, k.meaning) for k in figure.keys]
+
+
+def test_commands_near_the_driven_speeds_are_drawn_as_they_are(figures: dict[str, Figure]) -> None:
+    report, _ = drive_of_two()
+    drawn = column(trace(figures["speeds"], "commanded")["y"])
+    assert known(drawn) == known(point.value for point in report.linear["commanded"].points())
+    assert "triangle" not in figures["speeds"].caption
+    assert [one["name"] for one in figures["speeds"].data].count("commanded outside") == 0
+
+
+def test_a_curve_is_marked_each_time_it_leaves_the_scale_of_the_others() -> None:
+    values = [0.0, 9.0, 12.0, 0.5, -7.0, math.nan, -6.0, 1.4]
+    points = [Point(float(t), value) for t, value in enumerate(values)]
+    drawn, clips = clipped(points, [[Point(0.0, 1.0), Point(1.0, math.nan)]], 0.1, 1.0)
+    expected = [0.0, 1.5, 1.5, 0.5, -0.5, None, -0.5, 1.4]
+    assert known(point.value for point in drawn) == expected
+    assert clips == [Clip(1.0, 1.5, 12.0), Clip(4.0, -0.5, -7.0), Clip(6.0, -0.5, -6.0)]
 
 
 def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None:

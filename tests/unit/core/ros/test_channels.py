@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from mcap_ros2._vendor.rosidl_adapter.parser import parse_message_string
 from msgspec import Struct, inspect
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -62,7 +63,7 @@ def same(ours: Any, theirs: Any) -> bool:
     """Return whether the fields of both are equal, by their order."""
     if isinstance(ours, Struct):
         fields = [getattr(ours, name) for name in ours.__struct_fields__]
-        others = [v for k, v in vars(theirs).items() if k != "__msgtype__"]
+        others = [v for k, v in vars(theirs).items() if k != "__msgtype__" and not k.isupper()]
         return len(fields) == len(others) and all(map(same, fields, others))
     if isinstance(ours, list):
         return len(ours) == len(theirs) and all(map(same, ours, theirs))
@@ -117,6 +118,21 @@ def test_another_program_makes_the_same_hash_of_the_text(name: str) -> None:
     store.register(get_types_from_msg(schema_text(name), name))
     known = TYPE_HASHES.get(name, rihs01(name))
     assert store.hash_rihs01(name) == known == get_typestore(Stores.ROS2_JAZZY).hash_rihs01(name)
+
+
+@each("name", THEIRS)
+def test_a_text_has_the_constants_of_ros(name: str) -> None:
+    jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
+    constants, _ = get_types_from_msg(schema_text(name), name)[name]
+    assert constants == jazzy[name][0]
+
+
+def test_a_quaternion_that_is_not_filled_in_is_no_rotation() -> None:
+    first, *_ = schema_text("geometry_msgs/msg/Quaternion").split(RULE)
+    read = parse_message_string("geometry_msgs", "Quaternion", first)
+    assert {field.name: field.default_value for field in read.fields} == {
+        "x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0
+    }  # fmt: skip
 
 
 def test_a_text_has_each_type_once_after_the_type_itself() -> None:
