@@ -138,6 +138,8 @@ def states(seen: Callable[[Browser, str], None]) -> None:
                 look("no-data", "NO DATA", "Nothing is received")
             finally:
                 daemon.signal(signal.SIGCONT)
+            # Zenoh closes this session after 2 s of silence. It may connect later than the page.
+            until(lambda: bus.ask("state"), 10.0, "the bus answers again")
             board.plug()
             board.reply = usual
             until(lambda: browser.text("mode") == "FAULT", 10.0, "the board is back")
