@@ -157,7 +157,7 @@ class Admission:
             raise RefusedError("too_fast", "too many wrong tokens: wait a minute")
         raise RefusedError(
             "bad_token",
-            "this token is not valid: it has expired, was revoked, or is for another robot",
+            "this token is not valid (expired, revoked, or for another robot): ask for a new one",
         )
 
     @web.middleware

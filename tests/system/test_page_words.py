@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from acsard.machine.authority import Authority
-from tests.system.browser import NAME, Page
+from tests.system.browser import NAME, TRUSTING, Page
+from tests.system.camera_stream import Stream
 from tests.system.chromium import CHROMIUM, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import PLAIN, Bus, Daemon, Peer, until
-from tests.system.test_page_camera import Stream
 
 pytestmark = [
     pytest.mark.slow,
@@ -25,8 +25,7 @@ HIDDEN = "document.getElementById('clear').hidden"
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    there = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
-    with browsing(options=there) as browser:
+    with browsing(options=TRUSTING) as browser:
         browser.size(*PHONE)
         yield browser
         browser.open("about:blank")

@@ -212,7 +212,7 @@ function stated({ detail }) {
   readied();
   map.lose(!boarded(state));
   const who = state.sender ? person(state.sender, hello?.sender) : state.source;
-  views.text("who", !state.source ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
+  views.text("who", !state.source || state.mode !== "driving" ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
   const { linear, angular } = state; // null without feedback from the board
   dialled();
