@@ -146,14 +146,20 @@ def test_a_program_that_drives_is_named_and_a_push_takes_over(
     shows(browser, "hint", "Hold and push to drive")
 
 
-def test_switch_on_is_beside_stop_while_the_robot_is_off(
+def test_switch_on_is_beside_stop_and_only_offered_while_the_robot_is_off(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
+    def off(name: str) -> bool:
+        return bool(browser.js(f"document.getElementById({name!r}).disabled"))
+
+    assert (off("activate"), off("deactivate")) == (True, False)  # the robot is on
     robot[1].get("srv/deactivate")
     shows(browser, "clear", "Switch on")
+    assert (off("activate"), off("deactivate")) == (False, True)
     shows(browser, "reason", "press Switch on")
     browser.tap("clear")
     shows(browser, "mode", "READY")
+    until(lambda: off("activate"), 5.0, "the robot is on")
 
 
 def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
