@@ -149,6 +149,20 @@ class Scene:
                 told,
             )  # fmt: skip
 
+    def clear(self) -> None:
+        """Release the stop from the robot itself."""
+        with inside(self._hosts.robot):
+            connection = http.client.HTTPConnection(
+                self.page.here.removeprefix("http://"), timeout=9
+            )
+            told = {"Content-Type": "application/json"}
+            connection.request("GET", "/api/state")
+            latch = json.loads(connection.getresponse().read())["latch"]
+            body = json.dumps({"latch": latch})
+            connection.request("POST", "/api/srv/clear", body, told)
+            connection.getresponse().read()
+            connection.close()
+
     async def drive_on(self, crowd: Program) -> list[str]:
         """Drive from the phone while the crowd comes; return the modes meanwhile."""
         with inside(self._hosts.stranger):
@@ -218,7 +232,10 @@ def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
     finally:
         if hasattr(crowd, "process"):
             crowd.__exit__()
-        server.__exit__()
+        try:
+            scene.clear()
+        finally:
+            server.__exit__()
 
 
 def nine_of_ten(took: list[float]) -> float:
@@ -295,14 +312,6 @@ def _drive_and_stop(scene: Scene, crowd: str, most: int) -> None:
         for one in crowds:
             if hasattr(one, "process"):
                 one.__exit__()
-        with inside(scene._hosts.robot):
-            connection = http.client.HTTPConnection(page.here.removeprefix("http://"), timeout=9)
-            told = {"Content-Type": "application/json"}
-            connection.request("GET", "/api/state")
-            latch = json.loads(connection.getresponse().read())["latch"]
-            body = json.dumps({"latch": latch})
-            connection.request("POST", "/api/srv/clear", body, told)
-            connection.getresponse().read()
-            connection.close()
+        scene.clear()
     assert page.process.poll() is None
     assert "Traceback" not in page.stderr
