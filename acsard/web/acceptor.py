@@ -76,7 +76,7 @@ ACCEPTS = 32
 """Connections that are accepted before other work of the event loop has its turn."""
 
 PAUSE_S = 0.05
-"""Pause of one listening address when the process has no file left."""
+"""Pause of one listening address after the process has reached its limit of open files."""
 
 NO_HOST = "the request has no `Host`, the name of the robot"
 

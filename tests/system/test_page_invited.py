@@ -1,4 +1,4 @@
-"""An invitation in a real browser admits the client, whatever the network does, or says why not."""
+"""An invitation in a real browser admits the client on any network, or gives the reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the page says and offers in each state, and what it does not offer without a state."""
+"""The words and buttons of the page in each state, and its missing buttons without a state."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ DRAWN = """(() => {
     const [xs, ys] = [0, 1].map(at => found.map(one => one[at]));
     return [xs, ys].flatMap(all => [Math.min(...all), Math.max(...all)]);
 })()"""
-"""The left, right, upper and lower end of what the map shows in this colour, px."""
+"""The left, right, upper and lower end of the shapes in this colour on the map, px."""
 
 
 @pytest.mark.parametrize("size", [PHONE, SIDEWAYS], ids=["phone", "sideways"])

@@ -1,6 +1,6 @@
 """Each forbidden request to the robot's page is refused and counted, and nothing moves.
 
-With `-s` all of it is printed as a table.
+With `-s` the results are printed as a table.
 """
 
 from __future__ import annotations
