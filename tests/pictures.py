@@ -13,12 +13,15 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 
 from acsard.core.config.settings import Config
+from acsard.machine.authority import Authority
 from tests.scenarios.taped import Tape, drive_through_faults, happenings
 from tests.scenarios.world import World
-from tests.system.browser import Page
+from tests.system.browser import NAME, TRUSTING, Page
+from tests.system.camera_stream import Stream
 from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import PLAIN, Bus, Daemon, Peer, acsard, finish, until
 from tests.unit.report.driven import two_drivers
@@ -87,30 +90,40 @@ def _picture(
     return path
 
 
-def states(seen: Callable[[Browser, str], None]) -> None:
-    """Call `seen` with a page that shows the view *Drive*, in each state, and the state's name.
+STANDS = """(mode => new MutationObserver((_, observer) => {
+    if (mode.textContent !== "SHUTDOWN") return;
+    observer.disconnect();
+    const [now, today] = [performance.now(), Date.now()];
+    performance.now = () => now;
+    Date.now = () => today;
+}).observe(mode, {childList: true, subtree: true}))(document.getElementById("mode"))"""
+"""Stops the page's clocks at SHUTDOWN, which otherwise gives way to NO DATA after half a second."""
 
-    Each time the robot and the page stay in that state until `seen` returns.
-    """
-    with (
-        tempfile.TemporaryDirectory() as place,
-        Peer(Path(place) / "mcu") as board,
-        browsing() as browser,
-    ):
-        there = Path(place)
 
-        def look(state: str, mode: str, hint: str = "") -> None:
-            until(lambda: browser.text("mode") == mode, 10.0, mode)
-            until(lambda: hint in browser.text("hint"), 10.0, hint)
-            seen(browser, state)
+class _States:
+    """A browser that shows the view *Drive* in one state after the other."""
 
+    def __init__(self, there: Path, browser: Browser, seen: Callable[[Browser, str], None]) -> None:
+        self.there, self.browser, self.seen = there, browser, seen
+
+    def look(self, state: str, mode: str, hint: str = "") -> None:
+        """Wait until the page shows the mode and the hint, then look."""
+        until(lambda: self.browser.text("mode") == mode, 10.0, mode)
+        until(lambda: hint in self.browser.text("hint"), 10.0, hint)
+        self.seen(self.browser, state)
+        # A busy machine may have kept the robot's computer silent for a while.
+        until(lambda: self.browser.text("mode") == mode, 5.0, f"{mode} to the end")
+
+    def look_at_a_board(self) -> None:
+        """Look at the page of a robot whose board answers, lies and is unplugged."""
+        browser, look = self.browser, self.look
         with (
-            Daemon(there, board.path) as daemon,
+            Peer(self.there / "mcu") as board,
+            Daemon(self.there, board.path) as daemon,
             Bus(daemon.endpoint) as bus,
-            Page(daemon, there) as page,
+            Page(daemon, self.there) as page,
         ):
             bus.linked()
-            browser.size(*PHONE)
             browser.open(page.here)
             look("ready", "READY")
             browser.hold(lambda: (bus.state()["linear"] or 0.0) > 0.15)
@@ -118,7 +131,14 @@ def states(seen: Callable[[Browser, str], None]) -> None:
             look("driving", "DRIVING")
             browser.lift()
             bus.at_rest()
-            with bus.commanding(0.2):
+            usual, board.reply = board.reply, lambda speeds: PLAIN((0.0, *speeds[1:]))
+            with bus.commanding(0.3):
+                look("wheel-fault", "FAULT", "Fault")
+                assert "wheel is left out" in browser.text("doubt")
+                board.reply = usual
+            bus.get("srv/clear")
+            with bus.commanding(0.3):
+                until(lambda: not bus.state()["wheel_fault"], 10.0, "the wheel counts again")
                 look("program-drives", "DRIVING")
             with bus.commanding(0.2, source="teleop"):
                 look("another-drives", "DRIVING", "drives")
@@ -129,7 +149,7 @@ def states(seen: Callable[[Browser, str], None]) -> None:
             bus.get("srv/deactivate")
             look("inactive", "INACTIVE", "Switched off")
             bus.get("srv/activate")
-            usual, board.reply = board.reply, lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
+            board.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
             look("fault", "FAULT", "Fault")
             board.unplug()
             look("fault-no-board", "FAULT · NO BOARD", "Fault")
@@ -138,6 +158,8 @@ def states(seen: Callable[[Browser, str], None]) -> None:
                 look("no-data", "NO DATA", "Nothing is received")
             finally:
                 daemon.signal(signal.SIGCONT)
+            # Zenoh closes this session after 2 s of silence. It may connect later than the page.
+            until(lambda: bus.ask("state"), 10.0, "the bus answers again")
             board.plug()
             board.reply = usual
             until(lambda: browser.text("mode") == "FAULT", 10.0, "the board is back")
@@ -149,21 +171,71 @@ def states(seen: Callable[[Browser, str], None]) -> None:
             look("no-connection", "NO CONNECTION", "No connection")
             browser.tap("stop")
             until(lambda: "sends it again" in browser.text("alarm"), 5.0, "STOP is not confirmed")
-            seen(browser, "stop-unconfirmed")
-        with Daemon(there) as daemon, Page(daemon, there) as page:
-            browser.open(f"{page.here}/?robot=r2")
-            look("another-robot", "WAITING")
-            browser.ask("Network.enable")
-            browser.ask("Network.setCacheDisabled", cacheDisabled=True)
-            browser.ask("Network.setBlockedURLs", urls=["*/page/map.js"])
-            browser.open(page.here)
-            until(lambda: "Reload the page" in browser.text("alarm"), 10.0, "a file is missing")
-            seen(browser, "file-missing")
-            browser.ask("Network.setBlockedURLs", urls=[])
-        (bare := there / "bare").mkdir()
-        with Daemon(bare, bare / "none") as daemon, Page(daemon, bare) as page:
-            browser.open(page.here)
-            look("no-board", "NO BOARD")
+            self.seen(browser, "stop-unconfirmed")
+
+    def look_as_others(self) -> None:
+        """Look at a camera, as a viewer, at another robot, and at a daemon that ends."""
+        browser, look, tls = self.browser, self.look, self.there / "tls"
+        Authority.make(tls, "test", 1, [NAME]).issue(tls, "robot", [NAME], 1)
+        with closing(Stream()) as stream:
+            config = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
+            with Daemon(self.there, config=config) as daemon, Page(daemon, self.there) as page:
+                frozen = "document.getElementById('camera').matches('.frozen')"
+                browser.open(page.here)
+                until(lambda: browser.js(frozen) is False, 10.0, "the picture lives")
+                look("camera", "READY")
+                stream.silent = True
+                until(lambda: browser.js(frozen), 5.0, "the picture is frozen")
+                look("camera-frozen", "READY")
+                stream.silent = False
+                browser.open(f"{page.away}/#token={page.invite('viewer', 'tv')}")
+                look("viewer", "READY", "You may watch and stop")
+                page.vault.revoke("tv")
+                until(lambda: "not valid" in browser.text("reason"), 10.0, "the invitation ends")
+                browser.tap("stop")
+                until(lambda: "invitation" in browser.text("alarm"), 5.0, "STOP is refused")
+                look("invitation-ended", "NO CONNECTION")
+                browser.open(f"{page.here}/?robot=r2")
+                look("another-robot", "WAITING")
+                browser.ask("Network.enable")
+                browser.ask("Network.setCacheDisabled", cacheDisabled=True)
+                browser.ask("Network.setBlockedURLs", urls=["*/page/map.js"])
+                browser.open(page.here)
+                until(lambda: "Reload the page" in browser.text("alarm"), 10.0, "a file is missing")
+                self.seen(browser, "file-missing")
+                browser.ask("Network.setBlockedURLs", urls=[])
+                browser.open(page.here)
+                until(lambda: browser.text("mode") == "READY", 10.0, "the page is whole")
+                browser.js(STANDS)
+                daemon.signal(signal.SIGTERM)
+                until(lambda: browser.text("mode") == "SHUTDOWN", 10.0, "the daemon ends")
+                page.signal(signal.SIGSTOP)  # its server would report that the daemon is gone
+                try:
+                    look("shutdown", "SHUTDOWN", "is ending")
+                finally:
+                    page.signal(signal.SIGCONT)
+
+    def look_at_no_board(self) -> None:
+        """Look at the page of a robot whose board was never there."""
+        with (
+            Daemon(self.there, self.there / "none", name="bare") as daemon,
+            Page(daemon, self.there) as page,
+        ):
+            self.browser.open(page.here)
+            self.look("no-board", "NO BOARD")
+
+
+def states(seen: Callable[[Browser, str], None]) -> None:
+    """Call `seen` with a page that shows the view *Drive*, in each state, and the state's name.
+
+    Each time the robot and the page stay in that state until `seen` returns.
+    """
+    with tempfile.TemporaryDirectory() as place, browsing(options=TRUSTING) as browser:
+        browser.size(*PHONE)
+        shown = _States(Path(place), browser, seen)
+        shown.look_at_a_board()
+        shown.look_as_others()
+        shown.look_at_no_board()
 
 
 DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"

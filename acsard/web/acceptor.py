@@ -76,7 +76,7 @@ ACCEPTS = 32
 """Connections that are accepted before other work of the event loop has its turn."""
 
 PAUSE_S = 0.05
-"""Pause of one listening address when the process has no file left."""
+"""Pause of one listening address after the process has reached its limit of open files."""
 
 NO_HOST = "the request has no `Host`, the name of the robot"
 
@@ -173,11 +173,14 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Give up the oldest stranger's file, and accept again after a moment."""
+        """Give up the oldest stranger's file, and accept again after a moment.
+
+        A stranger on the robot itself goes only if no connection from another machine can go.
+        """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
         loop.call_later(PAUSE_S, self._resume, opened, secure, make)
-        if (gone := self._away.displaced()) is not None:
+        if (gone := self._away.displaced() or self._here.displaced()) is not None:
             self.crowded(gone)
 
     # The connections call the methods below.

@@ -58,7 +58,7 @@ PREFLIGHT = {
     "Access-Control-Allow-Headers": "Authorization, Content-Type, If-None-Match",
     "Access-Control-Max-Age": "600",
 }
-"""Headers of the answer to a browser that asks what a page of another origin may send."""
+"""Headers of the answer to a browser that asks which requests a page of another origin may send."""
 
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
@@ -84,9 +84,9 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the tokens by a reading that begins after this call; raises `TimeoutError`.
+        """Return the tokens of a file that is read after this call, so revoked ones are not valid.
 
-        So a token that was revoked before this call is not valid.
+        Raises `TimeoutError` if the disk does not answer.
         """
         if self._next is None:
             self._next = asyncio.create_task(self._later())
@@ -128,7 +128,7 @@ class Admission:
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
-        """Return the application that serves these rows; `page` is what their handlers work on."""
+        """Return the application that serves these rows; their handlers get `page`."""
         app = web.Application(middlewares=[self._serve], client_max_size=MAX_BYTES)
         app.on_response_prepare.append(secured)
         app.on_response_prepare.append(self._shared)
@@ -157,7 +157,7 @@ class Admission:
             raise RefusedError("too_fast", "too many wrong tokens: wait a minute")
         raise RefusedError(
             "bad_token",
-            "this token is not valid: it has expired, was revoked, or is for another robot",
+            "this token is not valid (expired, revoked, or for another robot): ask for a new one",
         )
 
     @web.middleware

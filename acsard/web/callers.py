@@ -1,4 +1,4 @@
-"""Decides who sends a request, by its source address and headers, and what a role may do.
+"""Finds the client of a request by its source address and headers, and the rights of its role.
 
 This module is pure.
 
@@ -45,7 +45,7 @@ tokens."""
 
 
 class RefusedError(AcsardError):
-    """A request or a message that is refused; the text says why, and what to do."""
+    """A refusal of a request or a message; the text has the reason and the remedy."""
 
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(text)
@@ -72,7 +72,7 @@ class Who(Struct, frozen=True):
         return has(self.role, least)
 
     def require(self, least: Role, what: str) -> None:
-        """Raise `RefusedError` unless the client has at least this role, the least for `what`."""
+        """Raise `RefusedError` unless the client has at least the role that `what` needs."""
         if not self.may(least):
             raise RefusedError("role", f"{what} is {self.barred(least)}: {MAY[self.role]}")
 

@@ -41,8 +41,8 @@ ANSWERED = 200
 """Maximum number of other robots of which it is known that they answer a stop."""
 
 ANSWER_S = 8.0
-"""Longer than a client waits for its answer, so the client's own error message is what the caller
-gets."""
+"""Time limit for an answer from the bus. The bus client gives up sooner, so the caller gets its
+error message."""
 
 BUSY = "busy: too many queries at once; ask again"
 

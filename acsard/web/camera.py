@@ -27,7 +27,7 @@ WAIT_S = 1.0
 """Longest wait for a picture that the client has not seen."""
 
 IDLE_S = 5.0
-"""Time without a client after which the stream is no longer read."""
+"""Time without a client after which the server stops reading the stream."""
 
 AGAIN_S = 0.5
 """Delay before the stream is opened again."""
@@ -105,7 +105,7 @@ class Camera:
     def __init__(self, url: str) -> None:
         self._url = url
         self.newest: Picture | None = None
-        """The newest picture, None if the stream is not read or has none."""
+        """The newest picture. It is None at first, after a failure and while no client asks."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0
@@ -114,9 +114,9 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Return the newest picture if it has another number, or wait for one; None if none comes.
+        """Return the newest picture once its number differs, or None if that takes too long.
 
-        Raises `TroubleError` if there is no camera or it shows nothing.
+        Raises `TroubleError` if the robot has no camera, or its stream cannot be read.
         """
         if not self._url:
             raise TroubleError(404, "this robot has no camera: web.camera names its MJPEG stream")

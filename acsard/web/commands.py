@@ -23,7 +23,7 @@ from acsard.web.limits import COMMANDS
 class Hand:
     """Sends the newest command of each viewer.
 
-    `client` returns the connection to the bus, or None if there is none.
+    `client` returns the connection to the bus, or None while it is lost.
     """
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:

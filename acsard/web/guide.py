@@ -78,8 +78,7 @@ class Choices(Struct, frozen=True):
     """Reason for the recommendation and the alternatives."""
     ports: Sequence[Board]
     note: str
-    """Explanation of a limit of this server, with the command to type instead; "" if there is
-    none."""
+    """Explanation of a limit of this server, with the command to type instead, or ""."""
 
 
 class _Said(Struct, frozen=True):
@@ -110,9 +109,9 @@ class Guide:
         return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
 
     def join(self, viewer: object, say: Say) -> None:
-        """Add a viewer, and report to it what is running, or that nothing is.
+        """Add a viewer, and report to it the running command, or that nothing runs.
 
-        The second report matters to a page that was disconnected when the child ended.
+        A page that was disconnected when the child ended needs the second report.
         """
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))

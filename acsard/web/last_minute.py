@@ -73,7 +73,7 @@ class Minute:
         return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - EARLY_NS
 
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
-        """Append a row; `wished` is None if the commanded twist is not known."""
+        """Append a row; `wished` is None while the commanded twist is unknown."""
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
         if len(measured) != MEASURED:
             measured = [None] * MEASURED

@@ -209,7 +209,7 @@ class Seats:
         self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
 
     def missing(self, address: str, token: str) -> str:
-        """Return why a connection is refused and what to do, or "" if there is room."""
+        """Return the reason and the remedy if a connection is refused, or "" if there is room."""
         for places, name, full in self._places(address, token):
             if not places.room(name):
                 return full

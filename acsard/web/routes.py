@@ -1,4 +1,4 @@
-"""The rows of the page's table: what each path is, who may use it, and what goes in and out.
+"""The rows of the page's table: the meaning, the role, the input and the output of each path.
 
 This module is pure. `app.ROUTES` is the table. Dispatch, admission, the request rate, the answers
 404 and 405 and the OpenAPI document follow it, so a path that is not in the table does not exist.

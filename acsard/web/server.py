@@ -199,9 +199,9 @@ def _about(wanted: Wanted) -> About:
 
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, frozenset[str]]:
-    """Return the TLS context and the names of this machine; raises a `MendableError`.
+    """Return the TLS context and the names of this machine, apart from its loopback names.
 
-    Without an HTTPS address both are empty. Loopback names are left out of the names.
+    Without an HTTPS address both are empty. Raises a `MendableError` if a certificate is missing.
     """
     if not any(one.secure for one in wanted.listen):
         return None, frozenset()

@@ -30,6 +30,9 @@ from tests.system.harness import (
 
 NAME = socket.gethostname()
 
+TRUSTING = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
+"""Options of a browser that opens the page over HTTPS, like one on another host."""
+
 
 class Page(Program):
     """`acsard web` for a daemon: over HTTP on the robot, and over HTTPS as other hosts reach it."""

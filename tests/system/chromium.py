@@ -200,12 +200,16 @@ class Browser:
         """Return the visible controls that are too small for a finger: name, width, height."""
         return list(self.js(_PRESSED.replace("LEAST", str(FINGER_PX - 0.5))))
 
-    def obstacles(self) -> list[Any]:
-        """Return the obstacles for a screen reader that axe finds: grade, rule, element."""
+    def obstacles(self, only: str = "") -> list[Any]:
+        """Return the obstacles for a screen reader that axe finds: grade, rule, element.
+
+        `only` names one of its rules.
+        """
+        rules = json.dumps({"runOnly": [only]} if only else {})
         if not self.js("'axe' in window"):
             self.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
         found: list[Any] = self.js(
-            "axe.run().then(told =>"
+            f"axe.run({rules}).then(told =>"
             " told.violations.map(one => [one.impact, one.id, one.nodes[0].html]))"
         )
         return found

@@ -1,4 +1,4 @@
-"""An invitation in a real browser admits the client, whatever the network does, or says why not."""
+"""An invitation in a real browser admits the client on any network, or gives the reason."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from acsard.machine.authority import Authority
-from tests.system.browser import NAME, Page
+from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import Bus, Daemon, until
 
@@ -60,8 +60,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    there = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
-    with browsing(options=there) as browser:
+    with browsing(options=TRUSTING) as browser:
         browser.size(*PHONE)
         browser.ask("Network.enable")
         yield browser
@@ -113,6 +112,7 @@ def test_a_token_that_has_ended_is_reported_as_such_and_a_new_link_in_its_tab_le
     before = stranger.tries
     stranger.knocks_no_more(before, 2)  # the socket, and the reason
     assert "this token is not valid" in stranger.browser.text("reason")
+    assert "ask for a new one" in stranger.browser.text("reason")
     token = stranger.server.invite("operator", "anew")
     stranger.browser.js(f"location.hash = 'token={token}'")
     stranger.shows("role", "operator")

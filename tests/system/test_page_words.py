@@ -1,4 +1,4 @@
-"""What the page says and offers in each state, and what it does not offer without a state."""
+"""The words and buttons of the page in each state, and its missing buttons without a state."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from acsard.machine.authority import Authority
-from tests.system.browser import NAME, Page
+from tests.system.browser import NAME, TRUSTING, Page
+from tests.system.camera_stream import Stream
 from tests.system.chromium import CHROMIUM, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import PLAIN, Bus, Daemon, Peer, until
-from tests.system.test_page_camera import Stream
 
 pytestmark = [
     pytest.mark.slow,
@@ -25,8 +25,7 @@ HIDDEN = "document.getElementById('clear').hidden"
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    there = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 127.0.0.1")
-    with browsing(options=there) as browser:
+    with browsing(options=TRUSTING) as browser:
         browser.size(*PHONE)
         yield browser
         browser.open("about:blank")
@@ -147,14 +146,20 @@ def test_a_program_that_drives_is_named_and_a_push_takes_over(
     shows(browser, "hint", "Hold and push to drive")
 
 
-def test_switch_on_is_beside_stop_while_the_robot_is_off(
+def test_switch_on_is_beside_stop_and_only_offered_while_the_robot_is_off(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
+    def off(name: str) -> bool:
+        return bool(browser.js(f"document.getElementById({name!r}).disabled"))
+
+    assert (off("activate"), off("deactivate")) == (True, False)  # the robot is on
     robot[1].get("srv/deactivate")
     shows(browser, "clear", "Switch on")
+    assert (off("activate"), off("deactivate")) == (False, True)
     shows(browser, "reason", "press Switch on")
     browser.tap("clear")
     shows(browser, "mode", "READY")
+    until(lambda: off("activate"), 5.0, "the robot is on")
 
 
 def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
@@ -228,7 +233,7 @@ DRAWN = """(() => {
     const [xs, ys] = [0, 1].map(at => found.map(one => one[at]));
     return [xs, ys].flatMap(all => [Math.min(...all), Math.max(...all)]);
 })()"""
-"""The left, right, upper and lower end of what the map shows in this colour, px."""
+"""The left, right, upper and lower end of the shapes in this colour on the map, px."""
 
 
 @pytest.mark.parametrize("size", [PHONE, SIDEWAYS], ids=["phone", "sideways"])

@@ -1,6 +1,6 @@
 """Each forbidden request to the robot's page is refused and counted, and nothing moves.
 
-With `-s` all of it is printed as a table.
+With `-s` the results are printed as a table.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import aiohttp
 import pytest
@@ -35,7 +35,16 @@ from acsard.web.limits import (
     STRANGERS,
 )
 from tests.system.browser import NAME, Hands, Page, hands, run
-from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, cpu_seconds, resident_kb, until
+from tests.system.harness import (
+    PATIENCE_S,
+    Bus,
+    Daemon,
+    Periods,
+    cpu_seconds,
+    resident_kb,
+    until,
+    waited_for_a_core,
+)
 
 pytestmark = pytest.mark.network
 
@@ -694,42 +703,61 @@ def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
         run(story)
 
 
-VIEWERS, A_SECOND, LASTS_S = 6, 190, 4.0
+TICK_S = 0.01
+VIEWERS, A_SECOND, LASTS_S = 6, 190, 3.0
 
 
-def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings(
+class Cost(NamedTuple):
+    """The cost of a wave of messages."""
+
+    cpu_s: float
+    """Processor time of the page and the daemon."""
+    missed: int
+    """Periods that the control loop missed."""
+    waited: float
+    """Periods for which the control loop waited for a core."""
+
+
+def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings_and_no_periods(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
-    """Every viewer sends as much as its limit allows, pings and stops in turns."""
+    """The viewers are quiet, send pings and send stops in turns, as much as their limit allows."""
     page, daemon = table.page.pid, table.daemon.pid
 
-    async def told(number: int, stops: bool) -> None:
+    async def told(number: int, what: str) -> None:
         async with hands(table.page, tokens["viewer"]) as theirs:
             reading = asyncio.create_task(_drained(theirs))
             begun = time.monotonic()
             for n in range(round(A_SECOND * LASTS_S)):
-                if stops:
+                if what == "stops":
                     await theirs.say(call="stop", id=n, robot=f"nobody{number}{n}")
-                else:
+                elif what == "pings":
                     await theirs.say(ping=n)
                 await asyncio.sleep(max(0.0, begun + n / A_SECOND - time.monotonic()))
             reading.cancel()
 
-    async def wave(stops: bool) -> tuple[float, int]:
-        """Return the processor time of page and daemon, s, and the missed periods."""
-        before, spent = bus.state(), cpu_seconds(page) + cpu_seconds(daemon)
-        await asyncio.gather(*(told(number, stops) for number in range(VIEWERS)))
+    async def wave(what: str) -> Cost:
+        before, waited = bus.state(), waited_for_a_core(daemon)
+        spent = cpu_seconds(page) + cpu_seconds(daemon)
+        await asyncio.gather(*(told(number, what) for number in range(VIEWERS)))
         spent = cpu_seconds(page) + cpu_seconds(daemon) - spent
-        return spent, Periods.between(before, bus.state()).missed
+        waited = waited_for_a_core(daemon) - waited
+        return Cost(spent, Periods.between(before, bus.state()).missed, waited / TICK_S)
 
     async def story() -> None:
-        pings, stops, again, more = [await wave(stops) for stops in (False, True, False, True)]
-        quiet, attack = pings[0] + again[0], stops[0] + more[0]
-        missed = pings[1] + again[1], stops[1] + more[1]
-        print(f"\npage and daemon: {50 * quiet / LASTS_S:.0f} % of a core with pings, "
-              f"{50 * attack / LASTS_S:.0f} % with stops; missed periods {missed}")  # fmt: skip
-        assert attack < 2 * quiet
-        assert missed[1] <= missed[0] + 2
+        kinds = ("nothing", "pings", "stops")
+        waves = [(kind, await wave(kind)) for kind in kinds * 2]
+        quiet, pings, stops = (
+            Cost(*map(sum, zip(*(cost for kind, cost in waves if kind == wanted), strict=True)))
+            for wanted in kinds
+        )
+        for kind, cost in zip(kinds, (quiet, pings, stops), strict=True):
+            print(f"\nviewers send {kind}: {50 * cost.cpu_s / LASTS_S:.0f} % of a core, "
+                  f"{cost.missed} periods missed, {cost.waited:.1f} waited for a core")  # fmt: skip
+        assert stops.cpu_s < 2 * pings.cpu_s
+        assert stops.missed <= pings.missed + 2
+        # Other work on the machine may come in one wave and not in the other.
+        assert stops.missed <= quiet.missed + stops.waited + 2
 
     run(story)
 

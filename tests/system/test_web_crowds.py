@@ -1,7 +1,8 @@
 """Crowds of connections from another host cost the page little, and lock no phone out.
 
 Each crowd comes twice: once while a phone drives, and once while the phone and a browser on the
-robot itself stop the robot. With `-s` the figures of each crowd are printed.
+robot itself stop the robot. Another crowd comes to a page that may open no more files. With `-s`
+the figures of each crowd are printed.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ import resource
 import ssl
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from acsard.machine.authority import Authority
+from acsard.web.acceptor import PAUSE_S
 from acsard.web.calls import MERGE_S
 from tests.system.browser import Hands, Page
 from tests.system.bystander import lost
-from tests.system.harness import PATIENCE_S, Daemon, Program, free_endpoint, resident_kb
+from tests.system.harness import PATIENCE_S, Daemon, Program, free_endpoint, resident_kb, until
 from tests.system.hosts import ROBOT_AT, STRANGER_AT, Hosts, inside, ip, on
 from tests.system.strangers import words
 
@@ -129,6 +131,11 @@ class Scene:
             place = self.page.here.removeprefix("http://")
             return _stopped(lambda: http.client.HTTPConnection(place, timeout=PATIENCE_S), {})
 
+    def reaches_the_daemon(self) -> bool:
+        with suppress(AssertionError):
+            return self.stop_here() >= 0.0
+        return False
+
     def stop_away(self) -> float:
         """Stop the robot from the phone by a new connection; return how long that took, s."""
         with inside(self._hosts.stranger):
@@ -141,6 +148,20 @@ class Scene:
                 ),
                 told,
             )  # fmt: skip
+
+    def clear(self) -> None:
+        """Release the stop from the robot itself."""
+        with inside(self._hosts.robot):
+            connection = http.client.HTTPConnection(
+                self.page.here.removeprefix("http://"), timeout=9
+            )
+            told = {"Content-Type": "application/json"}
+            connection.request("GET", "/api/state")
+            latch = json.loads(connection.getresponse().read())["latch"]
+            body = json.dumps({"latch": latch})
+            connection.request("POST", "/api/srv/clear", body, told)
+            connection.getresponse().read()
+            connection.close()
 
     async def drive_on(self, crowd: Program) -> list[str]:
         """Drive from the phone while the crowd comes; return the modes meanwhile."""
@@ -166,6 +187,55 @@ class Scene:
             holding.cancel()
             await ours.drive(0.0)
         return modes
+
+
+FREE_FILES, SILENT = 12, 80
+
+
+@pytest.mark.parametrize("near", [False, True], ids=["other host", "robot itself"])
+def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
+    hosts: Hosts, robot: Daemon, where: Path, near: bool, tmp_path: Path
+) -> None:
+    """The limit of open files is lowered behind the page's back, so its own bounds are too high."""
+    (tmp_path / "tls").symlink_to(where / "tls")
+    server = Page(robot, tmp_path, at=ROBOT_AT)
+    with inside(hosts.robot):
+        server.__enter__()
+    scene = Scene(hosts, server, "2500 silent", "")
+    place = (server.here if near else server.away).rpartition("//")[2]
+    host, _, port = place.rpartition(":")
+    crowd = Program(
+        words(CROWD, "silent", host, port, SILENT, *([host] if near else OLDER)), server.tls
+    )
+    try:
+        until(scene.reaches_the_daemon, 10.0, "the page reaches the daemon")
+        alone = asyncio.run(_stops(scene.stop_here))
+        taken = len(list(Path(f"/proc/{server.pid}/fd").iterdir()))
+        hard = resource.prlimit(server.pid, resource.RLIMIT_NOFILE)[1]
+        resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (taken + FREE_FILES, hard))
+        with inside(hosts.robot if near else hosts.stranger):
+            crowd.__enter__()
+        crowd.says("opened", PATIENCE_S)
+        crowded = asyncio.run(_stops(scene.stop_here))
+        crowd.__exit__()
+        after, away = asyncio.run(_stops(scene.stop_here)), scene.stop_away()
+        times = [f"{1000 * nine_of_ten(took):.0f} ms" for took in (alone, crowded, after)]
+        print("\nno file: a stop from here before, meanwhile and after:", ", ".join(times))
+        # Each turn without a file displaces one connection, and the listeners rest after it.
+        assert nine_of_ten(crowded) < HERE_S + 4 * PAUSE_S
+        assert nine_of_ten(after) < HERE_S
+        assert away < PHONE_S
+        with inside(hosts.robot):
+            assert server.refused()["crowded"] > 0
+        assert "Traceback" not in server.stderr
+        assert server.process.poll() is None
+    finally:
+        if hasattr(crowd, "process"):
+            crowd.__exit__()
+        try:
+            scene.clear()
+        finally:
+            server.__exit__()
 
 
 def nine_of_ten(took: list[float]) -> float:
@@ -242,14 +312,6 @@ def _drive_and_stop(scene: Scene, crowd: str, most: int) -> None:
         for one in crowds:
             if hasattr(one, "process"):
                 one.__exit__()
-        with inside(scene._hosts.robot):
-            connection = http.client.HTTPConnection(page.here.removeprefix("http://"), timeout=9)
-            told = {"Content-Type": "application/json"}
-            connection.request("GET", "/api/state")
-            latch = json.loads(connection.getresponse().read())["latch"]
-            body = json.dumps({"latch": latch})
-            connection.request("POST", "/api/srv/clear", body, told)
-            connection.getresponse().read()
-            connection.close()
+        scene.clear()
     assert page.process.poll() is None
     assert "Traceback" not in page.stderr

@@ -61,11 +61,12 @@ export function hint(hello, other) {
 }
 
 /** Disable the controls that this client may not use and explain why, on the control and in its description.
- *  `reason` disables all of them for that reason. `hello` is undefined while no robot has answered. */
-export function permit(hello, reason = "") {
+ *  `reason` disables all of them for that reason. `needless` has the reason by control for those that would change
+ *  nothing now. `hello` is undefined while no robot has answered. */
+export function permit(hello, reason = "", needless = {}) {
   document.getElementById("barred").textContent = reason || barred(hello, "drive");
   for (const one of document.querySelectorAll("[data-does]")) {
-    const why = reason || barred(hello, one.dataset.does);
+    const why = reason || barred(hello, one.dataset.does) || needless[one.dataset.does] || "";
     if ("disabled" in one) one.disabled = Boolean(why);
     else one.setAttribute("aria-disabled", String(Boolean(why)));
     one.title = why;

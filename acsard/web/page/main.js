@@ -27,6 +27,9 @@ const VIEWS = ["drive", "status", "events", "set", "robots"];
 const words = (told) => clickable(named(told), OTHER);
 const READ = 8000; // ms in which a message can be read
 const LATCHED = ["stopped", "fault"];
+const ON = { activate: "the robot is already on" };
+/** The switch that changes nothing in a mode, with the reason. */
+const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: "the robot is already off" } };
 const SOON = 300; // ms in which the WebSocket answers a STOP, unless it is dead but still open
 
 const link = new Link(refused);
@@ -200,9 +203,11 @@ function stated({ detail }) {
   if (!state && detail.age > 2 * lasts()) return;
   const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
   if (since > 0) period = Math.min(since, 10);
-  if (state && state.mode !== detail.value.mode) outdated();
+  const other = state?.mode !== detail.value.mode;
+  if (state && other) outdated();
   seen = true;
   state = drive.state = detail.value;
+  if (other) permitted();
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
   // The daemon's stop does not end a running check, so it confirms STOP only if none is running.
@@ -212,7 +217,7 @@ function stated({ detail }) {
   readied();
   map.lose(!boarded(state));
   const who = state.sender ? person(state.sender, hello?.sender) : state.source;
-  views.text("who", !state.source ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
+  views.text("who", !state.source || state.mode !== "driving" ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
   const { linear, angular } = state; // null without feedback from the board
   dialled();
@@ -256,7 +261,7 @@ function greeted({ detail }) {
   camera.show(!OTHER && hello.camera);
   drive.limits = hello.limits;
   drive.allowed = !OTHER && !barred(hello, "drive");
-  permit(hello, OTHER ? `only on the own page of ${OTHER}` : "");
+  permitted();
   $("limit").max = String(hello.limits.linear);
   limited();
   readied();
@@ -264,6 +269,11 @@ function greeted({ detail }) {
   uninvited = "";
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
   if (OTHER) elsewhere();
+}
+
+/** Disable the controls that the robot would refuse to this client or that would change nothing. */
+function permitted() {
+  permit(hello, OTHER ? `only on the own page of ${OTHER}` : "", NEEDLESS[state?.mode]);
 }
 
 /** Explain that this page shows a robot other than its own. */
