@@ -22,6 +22,7 @@ from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
 from tests.simulate.liveness import Liveness
+from tests.simulate.log_lines import LogLines
 from tests.simulate.plan import Plan
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import LIARS, PoseWitness
@@ -30,6 +31,14 @@ from tests.simulate.promises import DIALECTS, BrokenError, Witness
 from tests.simulate.reasons import Reasons
 from tests.simulate.reports import Echo, Reports, judge_pose, judge_state
 from tests.simulate.roads import NS, Message, messages, parameters, read_reply, sample
+from tests.simulate.spread import Spread
+
+RELEASING = {"clear", "activate", "deactivate", "set"}
+"""Calls that change what the robot may do, from when on is not known until the answer. A `stop`
+counts from its arrival on."""
+
+PLACING = {"set_pose", "reset_odometry"}
+"""Calls that set the pose."""
 
 
 class Result(NamedTuple):
@@ -78,6 +87,7 @@ class Run:
         """Monotonic time of the last resume: before it nothing can have arrived."""
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
+        self.spread, self.log_lines = Spread(self.witness), LogLines()
         self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
         self.counts: Counter[str] = self.witness.counts
@@ -103,6 +113,8 @@ class Run:
         self._stalled_ns = -NS
         self._full_ns = self._blocked_ns = -NS
         """When the disk was last seen full, and the output was last seen blocked."""
+        self._whole = False
+        """The last step sent a whole line."""
         self.epilogue = False
         self.moved_ns = -1
         self.product = Product(plan["config"], self._see)
@@ -387,6 +399,8 @@ class Run:
             self.pose.doubt(name == "mute")
 
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
+        if fault[0] == "endless" and self.product.alive:
+            self.liveness.weigh()
         self.active.remove(fault)
         self.liveness.event()
         self._troubled(fault[0])
@@ -427,7 +441,13 @@ class Run:
         if event.get("stop"):
             product.stop_unseen()
             witness.stops.append(self.true_ns)
+        moving = witness.last
+        if event["way"] == "term":
+            witness.ending_ns = self.true_ns
         product.end(event["way"])
+        self._raise()
+        if self._whole:
+            witness.ended(self.true_ns, moving)
         self._take_answers()
         for call, arrived_ns, _ in self._calls.values():
             witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
@@ -449,6 +469,8 @@ class Run:
             self._linked = False
             witness.new_life(self.true_ns)
             self.reports, self.followed = Reports(), Followed(witness)
+            self.log_lines = LogLines()
+            self.spread.forget()
             self.pose.latest = None
             self.damage.forget()
             self.reasons.restart()
@@ -515,9 +537,12 @@ class Run:
         if self._calls:
             self._take_answers()
             self._late_answers(true_ns)
-        witness.pending = self.product.disk.full and bool(self._calls)
-        if witness.pending:
-            self.pose.placed()
+        witness.pending = {}
+        if self._calls and self.product.disk.full:
+            waiting = {call["verb"]: at_ns for call, at_ns, _ in self._calls.values()}
+            witness.pending = {verb: waiting[verb] for verb in RELEASING & waiting.keys()}
+            if not PLACING.isdisjoint(waiting):
+                self.pose.placed()
         for fault in self.active:
             if fault not in self.lasting and fault[0] not in DIALECTS:
                 witness.troubles[fault[0]] = true_ns
@@ -530,6 +555,7 @@ class Run:
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.linked = seen.link == "up"
         witness.cut |= not witness.linked
+        self._whole = bool(seen.lines) and seen.lines[-1][1].endswith(b"\n")
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             if witness.linked:  # the daemon that has lost the link believes no line
@@ -545,8 +571,14 @@ class Run:
         if seen.estimates:
             lies, truth = {name for name, _ in self.active}, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
+            if self._stalled_ns > true_ns - NS:
+                self.spread.forget()
+            for estimate in seen.estimates:
+                self.spread.see(true_ns, estimate, lies)
             witness.wheels(true_ns, truth[4])
-        self.pose.end_step()
+        if self.pose.end_step():
+            self.spread.forget()
+        self.log_lines.see(true_ns, seen)
         calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
         self.plugging.see(true_ns, seen, self.product, calm_ns)
         if self.log is not None:

@@ -111,15 +111,17 @@ class PoseWitness:
             last_ns = sampled_ns + offset_ns
             self._before = last_ns, self.latest, (x, y, yaw), self.speed_at(last_ns), xx + yy
 
-    def end_step(self) -> None:
-        """Forget the pose if it was set in this step."""
-        if self._placed:
+    def end_step(self) -> bool:
+        """Forget the pose if it was set in this step, and return whether it was."""
+        placed = self._placed
+        if placed:
             last, asked = self._last, self._asked
             self._placed, self._asked, self.latest = False, None, None
             self.begin()
             true = None if last is None else self._true_at(last[0])
             if last is not None and true is not None and asked is not None:
                 self._expected, self._asked_ns = (true, asked), last[0]
+        return placed
 
     def _one(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
