@@ -65,7 +65,8 @@ class Course:
         late_ns, self._line_ns = true_ns - self._line_ns, true_ns
         limits = witness.limits
         saturated = max(map(abs, wheels)) > limits["wheel_speed"] - 0.1
-        late = late_ns > 2 * witness.period_ns
+        # A speed changes by that much time at most from one line to the next.
+        late = late_ns > max(NS // 20, 3 * witness.period_ns // 2)
         if wish is None or goal != self._goal or late or saturated or witness.unsure:
             self._goal, self._from_ns, self._from = goal, true_ns, wheels
             return

@@ -357,16 +357,18 @@ def test_a_robot_that_speeds_up_after_sigterm_is_a_finding() -> None:
         moves(witness, 1.1)
 
 
-@pytest.mark.parametrize(("share", "finding"), [(1.0, False), (0.5, True)])
-def test_a_ramp_to_a_slower_command_that_takes_twice_as_long_is_a_finding(
-    share: float, finding: bool
+@pytest.mark.parametrize(
+    ("share", "every", "finding"), [(1.0, 1, False), (0.5, 1, True), (0.5, 6, False)]
+)
+def test_a_ramp_with_all_its_lines_that_takes_twice_as_long_is_a_finding(
+    share: float, every: int, finding: bool
 ) -> None:
     witness = witnessed()
     witness.limits["wheel_speed"] = witness.limits["linear_speed"] = 99.0
     course, fall = Course(witness), witness.limits["linear_deceleration"]
     wheel = 1.0 * fall / witness.radius
     with pytest.raises(BrokenError, match="a ramp ends in time") if finding else nullcontext():
-        for n in range(200):
+        for n in range(0, 200, every):
             speed = max(0.5 * wheel, wheel * (1 - n * 0.01 * share))
             course.step(n * NS // 100, (0.5 * fall, 0.0), (speed,) * 4, 1)
 
