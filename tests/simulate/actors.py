@@ -103,6 +103,10 @@ class Run:
         self._numbers: dict[int, int] = {}
         """Numbers of latches that operators have read in `state`, each with the last time."""
         self.active: list[tuple[str, tuple[Any, ...]]] = []
+        self._names: set[str] = set()
+        """Names of the active faults."""
+        self._troubling: list[str] = []
+        """Names of those that came in this plan and are no dialect."""
         self._fed_ns = 0
         self._ended = b""
         """The last byte of the board that reached the daemon."""
@@ -171,7 +175,7 @@ class Run:
         plan, seen = self.plan, Counter[str]()
         self.lasting = [(name, tuple(values)) for name, *values in plan["board"]]
         self.active = list(self.lasting)
-        self.product.board(self.active)
+        self._board()
         for sender in plan["senders"]:
             self.counts[f"way {sender['way']}"] += 1
             for shape in sender["congestion"]:
@@ -337,7 +341,7 @@ class Run:
                 self.active.append(fault)
                 self._troubled(name)
                 self.witness.lying_ns = self.true_ns
-                product.board(list(self.active))
+                self._board()
                 if name == "echo":
                     self.echo.begin()
                 elif name == "mute":
@@ -387,10 +391,23 @@ class Run:
             if self.pose.latest is not None and not self._calls:
                 judge_pose(self.true_ns, state, self.pose.latest, self._fed_ns, quiet_ns)
 
+    def _weigh(self) -> None:
+        """Judge that a line without an end has not filled the memory."""
+        self.liveness.weigh()
+
     def _block(self, blocked: bool) -> None:
         self.liveness.event()
         self.product.block(blocked)
         self.witness.blocked_ns = self.true_ns if blocked else None
+
+    def _board(self) -> None:
+        """Have the board misbehave in all active ways."""
+        self.product.board(list(self.active))
+        self._names = {name for name, _ in self.active}
+        new = [one for one in self.active if one not in self.lasting]
+        self._troubling = [name for name, _ in new if name not in DIALECTS]
+        added = self.active[len(self.lasting) :]
+        self.witness.lies = [fault for fault in added if fault[0] not in DIALECTS]
 
     def _troubled(self, name: str) -> None:
         if name not in DIALECTS:
@@ -400,12 +417,12 @@ class Run:
 
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
         if fault[0] == "endless" and self.product.alive:
-            self.liveness.weigh()
+            self._weigh()
         self.active.remove(fault)
         self.liveness.event()
         self._troubled(fault[0])
-        self.product.board(list(self.active))
-        self.echo.on = any(name == "echo" for name, _ in self.active)
+        self._board()
+        self.echo.on = "echo" in self._names
         if fault[0] == "echo" and self.product.plugged:
             # The daemon asks for this, and drives no more until it was done.
             self.product.unplug()
@@ -482,12 +499,13 @@ class Run:
 
     def _fed(self, at_ns: int, data: bytes) -> None:
         before, self._ended = self._ended, data[-1:]
-        if b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
+        if b"!acsard-mcu " in data and b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
             self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
-        self.damage.fed(data)
+        if self._plain:
+            self.damage.fed(data)
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
-        if any(name == "endless" for name, _ in self.active):
+        if "endless" in self._names:
             return
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
@@ -527,6 +545,10 @@ class Run:
                 text = f"{call['verb']} by {call['by']} came at {arrived_ns / NS:.3f} s"
                 raise BrokenError("every call has an answer", true_ns, text)
 
+    def _lines(self) -> int:
+        """Return the number of good lines that the daemon has counted."""
+        return int(self.product.state()["counters"]["lines"])
+
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
@@ -537,16 +559,15 @@ class Run:
         if self._calls:
             self._take_answers()
             self._late_answers(true_ns)
-        witness.pending = {}
+        if witness.pending:
+            witness.pending = {}
         if self._calls and self.product.disk.full:
             waiting = {call["verb"]: at_ns for call, at_ns, _ in self._calls.values()}
             witness.pending = {verb: waiting[verb] for verb in RELEASING & waiting.keys()}
             if not PLACING.isdisjoint(waiting):
                 self.pose.placed()
-        for fault in self.active:
-            if fault not in self.lasting and fault[0] not in DIALECTS:
-                witness.troubles[fault[0]] = true_ns
-        witness.lies = [f for f in self.active[len(self.lasting) :] if f[0] not in DIALECTS]
+        for name in self._troubling:
+            witness.troubles[name] = true_ns
         if seen.followed_ns is not None:
             clock = self.reports.follows(true_ns, seen.followed_ns)
             if clock:
@@ -567,9 +588,9 @@ class Run:
         self.liveness.look(true_ns)
         self.reasons.look(true_ns, self._stalled_ns)
         if self._plain and not self.echo.on:
-            self.damage.look(true_ns, lambda: int(self.product.state()["counters"]["lines"]))
+            self.damage.look(true_ns, self._lines)
         if seen.estimates:
-            lies, truth = {name for name, _ in self.active}, self.product.truth()
+            lies, truth = self._names, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
             if self._stalled_ns > true_ns - NS:
                 self.spread.forget()

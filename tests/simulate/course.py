@@ -26,6 +26,8 @@ class Course:
         """Time of the line from which the ramp to this command began, and of the last line."""
         self._from: tuple[float, ...] = ZERO
         """The wheel speeds of the first of these lines."""
+        self._reached: tuple[float, ...] | None = None
+        """The wheel speeds at the end of the ramp."""
 
     def step(
         self, true_ns: int, wish: tuple[float, float] | None, wheels: tuple[float, ...], lines: int
@@ -56,19 +58,26 @@ class Course:
         if wheels != ZERO and abs(v * goal_w - w * goal_v) > error:
             raise BrokenError("the robot drives on the curve", true_ns, f"{got} for {goal}")
 
+    def _begin(self, goal: tuple[object, ...], true_ns: int, wheels: tuple[float, ...]) -> None:
+        """Start over with a ramp from these wheel speeds."""
+        self._goal, self._from_ns, self._from, self._reached = goal, true_ns, wheels, None
+
     def _ramp(
         self, true_ns: int, wish: tuple[float, float] | None, wheels: tuple[float, ...]
     ) -> None:
         """Judge that the ramp to a command ends in time."""
         witness = self._witness
-        goal = wish, witness.changed_ns
         late_ns, self._line_ns = true_ns - self._line_ns, true_ns
-        limits = witness.limits
-        saturated = max(map(abs, wheels)) > limits["wheel_speed"] - 0.1
+        goal, limits = (wish, witness.changed_ns), witness.limits
         # A speed changes by that much time at most from one line to the next.
         late = late_ns > max(NS // 20, 3 * witness.period_ns // 2)
-        if wish is None or goal != self._goal or late or saturated or witness.unsure:
-            self._goal, self._from_ns, self._from = goal, true_ns, wheels
+        if wish is None or late or goal != self._goal or witness.unsure:
+            self._begin(goal, true_ns, wheels)
+            return
+        if wheels == self._reached:
+            return
+        if max(map(abs, wheels)) > limits["wheel_speed"] - 0.1:
+            self._begin(goal, true_ns, wheels)
             return
         seconds, due = (true_ns - self._from_ns - LATE_NS - witness.period_ns) / NS, 0.0
         if seconds <= 0.0:
@@ -76,6 +85,7 @@ class Course:
         room, got = witness.radius * 0.02, witness.twist(wheels)
         rooms, aims = (room, room / witness.half), witness.clamped(*wish, limits)
         if all(abs(a - b) <= r for a, b, r in zip(got, aims, rooms, strict=True)):
+            self._reached = wheels
             return
         begun = witness.twist(self._from)
         for name, old, new in zip(("linear", "angular"), begun, aims, strict=True):

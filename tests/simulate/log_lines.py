@@ -24,14 +24,18 @@ class LogLines:
     def __init__(self) -> None:
         self._paid_ns: dict[str, int] = {}
         """Time at which the lines of each name are paid for, at a second each."""
-        self._mode = self._logged = ""
-        """The mode, and the one that the log has last."""
+        self._mode = self._awaited = ""
+        """The mode, and the words of a line that the log lacks."""
         self._since_ns = 0
-        """Since when the log lacks the present mode."""
+        """Since when it lacks them."""
 
     def see(self, true_ns: int, seen: Seen) -> None:
         """Judge the lines of one step."""
         now_ns = seen.decided_ns
+        if seen.mode != self._mode:
+            # The first mode of a daemon is no change.
+            self._awaited = f"-> {seen.mode}" if self._mode else ""
+            self._mode, self._since_ns = seen.mode, now_ns
         for name, level, text in seen.events:
             paid_ns = max(self._paid_ns.get(name, 0), now_ns)
             self._paid_ns[name] = paid_ns + NS
@@ -40,15 +44,8 @@ class LogLines:
                 raise BrokenError("the log is not flooded", true_ns, text)
             if level not in LEVELS or not text or "\n" in text:
                 raise BrokenError("every line of the log has a text", true_ns, f"{name}: {text!r}")
-            if name == "mode":
-                self._logged = text
-        if seen.mode != self._mode:
-            # The first mode of a daemon is no change.
-            if self._mode:
-                self._since_ns = now_ns
-            else:
-                self._logged = f"-> {seen.mode}"
-            self._mode = seen.mode
-        if f"-> {seen.mode}" not in self._logged and now_ns - self._since_ns > LATE_NS:
-            text = f"{seen.mode}: the last line is {self._logged!r}"
+            if name == "mode" and self._awaited in text:
+                self._awaited = ""
+        if self._awaited and now_ns - self._since_ns > LATE_NS:
+            text = f"no line has {self._awaited!r}"
             raise BrokenError("a change of the mode is logged", true_ns, text)

@@ -509,30 +509,37 @@ class Witness:
             return float(max(value, self.before[name]))
         return float(value)
 
+    def _most_limits(self, at_ns: int) -> dict[str, float]:
+        """Return all limits; shortly after a change the larger one of each two."""
+        if at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
+            return {name: max(value, self.before[name]) for name, value in self.limits.items()}
+        return self.limits
+
     def _limits(
         self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], dt: int, grows: bool
     ) -> None:
         if wheels[0] != wheels[3] or wheels[1] != wheels[2]:
             raise BrokenError("the wheels of a side turn alike", at_ns, str(wheels))
-        most = self._most("wheel_speed", at_ns) + 0.011
-        if max(map(abs, wheels)) > max(most, max(map(abs, before)) if not grows else 0.0):
+        limits, fastest = self._most_limits(at_ns), max(map(abs, wheels))
+        most = limits["wheel_speed"] + 0.011
+        if fastest > max(most, max(map(abs, before)) if not grows else 0.0):
             raise BrokenError("no wheel is over its limit", at_ns, f"{wheels} over {most:.2f}")
         (v, w), (v0, w0) = self.twist(wheels), self.twist(before)
         ev = self.radius * 0.011
         ew = self.radius * 0.011 / self.half
         seconds = min(dt / NS, max(0.05, 1.5 * self.period_ns / NS)) + 0.002
-        saturated = max(map(abs, wheels)) > self._most("wheel_speed", at_ns) - 0.1
+        saturated = fastest > limits["wheel_speed"] - 0.1
         spare = 1.0
         """By how much both speeds were scaled down together, at least, so that no wheel is over its
         limit. Before that, each of them was within its own limits."""
         axes: list[tuple[str, float, float, float]] = []
         for name, new, old, room in (("linear", v, v0, ev), ("angular", w, w0, ew)):
-            speed = self._most(f"{name}_speed", at_ns)
+            speed = limits[f"{name}_speed"]
             if abs(new) > max(speed, abs(old)) + room:
                 raise BrokenError("no speed is over its limit", at_ns, f"{name} {new:.4f}")
-            down = self._most(f"{name}_deceleration", at_ns)
+            down = limits[f"{name}_deceleration"]
             if self.mode in ("stopped", "fault", "shutdown"):
-                down = max(down, self._most(f"{name}_stop_deceleration", at_ns))
+                down = max(down, limits[f"{name}_stop_deceleration"])
             falls = down * (dt / NS + 0.002) + 2 * room
             lost = abs(old) - abs(new) if new * old >= 0 else abs(old)
             if lost > falls and not self.cut:
@@ -544,7 +551,7 @@ class Witness:
                 spare = max(spare, (abs(old) - falls) / max(abs(new), room))
             axes.append((name, new, old, room))
         for name, new, old, room in axes:
-            up = self._most(f"{name}_acceleration", at_ns)
+            up = limits[f"{name}_acceleration"]
             gained = spare * abs(new) - abs(old) if new * old >= 0 else abs(new)
             if gained > up * seconds + 2 * room * spare:
                 promise = "acceleration" if spare == 1.0 else "deceleration"

@@ -34,7 +34,7 @@ from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
-from tests.simulate.product import Disk, Seen, problems
+from tests.simulate.product import Disk, Product, Seen, problems
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.reasons import kind_of
 from tests.simulate.reports import Reports, judge_pose
@@ -725,6 +725,13 @@ def test_a_pair_goes_on_behind_a_broken_promise_and_ends_at_an_exception_of_the_
 
     monkeypatch.setattr(Run, "run_to", fails)
     assert Unjudged(quiet()).played() == "ZeroDivisionError: division by zero"
+
+
+def test_a_pair_does_not_measure_the_memory_of_a_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
+    # An older checkout measures it in another way.
+    monkeypatch.delattr(Product, "largest")
+    endless = {"at": 2.0, "for": 1.0, "do": "board", "fault": ["endless"]}
+    assert Unjudged(quiet_with(endless)).played() == ""
 
 
 def test_the_list_names_each_file_that_the_patch_for_the_older_checkout_changes() -> None:
