@@ -80,6 +80,8 @@ class VirtualPort:
         self._received.append(received)
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
+        if not self._received:
+            return ()
         got = tuple(self._received)
         self._received.clear()
         return got

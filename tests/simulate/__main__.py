@@ -22,6 +22,9 @@ from tests.simulate.plan import Plan, made
 
 HERE = Path(__file__).parent
 
+LARGEST = ("largest container", "largest text")
+"""Counts of which the table has the largest value of all runs, and not the sum."""
+
 MOST_SHRUNK = 3
 """Findings whose plans a run shrinks. To shrink one plan takes up to 400 runs of it."""
 
@@ -84,9 +87,10 @@ def explore(
         runs += 1
         simulated += result.simulated_s
         cpu += result.cpu_s
-        largest = max(counts["largest container"], result.counts["largest container"])
+        largest = {name: max(counts[name], result.counts[name]) for name in LARGEST}
         counts.update(result.counts)
-        counts["largest container"] = largest
+        for name, length in largest.items():
+            counts[name] = length
         if result.finding:
             broken.append(result)
             findings += 1

@@ -22,6 +22,7 @@ from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
 from tests.simulate.liveness import Liveness
+from tests.simulate.log_lines import LogLines
 from tests.simulate.plan import Plan
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import LIARS, PoseWitness
@@ -30,6 +31,14 @@ from tests.simulate.promises import DIALECTS, BrokenError, Witness
 from tests.simulate.reasons import Reasons
 from tests.simulate.reports import Echo, Reports, judge_pose, judge_state
 from tests.simulate.roads import NS, Message, messages, parameters, read_reply, sample
+from tests.simulate.spread import Spread
+
+RELEASING = {"clear", "activate", "deactivate", "set"}
+"""Calls that change what the robot may do, from when on is not known until the answer. A `stop`
+counts from its arrival on."""
+
+PLACING = {"set_pose", "reset_odometry"}
+"""Calls that set the pose."""
 
 
 class Result(NamedTuple):
@@ -78,6 +87,7 @@ class Run:
         """Monotonic time of the last resume: before it nothing can have arrived."""
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
+        self.spread, self.log_lines = Spread(self.witness), LogLines()
         self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
         self.counts: Counter[str] = self.witness.counts
@@ -93,6 +103,10 @@ class Run:
         self._numbers: dict[int, int] = {}
         """Numbers of latches that operators have read in `state`, each with the last time."""
         self.active: list[tuple[str, tuple[Any, ...]]] = []
+        self._names: set[str] = set()
+        """Names of the active faults."""
+        self._troubling: list[str] = []
+        """Names of those that came in this plan and are no dialect."""
         self._fed_ns = 0
         self._ended = b""
         """The last byte of the board that reached the daemon."""
@@ -103,6 +117,8 @@ class Run:
         self._stalled_ns = -NS
         self._full_ns = self._blocked_ns = -NS
         """When the disk was last seen full, and the output was last seen blocked."""
+        self._whole = False
+        """The last step sent a whole line."""
         self.epilogue = False
         self.moved_ns = -1
         self.product = Product(plan["config"], self._see)
@@ -159,7 +175,7 @@ class Run:
         plan, seen = self.plan, Counter[str]()
         self.lasting = [(name, tuple(values)) for name, *values in plan["board"]]
         self.active = list(self.lasting)
-        self.product.board(self.active)
+        self._board()
         for sender in plan["senders"]:
             self.counts[f"way {sender['way']}"] += 1
             for shape in sender["congestion"]:
@@ -325,7 +341,7 @@ class Run:
                 self.active.append(fault)
                 self._troubled(name)
                 self.witness.lying_ns = self.true_ns
-                product.board(list(self.active))
+                self._board()
                 if name == "echo":
                     self.echo.begin()
                 elif name == "mute":
@@ -375,10 +391,23 @@ class Run:
             if self.pose.latest is not None and not self._calls:
                 judge_pose(self.true_ns, state, self.pose.latest, self._fed_ns, quiet_ns)
 
+    def _weigh(self) -> None:
+        """Judge that a line without an end has not filled the memory."""
+        self.liveness.weigh()
+
     def _block(self, blocked: bool) -> None:
         self.liveness.event()
         self.product.block(blocked)
         self.witness.blocked_ns = self.true_ns if blocked else None
+
+    def _board(self) -> None:
+        """Have the board misbehave in all active ways."""
+        self.product.board(list(self.active))
+        self._names = {name for name, _ in self.active}
+        new = [one for one in self.active if one not in self.lasting]
+        self._troubling = [name for name, _ in new if name not in DIALECTS]
+        added = self.active[len(self.lasting) :]
+        self.witness.lies = [fault for fault in added if fault[0] not in DIALECTS]
 
     def _troubled(self, name: str) -> None:
         if name not in DIALECTS:
@@ -387,11 +416,13 @@ class Run:
             self.pose.doubt(name == "mute")
 
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
+        if fault[0] == "endless" and self.product.alive:
+            self._weigh()
         self.active.remove(fault)
         self.liveness.event()
         self._troubled(fault[0])
-        self.product.board(list(self.active))
-        self.echo.on = any(name == "echo" for name, _ in self.active)
+        self._board()
+        self.echo.on = "echo" in self._names
         if fault[0] == "echo" and self.product.plugged:
             # The daemon asks for this, and drives no more until it was done.
             self.product.unplug()
@@ -427,7 +458,13 @@ class Run:
         if event.get("stop"):
             product.stop_unseen()
             witness.stops.append(self.true_ns)
+        moving = witness.last
+        if event["way"] == "term":
+            witness.ending_ns = self.true_ns
         product.end(event["way"])
+        self._raise()
+        if self._whole:
+            witness.ended(self.true_ns, moving)
         self._take_answers()
         for call, arrived_ns, _ in self._calls.values():
             witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
@@ -449,6 +486,8 @@ class Run:
             self._linked = False
             witness.new_life(self.true_ns)
             self.reports, self.followed = Reports(), Followed(witness)
+            self.log_lines = LogLines()
+            self.spread.forget()
             self.pose.latest = None
             self.damage.forget()
             self.reasons.restart()
@@ -460,12 +499,13 @@ class Run:
 
     def _fed(self, at_ns: int, data: bytes) -> None:
         before, self._ended = self._ended, data[-1:]
-        if b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
+        if b"!acsard-mcu " in data and b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
             self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
-        self.damage.fed(data)
+        if self._plain:
+            self.damage.fed(data)
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
-        if any(name == "endless" for name, _ in self.active):
+        if "endless" in self._names:
             return
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
@@ -505,6 +545,10 @@ class Run:
                 text = f"{call['verb']} by {call['by']} came at {arrived_ns / NS:.3f} s"
                 raise BrokenError("every call has an answer", true_ns, text)
 
+    def _lines(self) -> int:
+        """Return the number of good lines that the daemon has counted."""
+        return int(self.product.state()["counters"]["lines"])
+
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
@@ -515,13 +559,15 @@ class Run:
         if self._calls:
             self._take_answers()
             self._late_answers(true_ns)
-        witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
-            self.pose.placed()
-        for fault in self.active:
-            if fault not in self.lasting and fault[0] not in DIALECTS:
-                witness.troubles[fault[0]] = true_ns
-        witness.lies = [f for f in self.active[len(self.lasting) :] if f[0] not in DIALECTS]
+            witness.pending = {}
+        if self._calls and self.product.disk.full:
+            waiting = {call["verb"]: at_ns for call, at_ns, _ in self._calls.values()}
+            witness.pending = {verb: waiting[verb] for verb in RELEASING & waiting.keys()}
+            if not PLACING.isdisjoint(waiting):
+                self.pose.placed()
+        for name in self._troubling:
+            witness.troubles[name] = true_ns
         if seen.followed_ns is not None:
             clock = self.reports.follows(true_ns, seen.followed_ns)
             if clock:
@@ -530,6 +576,7 @@ class Run:
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.linked = seen.link == "up"
         witness.cut |= not witness.linked
+        self._whole = bool(seen.lines) and seen.lines[-1][1].endswith(b"\n")
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             if witness.linked:  # the daemon that has lost the link believes no line
@@ -541,12 +588,18 @@ class Run:
         self.liveness.look(true_ns)
         self.reasons.look(true_ns, self._stalled_ns)
         if self._plain and not self.echo.on:
-            self.damage.look(true_ns, lambda: int(self.product.state()["counters"]["lines"]))
+            self.damage.look(true_ns, self._lines)
         if seen.estimates:
-            lies, truth = {name for name, _ in self.active}, self.product.truth()
+            lies, truth = self._names, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
+            if self._stalled_ns > true_ns - NS:
+                self.spread.forget()
+            for estimate in seen.estimates:
+                self.spread.see(true_ns, estimate, lies)
             witness.wheels(true_ns, truth[4])
-        self.pose.end_step()
+        if self.pose.end_step():
+            self.spread.forget()
+        self.log_lines.see(true_ns, seen)
         calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
         self.plugging.see(true_ns, seen, self.product, calm_ns)
         if self.log is not None:

@@ -23,6 +23,12 @@ MOST_HELD = 1500
 The largest one has the clocks of the last 1024 senders.
 """
 
+LONGEST = 1024
+"""Longest text or byte buffer that the daemon may hold.
+
+The longest one is a reason in words. A board sends more than that in 3.5 s without an end of line.
+"""
+
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
 
@@ -119,10 +125,7 @@ class Liveness:
         product.disk.fill(False)
         judge_counts(run.true_ns, product.state(), run.witness.delivered - product.dropped)
         run.reports.judge_junk(run.true_ns, product.state(), product.dropped)
-        size, kind = product.largest()
-        run.counts["largest container"] = max(run.counts["largest container"], size)
-        if size > MOST_HELD:
-            raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
+        self.weigh()
         boots_ns = int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS)
         # The last sender of a source keeps it for the source's timeout.
         run.run_to(run.true_ns + max(boots_ns, *run.witness.timeout.values()))
@@ -134,6 +137,17 @@ class Liveness:
                             "late": 0.0, "lost": False, "twice": False})  # fmt: skip
             run.run_to(run.true_ns + NS // 10)
         self._drive_lawfully()
+
+    def weigh(self) -> None:
+        """Judge that nothing in the daemon has grown too long."""
+        run = self.run
+        size, kind, longest = run.product.largest()
+        for name, length in (("container", size), ("text", longest)):
+            run.counts[f"largest {name}"] = max(run.counts[f"largest {name}"], length)
+        if size > MOST_HELD:
+            raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
+        if longest > LONGEST:
+            raise BrokenError("memory is bounded", run.true_ns, f"a text of {longest} bytes")
 
     def _drive_lawfully(self) -> None:
         run = self.run

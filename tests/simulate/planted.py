@@ -41,7 +41,7 @@ FIRST_SEED = 1
 
 MEASURED_WITH = (
     "plan", "roads", "actors", "ages", "course", "damage", "followed", "jerk", "liveness",
-    "plugging", "pose", "product", "promises", "reasons", "reports",
+    "log_lines", "plugging", "pose", "product", "promises", "reasons", "reports", "spread",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""
 

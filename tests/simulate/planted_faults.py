@@ -338,6 +338,13 @@ FAULTS = (
         "share = 1.0 - dt / (2 * seconds) if",
     ),
     fault(
+        "limits slow",
+        "a robot that follows a slower command falls by half of its deceleration",
+        LIMITS,
+        "if abs(target) > abs(speed) else axis.deceleration",
+        "if abs(target) > abs(speed) else axis.deceleration / 2",
+    ),
+    fault(
         "limits brake",
         "the robot always brakes by the stop deceleration",
         LIMITS,
@@ -513,6 +520,50 @@ FAULTS = (
         "if now_ns - made_ns > self._period_ns and",
         "if False and",
     ),
+    fault(
+        "lines endless",
+        "a line without an end fills the memory",
+        "core/link/lines.py",
+        "            if len(self._held) >= MAX_LINE:",
+        "            if False:",
+    ),
+    fault(
+        "loop periods",
+        "twice a second no line leaves for 60 ms",
+        LOOP,
+        "        if line is None:\n            return None\n        before_ns",
+        "        if line is None or now.mono_ns % 500_000_000 < 60_000_000:\n"
+        "            return None\n        before_ns",
+    ),
+    fault(
+        "loop end",
+        "SIGTERM ends the daemon while the robot moves",
+        LOOP,
+        "return outputs is not None and not any(outputs.speeds.as_tuple())",
+        "return outputs is not None",
+    ),
+    fault(
+        "robot end",
+        "the robot does not slow down on SIGTERM",
+        ROBOT,
+        "            self._life.leave()\n",
+        "            pass\n",
+    ),
+    # log
+    fault(
+        "log flooded",
+        "a client can fill the log",
+        "core/motion/event_throttle.py",
+        "BURST = 5",
+        "BURST = 500",
+    ),
+    fault(
+        "log modes",
+        "the log does not have the changes of the mode",
+        "core/motion/arbiter_text.py",
+        "        if mode is not before:\n",
+        "        if False:\n",
+    ),
     # sanity
     fault(
         "sanity evidence",
@@ -580,6 +631,14 @@ FAULTS = (
             "self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))",
             "self._gaps.interrupt(twist)",
         ),
+    ),
+    fault(
+        "odometry vague",
+        "the covariance of the pose is a hundred times as large as the errors",
+        "core/motion/uncertainty.py",
+        "published = PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)",
+        "published = PoseCovariance(\n"
+        "            *(100.0 * one for one in (xx, xy, xyaw, yy, yyaw, yawyaw))\n        )",
     ),
     fault(
         "odometry silent",

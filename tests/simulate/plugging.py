@@ -1,4 +1,4 @@
-"""The promises about a board that is unplugged and plugged in again.
+"""The promises about a board that is unplugged and plugged in again, and about one that stays.
 
 Times are in ns of the robot's monotonic clock, which stands while the host sleeps.
 """
@@ -16,6 +16,10 @@ FIRST_LINE_NS = NS // 2
 """The first line leaves within this time after the board was plugged in."""
 
 
+PERIODS = 2
+"""Two lines are at most this number of periods apart: one may be lost to a torn line."""
+
+
 class Plugging:
     """Judges what the daemon says and sends about the time at which the board comes and goes."""
 
@@ -23,6 +27,8 @@ class Plugging:
         self._period_ns = period_ns
         self._judged_ns = -1
         """The plugging of which the first line was judged."""
+        self._line_ns = -1
+        """When the last line was made, or the link was not up."""
 
     def see(self, true_ns: int, seen: Seen, product: Product, calm_ns: int) -> None:
         """Judge a step. At `calm_ns` the last stall of the host or of the output was over."""
@@ -33,6 +39,13 @@ class Plugging:
                 raise BrokenError("an unplugged board is seen", true_ns, text)
             return
         plugged_ns = product.plugged_ns
+        if seen.lines or seen.link != "up":
+            self._line_ns = seen.decided_ns
+        else:
+            late_ns = seen.decided_ns - max(self._line_ns, plugged_ns, calm_ns)
+            if late_ns > PERIODS * self._period_ns + SEEN_NS:
+                text = f"no line for {late_ns / NS:.3f} s"
+                raise BrokenError("a linked board gets a line in each period", true_ns, text)
         if plugged_ns == self._judged_ns:
             return
         # A line of which the kernel took only a part is not judged here.

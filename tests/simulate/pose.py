@@ -52,7 +52,7 @@ class PoseWitness:
         """The true pose at the last sample before a call, and the pose that the call has set."""
         self._asked_ns = 0
         """The time of that sample."""
-        self._room = 0.0
+        self._room = self._speed = 0.0
         self._last: tuple[int, Pose] | None = None
         self.latest: Pose | None = None
         """The pose of the last estimate, None if it was set since."""
@@ -93,6 +93,7 @@ class PoseWitness:
         """Judge the estimates of one step."""
         at_ns, x, y, yaw, _ = truth
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
+        self._speed = self._present_speed()
         lies = not LIARS.isdisjoint(faults)
         silent_only = not lies or faults & LIARS == {"mute"}
         if lies:
@@ -109,17 +110,19 @@ class PoseWitness:
         self.latest = ex, ey, eyaw
         if silent_only:
             last_ns = sampled_ns + offset_ns
-            self._before = last_ns, self.latest, (x, y, yaw), self.speed_at(last_ns), xx + yy
+            self._before = last_ns, self.latest, (x, y, yaw), self._speed, xx + yy
 
-    def end_step(self) -> None:
-        """Forget the pose if it was set in this step."""
-        if self._placed:
+    def end_step(self) -> bool:
+        """Forget the pose if it was set in this step, and return whether it was."""
+        placed = self._placed
+        if placed:
             last, asked = self._last, self._asked
             self._placed, self._asked, self.latest = False, None, None
             self.begin()
             true = None if last is None else self._true_at(last[0])
             if last is not None and true is not None and asked is not None:
                 self._expected, self._asked_ns = (true, asked), last[0]
+        return placed
 
     def _one(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
@@ -137,7 +140,7 @@ class PoseWitness:
         true = self._true_at(at_ns)
         if true is None:
             return
-        by_time = 0.1 * self.speed_at(at_ns)
+        by_time = 0.1 * self._speed
         if self._expected is not None:
             if at_ns - self._asked_ns < NS // 5:  # behind a silence nobody knows the way since
                 self._put(now_ns, self._expected, true, pose, by_time)
@@ -201,8 +204,8 @@ class PoseWitness:
             text = f"{expected[1]} was asked for, and {pose} is {off:.3f} m, {turned:.3f} rad off"
             raise BrokenError("the pose is put where a call asks for it", now_ns, text)
 
-    def speed_at(self, at_ns: int) -> float:
-        """Return the true speed about then, m/s, with that of the rim in a turn."""
+    def _present_speed(self) -> float:
+        """Return the true speed now, m/s, with that of the rim in a turn."""
         if len(self._true) < 2:
             return 0.0
         (t0, a), (t1, b) = self._true[-2], self._true[-1]

@@ -65,6 +65,8 @@ class Seen(msgspec.Struct, frozen=True, gc=False):
     lines: list[tuple[int, bytes]]
     """Lines that went to the board since the step before, each with its time."""
     estimates: Sequence[Estimate]
+    events: Sequence[tuple[str, str, str]] = ()
+    """Name, level and text of each line of the log."""
 
 
 def problems(config: dict[str, Any]) -> list[str]:
@@ -201,7 +203,9 @@ class Product:
             if self.echo:
                 for _, line in lines:
                     world.port.feed(Received(world.instant, line))
+        events: list[tuple[str, str, str]] = []
         if world.events:
+            events = [(event.name, event.level, event.text) for event in world.events]
             world.events.clear()
         estimates = [_plain(one) for one in outputs.estimates] if outputs.estimates else NONE
         self._see(
@@ -214,6 +218,7 @@ class Product:
                 outputs.link,
                 lines,
                 estimates,
+                events,
             )
         )
 
@@ -452,17 +457,24 @@ class Product:
         self._world, self.alive = world, True
         self._began()
 
-    def largest(self) -> tuple[int, str]:
-        """Return the length and the type of the largest container that the daemon holds."""
+    def largest(self) -> tuple[int, str, int]:
+        """Return the length and the type of the largest container that the daemon holds.
+
+        The last number is the length of its longest text or byte buffer.
+        """
         seen: set[int] = set()
         todo: deque[object] = deque([self._world.loop])
-        best = (0, "")
+        best, longest = (0, ""), 0
         while todo:
             one = todo.pop()
             if id(one) in seen:
                 continue
             seen.add(id(one))
-            if isinstance(one, dict):
+            if isinstance(one, Arrival):
+                continue  # only the messages of the last step are kept, as they came
+            if isinstance(one, str | bytes | bytearray):
+                longest = max(longest, len(one))
+            elif isinstance(one, dict):
                 best = max(best, (len(one), "dict"))
                 todo.extend(one.values())
             elif isinstance(one, list | tuple | set | deque):
@@ -472,4 +484,4 @@ class Product:
                 slots = getattr(type(one), "__struct_fields__", ())
                 todo.extend(getattr(one, name) for name in slots)
                 todo.extend(getattr(one, "__dict__", {}).values())
-        return best
+        return *best, longest

@@ -35,6 +35,12 @@ The board's own watchdog stops the motors before that.
 LATE_NS = 150_000_000
 """Allowed beyond a ramp from the speeds that were seen at its beginning."""
 
+END_NS = NS
+"""An orderly end takes at most this time."""
+
+RAMPS_NS = NS // 2
+"""A ramp of an orderly end that takes at most this time is not cut short."""
+
 STAND_NS = 2 * NS
 """After a ramp to rest: time for motors with a lag of 0.4 s to stand."""
 
@@ -117,6 +123,8 @@ class Witness:
         """Arrivals of each `deactivate` that no `activate` has released."""
         self.dormant_ns: int | None = None
         """Start of a daemon that waits for its first `activate`."""
+        self.ending_ns: int | None = None
+        """When the daemon got SIGTERM."""
         self.fault_ns: int | None = None
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
@@ -142,8 +150,9 @@ class Witness:
         """The daemon says that the link to the board is up."""
         self.cut = False
         """The link was lost since the last line, so the speed starts over from zero."""
-        self.pending = False
-        """An answer waits for the disk, so it is not known yet what is in force."""
+        self.pending: dict[str, int] = {}
+        """The arrival of the latest call of each verb that waits for the disk with its answer, so
+        it is not known yet whether it is in force."""
         self.mode = self.reason = ""
         self._decoded: dict[bytes, tuple[float, ...]] = {}
         self.new_life(0)
@@ -176,6 +185,7 @@ class Witness:
         self.delivered = 0
         if not self.config["control"].get("auto_activate", True):
             self.dormant_ns = at_ns
+        self.ending_ns = None
         self.mode = ""
 
     def command(
@@ -292,10 +302,11 @@ class Witness:
             case "stop":
                 self.stops = [at_ns for at_ns in self.stops if at_ns != arrived_ns]
             case "clear":
-                self.stops.clear()
-                self.fault_ns = None
+                self.stops = [at_ns for at_ns in self.stops if at_ns > arrived_ns]
+                if self.fault_ns is not None and self.fault_ns <= arrived_ns:
+                    self.fault_ns = None
             case "activate":
-                self.offs.clear()
+                self.offs = [at_ns for at_ns in self.offs if at_ns > arrived_ns]
             case "set":
                 for key, value in settings.items():
                     name = key.removeprefix("limits.")
@@ -360,7 +371,41 @@ class Witness:
             found.append((self.offs[0], "being switched off"))
         if self.dormant_ns is not None:
             found.append((self.dormant_ns, "being switched off"))
+        if self.ending_ns is not None:
+            found.append((self.ending_ns, "SIGTERM"))
         return min(found, default=None)
+
+    @property
+    def _surely_held(self) -> tuple[int, str] | None:
+        """Return the same, but without what a call that waits for the disk may have released."""
+        if not self.pending:
+            return self.held
+        cleared_ns, active_ns = self.pending.get("clear", -1), self.pending.get("activate", -1)
+        found = [(at_ns, "a stop") for at_ns in self.stops if at_ns > cleared_ns]
+        if self.fault_ns is not None and self.fault_ns > cleared_ns:
+            found.append((self.fault_ns, "a fault"))
+        found += [(at_ns, "being switched off") for at_ns in self.offs if at_ns > active_ns]
+        if self.dormant_ns is not None and self.dormant_ns > active_ns:
+            found.append((self.dormant_ns, "being switched off"))
+        if self.ending_ns is not None:
+            found.append((self.ending_ns, "SIGTERM"))
+        return min(found, default=None)
+
+    def ended(self, at_ns: int, moving: tuple[float, ...]) -> None:
+        """Judge an orderly end, which began with these wheel speeds and is over now.
+
+        It may cut the ramp short, but only one that takes longer than this end may.
+        """
+        begun_ns = self.ending_ns
+        if begun_ns is None or self.blocked_ns is not None or self._stalled[1] > begun_ns:
+            return
+        if at_ns - begun_ns > END_NS:
+            text = f"SIGTERM came at {begun_ns / NS:.3f} s"
+            raise BrokenError("an orderly end takes at most a second", at_ns, text)
+        due_ns = self.ramp_ns(True, moving) + LATE_NS + self.period_ns
+        if self.last != ZERO and self.linked and due_ns < RAMPS_NS:
+            text = f"{self.last} is the last line, and the ramp takes {due_ns / NS:.3f} s"
+            raise BrokenError("the last line of an orderly end is a zero", at_ns, text)
 
     def line(self, at_ns: int, line: bytes, fed_ns: int, made_ns: int) -> None:
         """Judge a line on the wire.
@@ -393,9 +438,9 @@ class Witness:
             abs(new) > abs(old) + 0.001 or new * old < 0.0
             for new, old in zip(wheels, before, strict=True)
         )
-        if not self.pending:
+        if "set" not in self.pending:
             self._limits(at_ns, wheels, before, made_ns - last_ns, grows)
-        held = None if self.pending else self.held
+        held = self._surely_held
         if held is None:
             self.braking = None
         else:
@@ -464,30 +509,37 @@ class Witness:
             return float(max(value, self.before[name]))
         return float(value)
 
+    def _most_limits(self, at_ns: int) -> dict[str, float]:
+        """Return all limits; shortly after a change the larger one of each two."""
+        if at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
+            return {name: max(value, self.before[name]) for name, value in self.limits.items()}
+        return self.limits
+
     def _limits(
         self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], dt: int, grows: bool
     ) -> None:
         if wheels[0] != wheels[3] or wheels[1] != wheels[2]:
             raise BrokenError("the wheels of a side turn alike", at_ns, str(wheels))
-        most = self._most("wheel_speed", at_ns) + 0.011
-        if max(map(abs, wheels)) > max(most, max(map(abs, before)) if not grows else 0.0):
+        limits, fastest = self._most_limits(at_ns), max(map(abs, wheels))
+        most = limits["wheel_speed"] + 0.011
+        if fastest > max(most, max(map(abs, before)) if not grows else 0.0):
             raise BrokenError("no wheel is over its limit", at_ns, f"{wheels} over {most:.2f}")
         (v, w), (v0, w0) = self.twist(wheels), self.twist(before)
         ev = self.radius * 0.011
         ew = self.radius * 0.011 / self.half
         seconds = min(dt / NS, max(0.05, 1.5 * self.period_ns / NS)) + 0.002
-        saturated = max(map(abs, wheels)) > self._most("wheel_speed", at_ns) - 0.1
+        saturated = fastest > limits["wheel_speed"] - 0.1
         spare = 1.0
         """By how much both speeds were scaled down together, at least, so that no wheel is over its
         limit. Before that, each of them was within its own limits."""
         axes: list[tuple[str, float, float, float]] = []
         for name, new, old, room in (("linear", v, v0, ev), ("angular", w, w0, ew)):
-            speed = self._most(f"{name}_speed", at_ns)
+            speed = limits[f"{name}_speed"]
             if abs(new) > max(speed, abs(old)) + room:
                 raise BrokenError("no speed is over its limit", at_ns, f"{name} {new:.4f}")
-            down = self._most(f"{name}_deceleration", at_ns)
+            down = limits[f"{name}_deceleration"]
             if self.mode in ("stopped", "fault", "shutdown"):
-                down = max(down, self._most(f"{name}_stop_deceleration", at_ns))
+                down = max(down, limits[f"{name}_stop_deceleration"])
             falls = down * (dt / NS + 0.002) + 2 * room
             lost = abs(old) - abs(new) if new * old >= 0 else abs(old)
             if lost > falls and not self.cut:
@@ -499,7 +551,7 @@ class Witness:
                 spare = max(spare, (abs(old) - falls) / max(abs(new), room))
             axes.append((name, new, old, room))
         for name, new, old, room in axes:
-            up = self._most(f"{name}_acceleration", at_ns)
+            up = limits[f"{name}_acceleration"]
             gained = spare * abs(new) - abs(old) if new * old >= 0 else abs(new)
             if gained > up * seconds + 2 * room * spare:
                 promise = "acceleration" if spare == 1.0 else "deceleration"
@@ -514,7 +566,7 @@ class Witness:
         saturated = max(map(abs, wheels)) > rim - STEP or _fastest(self.last) > rim - STEP
         # A line that goes at once, or late, belongs to a step of another length than its interval.
         uneven = abs(dt - self.period_ns) > self.period_ns // 20
-        lost = saturated or self.cut or self.pending or uneven
+        lost = saturated or self.cut or "set" in self.pending or uneven
         room = 0.51 * STEP * self.radius
         slopes = iter(self._slopes)
         axes = zip(("linear", "angular"), self.twist(wheels), (room, room / self.half), strict=True)
@@ -573,9 +625,9 @@ class Witness:
         """Judge the true wheels: those of a robot that is held must stand in the end."""
         if self.last == ZERO and fastest < 1.0:
             self.rested_ns = at_ns
-        if fastest < 0.5 or self.pending:
+        if fastest < 0.5:
             return
-        held = self.held
+        held = self._surely_held
         if held is None:
             return
         since_ns, why = held
@@ -636,7 +688,7 @@ class Witness:
                 if armed_ns < self.armed_since_ns:
                     why = f"{source} by {wish.identity} is not armed"
                     continue
-            if not grows or self.pending or self._leads(wish, wheels, before):
+            if not grows or "set" in self.pending or self._leads(wish, wheels, before):
                 return wish, ""
             why = f"{source} by {wish.identity} wishes {wish.v:g}, {wish.w:g}"
         return None, why

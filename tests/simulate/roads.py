@@ -10,6 +10,7 @@ import json
 import math
 import random
 import struct
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import msgspec
@@ -168,7 +169,7 @@ def sample(
                 | ({"steady": True} if way in STEADY else {})
             )
         case "rmw":
-            gid = hashlib.sha256(own.encode()).digest()[:16]
+            gid = _gid(own)
             options["attachment"] = struct.pack(
                 "<qqB16s", message.number, min(message.stamp_ns, LAST_STAMP), 16, gid
             )
@@ -191,6 +192,11 @@ def sample(
     options.update(via=via, session=session, stamp_ns=stamp_ns)
     key, payload = _payload(sender, message, config, via, options)
     return Sample(key, payload, options, identity, shared, clock)
+
+
+@lru_cache(64)
+def _gid(own: str) -> bytes:
+    return hashlib.sha256(own.encode()).digest()[:16]
 
 
 def _payload(

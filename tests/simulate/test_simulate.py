@@ -24,19 +24,22 @@ from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
 from tests.simulate.ages import Ages
+from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.differences import CORRECTED, REWORDED
 from tests.simulate.followed import Followed
 from tests.simulate.jerk import Slope
+from tests.simulate.log_lines import LogLines
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
-from tests.simulate.product import Disk, Seen, problems
+from tests.simulate.product import Disk, Product, Seen, problems
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.reasons import kind_of
 from tests.simulate.reports import Reports, judge_pose
 from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
+from tests.simulate.spread import Spread
 from tests.simulate.unjudged import Unjudged
 
 ODD = {"odd configuration", "extreme timing", "other vehicle", "other dialect"}
@@ -317,6 +320,90 @@ def test_a_stop_that_had_no_answer_may_be_gone_after_a_restart() -> None:
     assert witness.stops == [2 * NS]
 
 
+@pytest.mark.parametrize("pending", [True, False])
+def test_a_clear_without_an_answer_releases_no_stop_that_came_behind_it(pending: bool) -> None:
+    witness = witnessed()
+    witness.stops += [2 * NS, 5 * NS]
+    if pending:
+        witness.pending = {"clear": 3 * NS}
+    else:
+        witness.unanswered("clear", {}, 3 * NS)
+    with pytest.raises(BrokenError, match="nothing moves after a stop"):
+        moves(witness, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("began", "took_s", "promise"),
+    [
+        (1.0, 0.2, "the last line of an orderly end is a zero"),
+        (99.0, 0.6, ""),
+        (99.0, 1.1, "an orderly end takes at most a second"),
+    ],
+)
+def test_an_orderly_end_is_short_and_its_last_line_is_a_zero(
+    began: float, took_s: float, promise: str
+) -> None:
+    witness = witnessed()
+    fast = began * 0.1 * witness.limits["linear_stop_deceleration"] / witness.radius
+    witness.ending_ns, witness.last = NS, (0.1,) * 4
+    with pytest.raises(BrokenError, match=promise) if promise else nullcontext():
+        witness.ended(NS + int(took_s * NS), (fast,) * 4)
+
+
+def test_a_robot_that_speeds_up_after_sigterm_is_a_finding() -> None:
+    witness = witnessed()
+    witness.ending_ns = NS
+    with pytest.raises(BrokenError, match="nothing moves after SIGTERM"):
+        moves(witness, 1.1)
+
+
+@pytest.mark.parametrize(
+    ("share", "every", "finding"), [(1.0, 1, False), (0.5, 1, True), (0.5, 6, False)]
+)
+def test_a_ramp_with_all_its_lines_that_takes_twice_as_long_is_a_finding(
+    share: float, every: int, finding: bool
+) -> None:
+    witness = witnessed()
+    witness.limits["wheel_speed"] = witness.limits["linear_speed"] = 99.0
+    course, fall = Course(witness), witness.limits["linear_deceleration"]
+    wheel = 1.0 * fall / witness.radius
+    with pytest.raises(BrokenError, match="a ramp ends in time") if finding else nullcontext():
+        for n in range(0, 200, every):
+            speed = max(0.5 * wheel, wheel * (1 - n * 0.01 * share))
+            course.step(n * NS // 100, (0.5 * fall, 0.0), (speed,) * 4, 1)
+
+
+@pytest.mark.parametrize(("factor", "finding"), [(1.0, False), (100.0, True)])
+def test_a_covariance_that_no_motion_explains_is_a_finding(factor: float, finding: bool) -> None:
+    spread = Spread(Witness(PLAIN["config"]))
+    with pytest.raises(BrokenError, match="grows by motion only") if finding else nullcontext():
+        for n in range(1000):
+            x = 0.005 * n
+            place, yaw = factor * 1e-4 * x, factor * 1e-4 * x
+            covariance = (place, 0.0, 0.0, place + yaw * x * x / 3, 0.0, yaw)
+            spread.see(2 * NS, (n * NS // 100, x, 0.0, 0.0, covariance, ()), set())
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "name", "promise"),
+    [
+        ((0, 0, 0, 0, 0, 1000, 2000), "fault", ""),
+        ((0, 0, 0, 0, 0, 10, 20), "fault", "the log is not flooded"),
+        ((0, 7000), "fault", "a change of the mode is logged"),
+        ((0, 7000), "mode", ""),
+    ],
+)
+def test_the_judge_of_the_log_counts_its_lines_and_wants_each_mode_there(
+    times_ms: tuple[int, ...], name: str, promise: str
+) -> None:
+    log = LogLines()
+    log.see(0, Seen(0, 0, "ready", "a reason", None, "up", [], []))
+    with pytest.raises(BrokenError, match=promise) if promise else nullcontext():
+        for at_ms in times_ms:
+            at_ns, line = at_ms * NS // 1000, (name, "info", "ready -> driving: so")
+            log.see(at_ns, Seen(at_ns, at_ns, "driving", "", None, "up", [], [], [line]))
+
+
 @pytest.mark.parametrize(
     ("words", "kind"),
     [
@@ -487,6 +574,8 @@ class Board(NamedTuple):
         ("up", 31, None, "an unplugged board is seen"),
         ("down", 9000, None, ""),
         ("stale", 499, b"", ""),
+        ("up", 41, b"", "a linked board gets a line in each period"),
+        ("up", 39, b"", ""),
         ("stale", 501, b"", "a board that is plugged in gets a line"),
         ("stale", 501, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", ""),
         ("stale", 9, b"ap00.00,bp00.01,cp00.01,dp00.00\r\n", "the first line is a zero"),
@@ -636,6 +725,13 @@ def test_a_pair_goes_on_behind_a_broken_promise_and_ends_at_an_exception_of_the_
 
     monkeypatch.setattr(Run, "run_to", fails)
     assert Unjudged(quiet()).played() == "ZeroDivisionError: division by zero"
+
+
+def test_a_pair_does_not_measure_the_memory_of_a_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
+    # An older checkout measures it in another way.
+    monkeypatch.delattr(Product, "largest")
+    endless = {"at": 2.0, "for": 1.0, "do": "board", "fault": ["endless"]}
+    assert Unjudged(quiet_with(endless)).played() == ""
 
 
 def test_the_list_names_each_file_that_the_patch_for_the_older_checkout_changes() -> None:

@@ -41,6 +41,8 @@ class Unjudged(Run):
 
     def _look(self) -> None: ...
 
+    def _weigh(self) -> None: ...
+
     def _take_answers(self) -> None:
         for ticket, _ in self.product.replies():
             self._calls.pop(ticket, None)

@@ -1,0 +1,51 @@
+"""The promises about the lines of the log: what is logged, and that nothing floods the log.
+
+`deploy/systemd/README.md` has them. Times are in ns of the robot's monotonic clock.
+"""
+
+from __future__ import annotations
+
+from tests.simulate.product import Seen
+from tests.simulate.promises import BrokenError
+from tests.simulate.roads import NS
+
+BURST = 5
+"""Lines of one name that may come at once. From then on one comes in each second."""
+
+LATE_NS = 6 * NS
+"""A change may be logged this late: after a burst, repetitions wait until it is paid for."""
+
+LEVELS = {"info", "warning", "error"}
+
+
+class LogLines:
+    """The lines of one daemon's log."""
+
+    def __init__(self) -> None:
+        self._paid_ns: dict[str, int] = {}
+        """Time at which the lines of each name are paid for, at a second each."""
+        self._mode = self._awaited = ""
+        """The mode, and the words of a line that the log lacks."""
+        self._since_ns = 0
+        """Since when it lacks them."""
+
+    def see(self, true_ns: int, seen: Seen) -> None:
+        """Judge the lines of one step."""
+        now_ns = seen.decided_ns
+        if seen.mode != self._mode:
+            # The first mode of a daemon is no change.
+            self._awaited = f"-> {seen.mode}" if self._mode else ""
+            self._mode, self._since_ns = seen.mode, now_ns
+        for name, level, text in seen.events:
+            paid_ns = max(self._paid_ns.get(name, 0), now_ns)
+            self._paid_ns[name] = paid_ns + NS
+            if paid_ns - now_ns > BURST * NS:
+                text = f"{name} more than {BURST} times at once: {text}"
+                raise BrokenError("the log is not flooded", true_ns, text)
+            if level not in LEVELS or not text or "\n" in text:
+                raise BrokenError("every line of the log has a text", true_ns, f"{name}: {text!r}")
+            if name == "mode" and self._awaited in text:
+                self._awaited = ""
+        if self._awaited and now_ns - self._since_ns > LATE_NS:
+            text = f"no line has {self._awaited!r}"
+            raise BrokenError("a change of the mode is logged", true_ns, text)

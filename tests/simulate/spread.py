@@ -1,0 +1,79 @@
+"""The upper bound of the pose's covariance: it grows by no more than the motion explains.
+
+A covariance that is too small is a broken promise of `pose.py`. One that is far too large makes a
+filter ignore the odometry. The error rates of `[odometry]` bound the growth from one estimate to
+the next, by the distance and the turn between them.
+"""
+
+from __future__ import annotations
+
+import math
+
+from tests.simulate.promises import DIALECTS, BrokenError, Witness
+from tests.simulate.roads import NS
+
+Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
+
+ROOM = 3.0
+"""Factor allowed beside the bound. It covers terms of second order and the shape of a path."""
+
+COUNTS_M2, COUNTS_RAD2 = 1e-4, 1e-3
+"""Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn."""
+
+CALM_NS = NS
+"""For this time after trouble the wheels of a side may still seem to slip."""
+
+LEAST_NS = 12_000_000
+"""The lines of a board that answers each line come in at least this period."""
+
+
+class Spread:
+    """The highest variances that the motion since an anchor explains."""
+
+    def __init__(self, witness: Witness) -> None:
+        config = witness.config
+        odometry = config.get("odometry", {})
+        self._by_metre = odometry.get("distance_variance_per_metre", 1e-4)
+        self._yaw_by_metre = odometry.get("yaw_variance_per_metre", 1e-4)
+        self._yaw_by_radian = odometry.get("yaw_variance_per_radian", 1e-2)
+        self._judged = not odometry.get("gyro")
+        self._track = 2 * witness.half
+        every_s = max(witness.period_ns / NS, config["mcu"].get("reply_period", 0.0))
+        self._longest_ns = 2 * max(int(every_s * NS), LEAST_NS)
+        """A longer time between two estimates is a gap, in which the covariance grows faster."""
+        self._calm_ns = 0
+        self._last: Estimate | None = None
+        self._place = self._yaw = 0.0
+        """Standard deviation of the position, m, and of the heading, rad: the bounds."""
+
+    def forget(self) -> None:
+        """Note that the next estimate has another covariance for another reason than motion."""
+        self._last = None
+
+    def see(self, now_ns: int, estimate: Estimate, faults: set[str]) -> None:
+        """Judge an estimate while the board has these faults."""
+        if not self._judged:
+            return
+        if not faults <= DIALECTS:
+            self._calm_ns = now_ns + CALM_NS
+        last, self._last = self._last, estimate
+        _, x, y, yaw, (xx, _, _, yy, _, yawyaw), _ = estimate
+        if last is None or now_ns < self._calm_ns or estimate[0] - last[0] > self._longest_ns:
+            self._place, self._yaw = math.sqrt(xx + yy), math.sqrt(yawyaw)
+            return
+        way = math.hypot(x - last[1], y - last[2])
+        turn = abs(math.remainder(yaw - last[3], math.tau))
+        # The rates are of a robot as a whole. Those of its two sides have twice the sum at most.
+        rolled = 2 * way + self._track * turn / 2
+        place = self._place + way * self._yaw
+        self._place = math.sqrt(place**2 + self._by_metre * rolled)
+        self._yaw = math.sqrt(
+            self._yaw**2 + self._yaw_by_metre * rolled + self._yaw_by_radian * turn
+        )
+        wide = xx + yy > ROOM * self._place**2 + COUNTS_M2
+        if wide or yawyaw > ROOM * self._yaw**2 + COUNTS_RAD2:
+            raise BrokenError(
+                "the covariance grows by motion only", now_ns,
+                f"variances {xx + yy:.3g} m2 and {yawyaw:.3g} rad2, "
+                f"the motion explains {self._place**2:.3g} m2 and {self._yaw**2:.3g} rad2",
+            )  # fmt: skip
