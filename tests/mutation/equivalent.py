@@ -60,7 +60,7 @@ EQUIVALENT: dict[str, str] = {
     "acsard/core/motion/sanity.py Sanity._objection: 'if size <= fastest and change <= most:' -> 'if size <= fastest and change < most:'": "only saves work: the conditions below hold no more then",
     "acsard/core/motion/sanity.py Sanity.watch: 'share = dt / (response + dt) if dt else 0.0' -> 'share = dt / (response + dt)'": "response_time is at least 0.01",
     "acsard/core/motion/sanity.py _Wheel.signs: 'moving and speed * expected < 0 and (turns > 0.3 * size), fas' -> 'moving and speed * expected < -1 and (turns > 0.3 * size), fas'": "|expected| > 2 and |speed| > 0.6: their product is not between -1 and 0",
-    "acsard/core/motion/sanity.py _Wheel.signs: 'return (moving and turns < 0.1 * size, moving and speed * expected < 0 and (turns > 0.3' -> 'return (moving and turns < 0.1 * size, moving and speed / expected < 0 and (turns > 0.3'": "the quotient has the sign of the product, and `moving` excludes 0",
+    "acsard/core/motion/sanity.py _Wheel.signs: '.1 * least), moving and speed * expected < 0 and (turns > 0.3' -> '.1 * least), moving and speed / expected < 0 and (turns > 0.3'": "the quotient has the sign of the product, and `moving` excludes 0",
     "acsard/core/motion/lifecycle.py : 'LONG_AGO_NS = -2 ** 62' -> 'LONG_AGO_NS = -2 ** 47'": "before every monotonic time all the same",
     "acsard/core/motion/lifecycle.py : 'LONG_AGO_NS = -2 ** 62' -> 'LONG_AGO_NS = -2 ** 77'": "before every monotonic time all the same",
     "acsard/core/motion/lifecycle.py : 'LONG_AGO_NS = -2 ** 62' -> 'LONG_AGO_NS = -3 ** 62'": "before every monotonic time all the same",

@@ -184,7 +184,11 @@ CORRECTED: tuple[tuple[str, tuple[str, ...]], ...] = (
         "drives",
         (MOTION + "arbiter.py",),
     ),
-    ("one feedback line after a stall proves no wheel fault", (MOTION + "sanity.py",)),
+    (
+        "neither one feedback line after a stall nor a wheel that follows sooner than its response "
+        "time is a wheel fault",
+        (MOTION + "sanity.py",),
+    ),
     (
         "a board that answers each line again is assigned no line from before it seemed to report",
         (LINK + "clock_of_answers.py", LINK + "feedback.py"),

@@ -576,8 +576,8 @@ FAULTS = (
         "sanity dead",
         "a healthy wheel that follows its command slowly is called dead",
         SANITY,
-        "moving and turns < 0.1 * size,",
-        "moving and turns < 0.97 * size,",
+        "moving and least > SLACK and turns < 0.1 * least,",
+        "moving and least > SLACK and turns < 0.97 * least,",
     ),
     # bus
     fault(

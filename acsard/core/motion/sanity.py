@@ -97,12 +97,14 @@ class _Wheel:
         if slowing or not fast:
             self.slowest = turns
         moving = size > SLACK and expected * told > 0
+        # A wheel that slows down to its command sooner than `response_time` says is not dead.
+        least = min(size, abs(told))
         constant = constant and driven and speed != 0.0
         return (
-            moving and turns < 0.1 * size,
+            moving and least > SLACK and turns < 0.1 * least,
             moving and speed * expected < 0 and turns > 0.3 * size,
             fast and not slowing,
-            constant and abs(speed - expected) > SLACK + 0.3 * most,
+            constant and min(abs(speed - expected), abs(speed - told)) > SLACK + 0.3 * most,
         )
 
 

@@ -451,6 +451,23 @@ def test_a_wheel_that_is_sooner_than_it_was_said_to_be_is_no_fault(sign: float) 
             assert sanity.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_wheel_that_slows_to_a_creep_sooner_than_it_was_said_to_is_not_dead(sign: float) -> None:
+    """A coarse encoder reports a speed below one count per line as zero."""
+    sanity = Sanity(FeedbackConfig(response_time=2.0))
+    for told, reported in ((sign * 20.0, sign * 20.0), (sign * 0.6, 0.0)):
+        for step in range(1000):
+            seen = WheelSpeeds(*(reported and reported + step % 2 / 10 for _ in WHEELS))
+            assert sanity.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
+
+
+def test_a_wheel_at_its_command_sooner_than_it_was_said_to_is_not_stuck() -> None:
+    """A coarse encoder reports one and the same speed for several lines."""
+    sanity = Sanity(FeedbackConfig(response_time=2.0))
+    for _ in range(1000):
+        assert sanity.watch(WheelSpeeds(*[13.7] * 4), WheelSpeeds(*[13.7] * 4), DT) == ""
+
+
 def test_a_healthy_wheel_is_expected_to_follow_by_its_response_time() -> None:
     # Each step covers a sixth of the way. After the second step the model has 10 (1 - (5/6)^2) =
     # 3.06 rad/s, over 2 rad/s. Eight more steps of 1/16 s then exceed half a second.
