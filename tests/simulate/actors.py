@@ -385,7 +385,10 @@ class Run:
     def _look(self) -> None:
         """Judge what `state` says, unless the daemon has just slept or stood still."""
         product, since_ns = self.product, self.true_ns - NS // 10
-        if product.alive and self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
+        # An echo of zeros looks like a board at rest.
+        if self.echo.on or not product.alive:
+            return
+        if self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
             state, quiet_ns = product.state(), self.witness.quiet_ns
             judge_state(self.true_ns, state, self._fed_ns, quiet_ns)
             if self.pose.latest is not None and not self._calls:

@@ -108,7 +108,7 @@ class Reasons:
     def command(self, sender: dict[str, Any], message: Message, one: Sample) -> None:
         """Take note of a command that the witness has noted just before."""
         source = sender["source"]
-        if message.junk:
+        if message.junk or sender.get("bad_stamps"):
             self._junk.add(source)
         if message.junk not in ("", "cancels") or sender["churn"]:
             return
