@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from acsard.core.formatting import many
 from acsard.core.link.link_diagnosis import is_ours
-from acsard.core.values import Event
+from acsard.core.values import Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
@@ -79,6 +79,10 @@ class TimelineWriter:
         self._distance_m = 0.0
         """Distance of the present drive."""
         self._source = ""
+        self._since = ""
+        """Words for a drive that began before the first step; "" for any other drive."""
+        self._now: Instant | None = None
+        """Time of the last step."""
         self._shutting_down = False
         self._losses = LinkLosses()
 
@@ -91,8 +95,8 @@ class TimelineWriter:
             missing = step.number - self._number - 1
             gap = f"{many(missing, 'step is', 'steps are')} missing before this one"
             yield TimelineEntry(wall_s, "gap", gap, "warning")
-        self._number = step.number
         yield from self._drive(step, wall_s)
+        self._number, self._now = step.number, step.inputs.now
         for event in step.recorded.events:
             entry = entry_of(event, step.inputs.now.wall_ns)
             repeated = self._losses.repeated(entry.name)
@@ -112,11 +116,22 @@ class TimelineWriter:
         if mode == "driving":
             if self._began_ns is None:
                 self._began_ns, self._distance_m, self._source = now_ns, 0.0, source
+                seen = self._number is not None or step.number == 0
+                self._since = "" if seen else ", counted from the beginning of this recording"
         elif self._began_ns is not None:
-            seconds = (now_ns - self._began_ns) / 1e9
-            text = f"drove {self._distance_m:.2f} m in {seconds:.1f} s"
+            text = f"drove {self._driven(now_ns)}{self._since}"
             yield TimelineEntry(wall_s, "drive", text, by=self._source)
             self._began_ns = None
+
+    def end(self) -> Iterator[TimelineEntry]:
+        """Yield the entry of a drive that goes on at the last step, if there is one."""
+        if self._began_ns is not None and self._now is not None:
+            text = f"was driving, {self._driven(self._now.mono_ns)} so far{self._since}"
+            yield TimelineEntry(self._now.wall_ns / 1e9, "drive", text, by=self._source)
+
+    def _driven(self, now_ns: int) -> str:
+        seconds = (now_ns - (self._began_ns or now_ns)) / 1e9
+        return f"{self._distance_m:.2f} m in {seconds:.1f} s"
 
 
 INCIDENTS = {

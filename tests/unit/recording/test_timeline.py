@@ -39,6 +39,24 @@ def test_the_timeline_has_the_start_each_drive_and_the_end() -> None:
     assert [one.seconds for one in told] == sorted(one.seconds for one in told)
 
 
+def test_a_drive_that_goes_on_at_the_last_step_has_an_entry() -> None:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, seconds=1.3)
+    writer, steps = TimelineWriter(), decode(encode(0, tape.taken))
+    assert not [one for step in steps for one in writer.step(step) if one.name == "drive"]
+    (drive,) = writer.end()
+    assert (drive.name, drive.by, drive.text[:13]) == ("drive", "app", "was driving, ")
+    assert drive.text.endswith(" m in 1.3 s so far")
+    assert drive.seconds == steps[-1].inputs.now.wall_ns / 1e9
+
+
+def test_a_drive_that_has_ended_has_no_second_entry() -> None:
+    tape, writer = driven(), TimelineWriter()
+    for step in decode(encode(0, tape.taken)):
+        list(writer.step(step))
+    assert not list(writer.end())
+
+
 def test_a_host_stall_is_not_called_a_silence_of_the_board() -> None:
     tape = Tape()
     world = World(BOARD, recorder=tape)
