@@ -212,14 +212,15 @@ def part_between(found: list[Stretch], first: float, last: float) -> Span | None
 
     Returns None if nothing was recorded between them.
     """
-    parts = [
-        Span(one.at + max(first, one.begin) - one.begin, one.at + min(last, one.end) - one.begin)
-        for one in found
-        if one.begin <= last and first <= one.end
-    ]
-    if not parts:
+    inside = [one for one in found if one.begin <= last and first <= one.end]
+    if not inside:
         return None
-    return Span(min(part.begin for part in parts), max(part.end for part in parts))
+    begin = min(one.at + max(first, one.begin) - one.begin for one in inside)
+    end = max(one.at + min(last, one.end) - one.begin for one in inside)
+    # The end of the file belongs to the part too if the last step does.
+    whole_begin = inside[0] is found[0] and first <= found[0].begin
+    whole_end = inside[-1] is found[-1] and last >= found[-1].end
+    return Span(-math.inf if whole_begin else begin, math.inf if whole_end else end)
 
 
 def _on(near: float, day: int, when: TimeOfDay) -> float:

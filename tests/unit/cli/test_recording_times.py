@@ -247,6 +247,24 @@ def test_two_runs_of_the_daemon_become_two_files(
     assert len([*tmp_path.glob("00000[12]-*.csv")]) == 2
 
 
+def test_a_search_reports_the_drive_and_the_cut_at_the_end_of_the_newest_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tape = Tape(every=STEPS)
+    World(recorder=tape).drive(0.5, seconds=3.0)
+    *_, newest = rotated(tape, tmp_path, 3)
+    part = (tmp_path / newest).rename(tmp_path / f"{newest}.part")
+    part.write_bytes(part.read_bytes()[:-1000])
+    for times in (("--from", local(2.0)), ("--from", local(0.5), "--to", local(60.0))):
+        code, out, err = recording(capsys, tmp_path, "show", *times)
+        drive, cut = out.splitlines()[-2:]
+        assert (code, "  drive: was driving, 1." in drive) == (0, True)
+        assert cut.endswith("  ! cut: no end: cut off, or still being recorded")
+        assert part.name in err
+    _, out, _ = recording(capsys, tmp_path, "show", "--to", local(2.0))
+    assert "  drive: was driving, 0." in out.splitlines()[-1]
+
+
 def test_a_file_that_cannot_be_read_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
