@@ -7,6 +7,7 @@ mode `driving`; its entry gives the distance and the duration.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Annotated
@@ -16,11 +17,21 @@ from msgspec.structs import replace
 
 from acsard.core.formatting import many
 from acsard.core.link.link_diagnosis import is_ours
-from acsard.core.values import Event, Instant
+from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
 """Largest distance of an entry's time from 1970, s: 292 years. No recording has other times."""
+
+
+REASON_NS = NS_PER_S
+"""Shortest time between two entries about a reason. Two sources may alternate in every step."""
+
+NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
+"""A number, but not a digit of a name.
+
+Reasons that differ only in numbers, such as a duration, count as one reason.
+"""
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
@@ -32,8 +43,8 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     """Name of the event, or a name that only the timeline uses.
 
     The names of the timeline are `link_late` for a `link_stale` that this computer caused,
-    `link_heard` for a further event about a link that is already lost, and `start`, `drive`, `gap`
-    and `end`.
+    `link_heard` for a further event about a link that is already lost, `reason` for a change of the
+    reason without a change of the mode, and `start`, `drive`, `gap` and `end`.
     """
     text: str
     level: str = "info"
@@ -68,6 +79,30 @@ class LinkLosses:
         return before
 
 
+class ReasonChanges:
+    """Detects that the robot does the same for another reason, which no event reports."""
+
+    def __init__(self) -> None:
+        self._mode = self._reason = ""
+        """Mode and reason that the timeline has, the reason without its numbers."""
+        self._reported_ns = -REASON_NS
+        """Monotonic time of the last entry."""
+
+    def step(self, step: Step) -> Iterator[TimelineEntry]:
+        """Yield an entry if the reason changed and the mode did not. The events come before it."""
+        mode, text, _, _ = step.recorded.status
+        now, reason = step.inputs.now, NUMBER.sub("#", text)
+        if reason == self._reason and mode == self._mode:
+            return
+        reported = mode != self._mode or any(event.text == text for event in step.recorded.events)
+        if not reported and mode != "driving":
+            if now.mono_ns - self._reported_ns < REASON_NS:
+                return
+            self._reported_ns = now.mono_ns
+            yield TimelineEntry(now.wall_ns / 1e9, "reason", f"{mode}: {text}")
+        self._mode, self._reason = mode, reason
+
+
 class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
@@ -85,6 +120,7 @@ class TimelineWriter:
         """Time of the last step."""
         self._shutting_down = False
         self._losses = LinkLosses()
+        self._reasons = ReasonChanges()
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield the entries of a step. The steps must come in order."""
@@ -101,6 +137,7 @@ class TimelineWriter:
             entry = entry_of(event, step.inputs.now.wall_ns)
             repeated = self._losses.repeated(entry.name)
             yield replace(entry, name="link_heard") if repeated else entry
+        yield from self._reasons.step(step)
         if step.inputs.shutting_down and not self._shutting_down:
             yield TimelineEntry(wall_s, "end", "the daemon received the request to end")
         self._shutting_down = step.inputs.shutting_down
