@@ -48,7 +48,7 @@ from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
-"""Largest number of recordings that a search names."""
+"""Largest number of recordings, and of gaps between them, that a search names."""
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
@@ -300,6 +300,9 @@ def _search(args: argparse.Namespace, by_clock: bool) -> list[tuple[Recording, S
     names = [path.name for found in result.found for path in found.recording.paths]
     looked = f"{len(names)} of {many(len(files), 'recording')} in {where}"
     print(f"{in_words(first, last)}: {looked}: {listed(names, MAX_NAMES)}", file=sys.stderr)
+    if result.gaps:
+        gaps = listed([in_words(*gap) for gap in result.gaps], MAX_NAMES, "; ")
+        print(f"nothing was recorded {gaps}", file=sys.stderr)
     for sentence in result.unreadable:
         print(printable(sentence), file=sys.stderr)
     return [(found.recording, found.part) for found in result.found]

@@ -27,6 +27,9 @@ MARGIN_S = 60.0
 The end record has the time at which the last message began, and a slow disk makes messages long.
 """
 
+GAP_S = 2.0
+"""Longest time between two recordings that is not reported as a gap."""
+
 
 class Series(Recording):
     """Several files of one run of the daemon without a missing step between them, read as one."""
@@ -66,6 +69,8 @@ class Search(Struct):
     found: list[Found] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     """A sentence for each file that cannot be read."""
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+    """Times in the range in which nothing was recorded, s since 1970."""
 
 
 class NothingRecordedError(AcsardError):
@@ -106,13 +111,25 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
     for group in _groups(files, chosen):
         paths = [files[number] for number in group]
         recording = Recording(_present(paths[0])) if len(paths) == 1 else Series(paths)
-        contents = read_contents(recording)
+        contents = chosen[group[0]] if len(paths) == 1 else read_contents(recording)
         part = part_between(contents.stretches, first, last) if contents else None
         if part is not None:
             result.found.append(Found(recording, part))
     if not result.found:
         raise NothingRecordedError(_nearest(pieces, first, last))
+    result.gaps = _gaps(pieces, first, last)
     return result
+
+
+def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
+    """Return the times between two times that no piece covers."""
+    inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
+    ends = [first]
+    for piece in inside:
+        ends.append(max(ends[-1], piece.end))
+    begins = [*(piece.begin for piece in inside), last]
+    pairs = zip(ends, begins, strict=True)
+    return [(end, begin) for end, begin in pairs if GAP_S < begin - end < math.inf]
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:

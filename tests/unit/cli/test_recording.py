@@ -423,6 +423,8 @@ def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
     code, out, _ = log(capsys, where)
     assert (code, len(out.splitlines())) == (Exit.OK, HARMED)
     assert min(ends[Exit.OK], ends[Exit.FAILURE]) > HARMED / 2, ends
+    code, out, err = log(capsys, where, "show", "all")
+    assert (code, "  stop: " in out, "Traceback" in err) == (Exit.OK, True, False)
 
 
 def test_what_is_not_there_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -119,6 +119,14 @@ def test_a_time_between_two_recordings_names_both(
     assert (code, out) == (1, "")
     assert "before it is 000001-20270115T080000Z.mcap, " in err
     assert "after it is 000002-20270115T090000Z.mcap, " in err
+    times = ("--from", local(-60.0), "--to", local(7200.0))
+    code, out, err = recording(capsys, tmp_path, "show", *times)
+    begins = [line.split("  ")[0] for line in out.splitlines() if "  start: " in line]
+    assert (code, begins) == (0, [local(0.0)[11:], local(3600.0)[11:]])
+    gaps = ((-60.0, 0.0), (1.0, 3600.0), (3601.0, 7200.0))
+    words = "; ".join(f"from {local(begin)[:19]} to {local(end)[:19]}" for begin, end in gaps)
+    assert f"nothing was recorded {words}\n" in err
+    assert "nothing was recorded" not in recording(capsys, tmp_path, "show", "--to", local(0.9))[2]
 
 
 def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
