@@ -93,14 +93,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         description=recording_files.REPORT,
     )
     report.set_defaults(main=main_report)
-    for action in (shown, replay, export, report):
-        action.add_argument(
-            "file",
-            nargs="?",
-            metavar="FILE",
-            help="a recording, or its number in the list of `acsard recording` (default: the "
-            "newest)" + ("" if action is replay else ", or `all` recordings"),
-        )
+    number = "its number in the list of `acsard recording`"
+    one = f"a recording, or {number} (default: the newest)"
+    default = "the newest; all if --from or --to has a time"
+    several = f"a recording, {number}, or `all` (default: {default})"
+    for action, words in ((shown, several), (replay, one), (export, several), (report, several)):
+        action.add_argument("file", nargs="?", metavar="FILE", help=words)
     recording_files.add_export(export)
     recording_files.add_report(report)
     for action in (replay, export):
