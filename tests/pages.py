@@ -421,7 +421,8 @@ COMMANDS: dict[str, How] = {
         LOG, "test_the_list_has_a_line_for_each_recording_with_its_events"
     ),
     "sudo /opt/acsard/venv/bin/acsard recording show --from 14:05": Elsewhere(
-        LOG, "test_a_part_of_a_story_by_seconds_and_by_the_time_of_day"
+        "tests/unit/cli/test_recording_times.py",
+        "test_a_time_of_day_is_looked_up_before_now_in_the_ring",
     ),
     "sudo /opt/acsard/venv/bin/acsard recording replay": Elsewhere(
         LOG, "test_a_replay_says_that_all_is_the_same"

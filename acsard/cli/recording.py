@@ -1,6 +1,6 @@
 """Work with the recordings that the daemon has made. Without a subcommand, list them, oldest
-first, with the main events of each. FILE is a recording or its number in that list (default: the
-newest recording).
+first, with the main events of each. FILE is a recording, its number in that list, or `all` of them.
+Without FILE, --from and --to search all recordings, and without these too the newest is taken.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import time
 from pathlib import Path
 
 import msgspec
@@ -15,11 +16,11 @@ import msgspec
 from acsard.cli import recording_files
 from acsard.cli.common import load
 from acsard.cli.recording_files import progress
-from acsard.core.formatting import json_line, many, printable
+from acsard.core.formatting import json_line, listed, many, printable
 from acsard.core.ros.shapes import how_often
-from acsard.host.errors import Exit, ExitError, MendableError, RecordingError
+from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
 from acsard.recording.atomic_output import replacing
-from acsard.recording.directory import listed
+from acsard.recording.directory import listed as recordings_in
 from acsard.recording.end_record import EndRecord, how_it_ends, read_end
 from acsard.recording.file import Recording, rewrite
 from acsard.recording.file_replay import config_of, replay_file, steps
@@ -30,9 +31,24 @@ from acsard.recording.replay_text import (
     explain_verdict,
     verdict,
 )
-from acsard.recording.time_span import clock, span
+from acsard.recording.series import NothingRecordedError, in_words, search
+from acsard.recording.time_span import (
+    EXAMPLES,
+    WHOLE,
+    Offset,
+    Span,
+    TimeError,
+    When,
+    clock,
+    parse_when,
+    resolve,
+    span,
+)
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.terminal.output import show, table
+
+MAX_NAMES = 10
+"""Largest number of recordings, and of gaps between them, that a search names."""
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
@@ -78,14 +94,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         description=recording_files.REPORT,
     )
     report.set_defaults(main=main_report)
-    for action in (shown, replay, export, report):
-        action.add_argument(
-            "file",
-            nargs="?",
-            metavar="FILE",
-            help="a recording, or its number in the list of `acsard recording` (default: the "
-            "newest)",
-        )
+    number = "its number in the list of `acsard recording`"
+    one = f"a recording, or {number} (default: the newest)"
+    default = "the newest; all if --from or --to has a time"
+    several = f"a recording, {number}, or `all` (default: {default})"
+    for action, words in ((shown, several), (replay, one), (export, several), (report, several)):
+        action.add_argument("file", nargs="?", metavar="FILE", help=words)
     recording_files.add_export(export)
     recording_files.add_report(report)
     for action in (replay, export):
@@ -97,9 +111,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for action in (recover, export, report):
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
     for action in (shown, export, report):
-        when = "seconds after the beginning of the recording, or the time of day: HH:MM, HH:MM:SS"
-        action.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
-        action.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
+        for option, name in (("--from", "begin"), ("--to", "end")):
+            action.add_argument(
+                option, dest=name, type=_when, metavar="TIME", help=f"for example {EXAMPLES}"
+            )
     for action in (shown, replay, recover, export, report):
         _directory(action, argparse.SUPPRESS)
     # For `replay` and `export`, --config is the configuration that they try.
@@ -160,22 +175,37 @@ def _bracketed(text: str) -> str:
 
 
 def main_show(args: argparse.Namespace) -> int:
-    recording = _recording(args)
-    begin, end = span(recording, args.begin, args.end)
-    story, last = TimelineWriter(), recording.about.wall_ns / 1e9
-    inside = begin <= 0.0
-    for step in steps(recording):
-        now = step.inputs.now
-        seconds, last = (now.mono_ns - recording.about.mono_ns) / 1e9, now.wall_ns / 1e9
-        inside = begin <= seconds <= end
-        for one in story.step(step):
-            if inside:
-                _tell(one, args.json)
-    if recording.ending and inside:
-        words = recording.ending.removeprefix("cut: ")
-        _tell(TimelineEntry(last, "cut", words, "warning"), args.json)
-    _note(recording, _bracketed(recording.missing))
+    for recording, part in _parts(args):
+        if not _show(recording, part, args.json) and part != WHOLE:
+            raise RecordingError(f"{recording.path} has no step in that span of time")
+        _note(recording, _bracketed(recording.missing))
     return int(Exit.OK)
+
+
+def _show(recording: Recording, part: Span, as_json: bool) -> bool:
+    """Print the events of a part, and return whether the part has steps."""
+    story, last_s = TimelineWriter(), recording.about.wall_ns / 1e9
+    found, over = False, False
+    for step in steps(recording):
+        if over:
+            # Read the rest, so that the notes count every damaged place.
+            continue
+        now = step.inputs.now
+        seconds, last_s = (now.mono_ns - recording.about.mono_ns) / 1e9, now.wall_ns / 1e9
+        over = seconds > part.end
+        entries = list(story.end() if over and found else story.step(step))
+        if part.begin <= seconds <= part.end or (over and found):
+            found = True
+            for entry in entries:
+                _tell(entry, as_json)
+    if over or (part.begin > 0.0 and not found):
+        return found
+    for entry in story.end():
+        _tell(entry, as_json)
+    if recording.ending:
+        words = recording.ending.removeprefix("cut: ")
+        _tell(TimelineEntry(last_s, "cut", words, "warning"), as_json)
+    return found
 
 
 def _note(recording: Recording, note: str) -> None:
@@ -225,24 +255,76 @@ def main_recover(args: argparse.Namespace) -> int:
 
 
 def main_export(args: argparse.Namespace) -> int:
-    recording = _recording(args)
-    trouble = recording_files.export(recording, args)
-    _note(recording, trouble or _bracketed(recording.missing))
+    for recording, part in _files_to_write(args):
+        trouble = recording_files.export(recording, part, args)
+        _note(recording, trouble or _bracketed(recording.missing))
     return int(Exit.OK)
 
 
 def main_report(args: argparse.Namespace) -> int:
     plotly = recording_files.library()
-    recording = _recording(args)
-    for note in recording_files.report(recording, args, plotly):
-        _note(recording, note)
+    for recording, part in _files_to_write(args):
+        for note in recording_files.report(recording, part, args, plotly):
+            _note(recording, note)
     return int(Exit.OK)
+
+
+def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
+    """Return the parts to write, each of which becomes a file of its own."""
+    parts = _parts(args)
+    if args.new is not None and len(parts) > 1:
+        raise UsageError(
+            f"that time has {len(parts)} runs of the daemon, or steps are missing in it, and each "
+            "becomes a file of its own: leave out NEW, or use a shorter --from and --to"
+        )
+    return parts
+
+
+def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
+    """Return the recordings that the arguments name, and the part of each between the times."""
+    times = [when for when in (args.begin, args.end) if when is not None]
+    by_clock = bool(times) and not any(isinstance(when, Offset) for when in times)
+    if args.file == "all" or (args.file is None and by_clock):
+        return _search(args, by_clock or not times)
+    recording = _recording(args)
+    if args.file is None and times:
+        _note(recording, "the newest recording: a number of seconds counts from its beginning")
+    return [(recording, span(recording, args.begin, args.end))]
+
+
+def _search(args: argparse.Namespace, by_clock: bool) -> list[tuple[Recording, Span]]:
+    """Search all recordings, and say on standard error which ones have the time."""
+    if not by_clock:
+        raise UsageError(
+            "a number of seconds counts from the beginning of one recording: name that recording, "
+            f"or write a time, for example {EXAMPLES}"
+        )
+    try:
+        first, last = resolve(args.begin, args.end, time.time())
+    except TimeError as error:
+        raise UsageError(str(error)) from None
+    where, files = _files(args)
+    try:
+        result = search(files, first, last)
+    except NothingRecordedError as error:
+        raise RecordingError(
+            f"{error} (looked at {many(len(files), 'recording')} in {where})"
+        ) from None
+    names = [path.name for found in result.found for path in found.recording.paths]
+    looked = f"{len(names)} of {many(len(files), 'recording')} in {where}"
+    print(f"{in_words(first, last)}: {looked}: {listed(names, MAX_NAMES)}", file=sys.stderr)
+    if result.gaps:
+        gaps = listed([in_words(*gap) for gap in result.gaps], MAX_NAMES, "; ")
+        print(f"nothing was recorded {gaps}", file=sys.stderr)
+    for sentence in result.unreadable:
+        print(printable(sentence), file=sys.stderr)
+    return [(found.recording, found.part) for found in result.found]
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
     where = Path(args.directory or load(args.own_config)[1].record.directory or SERVICE)
     try:
-        return where, listed(where)
+        return where, recordings_in(where)
     except FileNotFoundError:
         raise MendableError(
             f"nothing is recorded in {where}: the directory does not exist. The service records "
@@ -277,7 +359,8 @@ def _sentence(one: TimelineEntry) -> str:
     return f"{clock(one.seconds)}  {mark}{one.name.replace('_', ' ')}: {one.text}{by}{times}"
 
 
-def _when(text: str) -> str:
-    if not re.fullmatch(r"\d+(\.\d+)?|\d\d:\d\d(:\d\d(\.\d+)?)?", text):
-        raise argparse.ArgumentTypeError(f"{text} is neither seconds nor HH:MM:SS")
-    return text
+def _when(text: str) -> When:
+    try:
+        return parse_when(text, time.time())
+    except TimeError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

@@ -17,7 +17,7 @@ from acsard.recording import export as exports
 from acsard.recording.atomic_output import replacing
 from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording
-from acsard.recording.time_span import span
+from acsard.recording.time_span import Span
 from acsard.report.page import drawn
 
 EXPORT = """\
@@ -42,7 +42,7 @@ def progress(recording: Recording) -> Iterator[Callable[[int], None]]:
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
         return
-    began_ns, last = recording.about.wall_ns, read_end(recording.path)
+    began_ns, last = recording.about.wall_ns, read_end(recording.paths[-1])
     whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
 
     def tell(wall_ns: int) -> None:
@@ -91,12 +91,14 @@ def add_export(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def export(recording: Recording, args: argparse.Namespace) -> str:
-    """Write the file, print a summary, and return why it ends early, or "" if it is complete."""
+def export(recording: Recording, part: Span, args: argparse.Namespace) -> str:
+    """Write a part of the recording, print a summary, and return why it ends early.
+
+    Returns "" if the part is complete.
+    """
     kind: exports.Kind = args.kind
     # The default is this directory, because that of the recordings belongs to the service.
     new = Path(args.new or recording.path.name.partition(".")[0] + exports.SUFFIX[kind])
-    part = span(recording, args.begin, args.end)
     other = None if args.config is None else load(args.config)[1]
     with _written(new), progress(recording) as tell:
         done = exports.export(recording, new, kind, other, part, tell, args.force)
@@ -124,9 +126,8 @@ def library() -> str:
     return script
 
 
-def report(recording: Recording, args: argparse.Namespace, plotly: str) -> list[str]:
-    """Write the report, print a summary, and return notes about the recording."""
-    part = span(recording, args.begin, args.end)
+def report(recording: Recording, part: Span, args: argparse.Namespace, plotly: str) -> list[str]:
+    """Write the report of a part, print a summary, and return notes about the recording."""
     if args.supervised:
         end_with_parent(signal.SIGKILL)
         text, _ = drawn(recording, plotly, part, _percent(recording))

@@ -17,6 +17,8 @@ The modules that do I/O:
 - `recorder`: takes steps from the control loop; `step_writer` writes them in a thread.
 - `directory`: limits the directory of recordings in bytes and in days.
 - `file`: writes and reads one MCAP file; `chunks`, `mcap_records` and `end_record` are its parts.
+- `series`: finds the recordings of a range of time, and reads the files of one run as one.
+- `time_span`: reads the times that a person types, and finds them in a recording.
 - `recovery`: finishes a file that was cut off.
 - `state`: encodes a robot as bytes, and decodes it.
 - `file_replay`: replays a file.

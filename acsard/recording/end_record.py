@@ -68,6 +68,11 @@ class EndRecord(Struct, frozen=True):
     """Why the recording was cut off: a key of `CUTS`, or "" if it ends with an ordinary end."""
     why: str = ""
     """For the cause `bug`: the step in which the daemon failed, and the exception."""
+    earliest_ns: Ns | None = None
+    """Earliest wall-clock time of a message, ns since 1970; None if it is not known.
+
+    It is before `wall_ns` if the clock was set back during the recording.
+    """
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
@@ -83,7 +88,8 @@ def how_it_ends(cut: str, why: str = "") -> str:
 
 def as_metadata(last: EndRecord) -> dict[str, str]:
     """Return the end record as MCAP metadata, which holds strings only."""
-    return {key: str(value) for key, value in msgspec.to_builtins(last).items()}
+    fields = msgspec.to_builtins(last).items()
+    return {key: str(value) for key, value in fields if value is not None}
 
 
 def read_end(path: Path) -> EndRecord | None:

@@ -97,7 +97,7 @@ class EndRecordBuilder:
     """Collects the end record of a recording from its messages."""
 
     def __init__(self, about: About) -> None:
-        self._wall_ns = self._last_ns = about.wall_ns
+        self._wall_ns = self._last_ns = self._earliest_ns = about.wall_ns
         self._incidents: list[TimelineEntry] = []
         self._starts = False
         """True once the first step of the daemon was among the messages."""
@@ -105,6 +105,7 @@ class EndRecordBuilder:
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
         """Take a message of any channel. For an event, call `event` as well."""
         self._last_ns = max(self._last_ns, wall_ns)
+        self._earliest_ns = min(self._earliest_ns, wall_ns)
         if topic == "steps":
             self._starts = self._starts or first_of(data) == 0
         elif topic == "unfinished":
@@ -123,7 +124,7 @@ class EndRecordBuilder:
         explain it.
         """
         text = summary(self._incidents, self._starts)
-        return EndRecord(self._wall_ns, self._last_ns, text, cut, why)
+        return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
 
 
 class Index:
@@ -319,6 +320,8 @@ class Recording:
         Raises `RecordingError` if it cannot be read or is not a recording of acsard.
         """
         self.path = path
+        self.paths = [path]
+        """The files that are read, in order."""
         try:
             self._data = path.read_bytes()
         except OSError as error:

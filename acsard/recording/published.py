@@ -2,7 +2,8 @@
 
 `Report`, which the daemon uses too, builds the messages as if a client had subscribed to every
 topic all the time. A recording does not hold the daemon's measurements of itself, so the rows of
-`diagnostics` with such measurements are omitted.
+`diagnostics` with such measurements are omitted. The log also has the lines `reason` of the
+timeline, which the robot does not publish: it publishes its reason in `state` only.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from acsard.core.messages.report import Look, Report
 from acsard.core.messages.schema import DiagnosticArray, RobotState, TFMessage, Time
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, published_channels
-from acsard.core.ros.shapes import asked, log
+from acsard.core.ros.shapes import LEVELS, Log, asked, log
 from acsard.core.ros.transports import left_out
 from acsard.core.values import Command, Instant, Outputs
 from acsard.recording.recorded_steps import Step
+from acsard.recording.timeline import ReasonChanges
 
 MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
 """Rows of `diagnostics` whose values a recording does not hold."""
@@ -50,6 +52,7 @@ class Publisher:
         self._robot, self._config = robot, robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._wanted_keys()
+        self._reasons = ReasonChanges()
         self._static: TFMessage | None = None
         self._static_due = True
         """True before the first step, and after a setting has changed."""
@@ -78,6 +81,10 @@ class Publisher:
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
         for event in step.recorded.events:
             line = log(event, Time.from_ns(now.wall_ns))
+            yield Published(LOG, "", now.wall_ns, line)
+        for entry in self._reasons.step(step):
+            stamp = Time.from_ns(now.wall_ns)
+            line = Log(stamp, LEVELS[entry.level], entry.name, entry.text)
             yield Published(LOG, "", now.wall_ns, line)
 
     def _snapshot(self, now: Instant) -> Look:

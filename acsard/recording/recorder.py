@@ -1,9 +1,10 @@
 """The black box of a running daemon: takes the inputs and outputs of each step without waiting.
 
 The control loop puts references to the steps into a bounded queue. Once a second a thread takes all
-steps from the queue, adds them to the file as a block, and syncs the file to the disk. If the disk
-is slow or hangs, the queue fills, and further steps are lost and counted. The recording then goes
-on in a new file that begins with the robot's state, so that the new file can be replayed.
+steps from the queue, adds them to the file as a block, and syncs the file to the disk. The log
+reports a disk that hangs for 3 s. If the queue fills, further steps are lost and counted. The
+recording then goes on in a new file that begins with the robot's state, so that the new file can be
+replayed.
 """
 
 from __future__ import annotations
@@ -14,15 +15,27 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from acsard.core.config.settings import Config
+from acsard.core.formatting import many
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
-from acsard.core.values import Event, Inputs, Outputs, Recording
+from acsard.core.values import NS_PER_S, Event, Inputs, Outputs, Recording
 from acsard.recording.recorded_steps import Start, Taken, Unfinished
 from acsard.recording.state import freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
 MAX_QUEUED_STEPS = 4096
 """With 400 steps a second, a disk may hang for 10 s without a loss of steps."""
+
+SLOW_NS = 3 * NS_PER_S
+"""Time that a sync of the recording may take until the disk counts as hanging."""
+
+SLOW = "the disk has accepted nothing for 3 s"
+
+PAUSE_NS = NS_PER_S // 4
+"""Longest time between two steps that counts as waiting for the disk.
+
+If this process did not run, its recorder's thread did not run either.
+"""
 
 FLUSH_S = 0.98
 """Pause between two syncs. Together with the duration of a sync, that is about one second."""
@@ -60,6 +73,14 @@ class Recorder:
         self._lost = 0
         """Number of steps lost because the queue was full."""
         self._full = False
+        self._syncs = 0
+        """`StepWriter.syncs` at the last step."""
+        self._waited_ns = self._now_ns = 0
+        """Time for which the present sync has lasted, and time of the last step."""
+        self._slow = False
+        """True from the report of a disk that hangs until the report that it goes on."""
+        self._lost_before = 0
+        """Number of lost steps before the disk hung."""
         self._failed_inputs: Inputs | None = None
         """Inputs of the step in which the daemon failed."""
         self._wants_state = False
@@ -79,25 +100,52 @@ class Recorder:
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
         """Take a finished step; `sent` is the line that was sent to the board, or None."""
-        queue = self._queue
         self._number += 1
         if self._events:
             self._report(self._events.popleft())
+        self._put(Taken(inputs, outputs, sent), robot, guard)
+        self._watch_disk(inputs.now.mono_ns)
+
+    def _put(self, taken: Taken, robot: Robot, guard: Guard) -> None:
+        queue = self._queue
         if self._full:
             self._lost += 1
             if len(queue) > MAX_QUEUED_STEPS // 2:
                 return
             self._full, self._wants_state = False, True
         elif len(queue) >= MAX_QUEUED_STEPS:
+            self._hangs()
             self._full = True
             self._lost += 1
             self._report(Event("recording", "the disk is too slow; steps are lost", "warning"))
             return
         else:
-            queue.append(Taken(inputs, outputs, sent))
+            queue.append(taken)
         if self._wants_state:
             self._wants_state = False
             queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
+
+    def _watch_disk(self, now_ns: int) -> None:
+        """Report that the disk hangs, and that a sync ends in time again."""
+        before, self._syncs = self._syncs, self._writer.syncs
+        passed = self._syncs - before
+        if passed:
+            ended = before % 2 == 1 or passed > 1
+            if self._slow and ended and self._waited_ns <= SLOW_NS:
+                self._slow = False
+                missing = many(self._lost - self._lost_before, "step is", "steps are")
+                self._report(Event("recording", f"the disk goes on; {missing} missing"))
+            self._waited_ns = 0
+        elif before % 2:
+            self._waited_ns += min(now_ns - self._now_ns, PAUSE_NS)
+            if self._waited_ns > SLOW_NS and not self._slow:
+                self._hangs()
+                self._report(Event("recording", f"{SLOW}; driving goes on", "warning"))
+        self._now_ns = now_ns
+
+    def _hangs(self) -> None:
+        if not self._slow:
+            self._slow, self._lost_before = True, self._lost
 
     def died(self, inputs: Inputs) -> None:
         """Take the inputs of the step in which the daemon failed. The failure ends the daemon."""
@@ -106,7 +154,9 @@ class Recorder:
     @property
     def status(self) -> Recording:
         """Status of the recording, for `state` and `diagnostics`."""
-        trouble = "the disk is too slow" if self._full else self._writer.trouble
+        trouble = self._writer.trouble or (SLOW if self._slow else "")
+        if self._full:
+            trouble = "the disk is too slow"
         if not self._thread.is_alive():
             trouble = "the recorder has ended because of an error of its own, which is in the log"
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)

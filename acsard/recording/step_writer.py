@@ -18,6 +18,7 @@ from acsard import __version__
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.writing import document
+from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.recording.chunks import MAX_DATA_BYTES
 from acsard.recording.directory import Ring, Run, mark_cut
@@ -75,6 +76,10 @@ class StepWriter:
         """Why the disk refuses, for the user; "" if it does not."""
         self.lost = 0
         """Number of steps lost because the disk refused to write."""
+        self.syncs = 0
+        """Number of beginnings and ends of a sync of the current file; odd during a sync."""
+        self._lost_before = 0
+        """Number of steps that were lost before the present trouble began."""
         self._config, self._report, self._request_state = config, report, request_state
         self._ring: Ring | None = None
         self._writing: Writing | None = None
@@ -231,12 +236,18 @@ class StepWriter:
             ring.close()
         if self._writing is None:
             return
-        self._writing.flush()
+        self.syncs += 1
+        try:
+            self._writing.flush()
+        finally:
+            self.syncs += 1
         self._safe, self._run.freed = self._handed, 0
         ring.tend(self._last)
         if self.trouble or not self._reported:
+            missing = many(self.lost - self._lost_before, "step is", "steps are")
+            since = f" again; {missing} missing" if self.trouble else ""
             self.trouble, self._reported = "", True
-            self._report(Event("recording", f"to {self.where}"))
+            self._report(Event("recording", f"to {self.where}{since}"))
         too_long = self._last.mono_ns - self._began_ns > MAX_FILE_NS
         if too_long or self._writing.size > ring.file_bytes:
             self._request_state()
@@ -251,6 +262,8 @@ class StepWriter:
     def _fail(self, error: OSError) -> None:
         """Close the file and the directory after an error of the disk, and begin the pause."""
         text = f"{self.where}: {error.strerror or error}"
+        if not self.trouble:
+            self._lost_before = self.lost
         if text != self.trouble:
             self.trouble = text
             self._report(Event("recording", f"{text}; driving goes on", "warning"))

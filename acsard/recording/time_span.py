@@ -1,18 +1,20 @@
-"""A part of a recording, given in seconds or by the time of day.
+"""Times that a person types, and the part of a recording between two of them.
 
-A recording may cross midnight, and its clock may be set in the middle of it. The time of day is
-therefore looked up in every stretch between two clock steps.
+A recording may cross midnight, and its clock may be set in the middle of it. A time is therefore
+looked up in every stretch between two clock steps.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import time
 from itertools import pairwise
 from typing import NamedTuple
 
-from acsard.core.values import NS_PER_S, Instant
+from acsard.core.values import NS_PER_S, AcsardError, Instant
 from acsard.recording.file import Recording
+from acsard.recording.recorded_steps import Step
 from acsard.recording.rows import BatchError, decode
 
 
@@ -24,6 +26,136 @@ class Span(NamedTuple):
 
 
 WHOLE = Span()
+
+
+class Offset(NamedTuple):
+    """A time in seconds after the beginning of a recording."""
+
+    seconds: float
+
+
+class TimeOfDay(NamedTuple):
+    """A time of day without a date, local time."""
+
+    hours: int
+    minutes: int
+    seconds: float
+
+
+MIDNIGHT = TimeOfDay(0, 0, 0.0)
+
+
+class Moment(NamedTuple):
+    """A moment, s since 1970. A whole day has two: it begins at `begin` and ends at `end`."""
+
+    begin: float
+    end: float
+
+
+When = Offset | TimeOfDay | Moment
+"""A time that a person typed."""
+
+EXAMPLES = (
+    '14:05, 14:05:30, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21, "2 h ago", or a number of '
+    "seconds after the beginning of the recording"
+)
+
+_CLOCK = re.compile(r"(\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?")
+_AGO = re.compile(r"(\d+(?:\.\d+)?) ?(s|min|h|d)\w* ago")
+_UNIT_S = {"s": 1, "min": 60, "h": 3600, "d": 86400}
+_DAYS_AGO = {"today": 0, "yesterday": 1}
+
+
+class TimeError(AcsardError):
+    """A text is not a time."""
+
+
+def parse_when(text: str, now_s: float) -> When:
+    """Parse a time that a person typed; `now_s` is the present time, s since 1970.
+
+    Raises `TimeError` with a text that says how to write a time.
+    """
+    words = re.sub(r"(?<=\d)t(?=\d)", " ", " ".join(text.lower().split()))
+    if re.fullmatch(r"\d+(\.\d+)?", words):
+        return Offset(float(words))
+    if ago := _AGO.fullmatch(words):
+        moment = now_s - float(ago[1]) * _UNIT_S[ago[2]]
+        return Moment(moment, moment)
+    day, _, rest = words.partition(" ")
+    if ":" in day:
+        return _time_of_day(words, text)
+    date = _date(day, text, now_s)
+    if not rest:
+        return Moment(_moment(date), _moment(date, days=1))
+    at = _moment(date, _time_of_day(rest, text))
+    return Moment(at, at)
+
+
+def _time_of_day(words: str, text: str) -> TimeOfDay:
+    found = _CLOCK.fullmatch(words)
+    if found is None:
+        raise _unknown(text)
+    clock = TimeOfDay(int(found[1]), int(found[2]), float(found[3] or 0))
+    if clock.hours > 23 or clock.minutes > 59 or clock.seconds >= 60:
+        raise TimeError(
+            f"{words} is not a time of day: a day goes from 00:00 to 23:59:59; write for example "
+            f"{EXAMPLES}"
+        )
+    return clock
+
+
+def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
+    """Return year, month and day."""
+    if words in _DAYS_AGO:
+        today = time.localtime(now_s)
+        return today.tm_year, today.tm_mon, today.tm_mday - _DAYS_AGO[words]
+    if not re.fullmatch(r"(19|20)\d\d-\d\d-\d\d", words):
+        raise _unknown(text)
+    try:
+        date = time.strptime(words, "%Y-%m-%d")
+    except ValueError:
+        raise TimeError(f"{words} is not a date: the calendar has no such day") from None
+    return date.tm_year, date.tm_mon, date.tm_mday
+
+
+def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
+    """Return a local time `days` days after a date, s since 1970. The day may exceed its month."""
+    year, month, day = date
+    whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)
+    return time.mktime(whole) + when.seconds
+
+
+def _unknown(text: str) -> TimeError:
+    return TimeError(f"{text} is not a time; write for example {EXAMPLES}")
+
+
+def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
+    """Return the range of time between two times, s since 1970, both of which may be infinite.
+
+    A time of day of `begin` is its last occurrence before `end` or before the present time `now_s`.
+    A time of day of `end` is its first occurrence after `begin`, or the last one before `now_s`.
+    Raises `TimeError` if the range ends before it begins.
+    """
+    first, last = -math.inf, math.inf
+    if isinstance(begin, TimeOfDay):
+        first = _last_occurrence(begin, end.end if isinstance(end, Moment) else now_s)
+    elif isinstance(begin, Moment):
+        first = begin.begin
+    if isinstance(end, Moment):
+        last = end.end
+    elif isinstance(end, TimeOfDay):
+        last = _last_occurrence(end, now_s)
+        if math.isfinite(first):
+            last = next(at for day in range(3) if (at := _on(first, day, end)) >= first)
+    if last < first:
+        raise TimeError(
+            f"--from is {clock(first, day=True)}, which is after --to, {clock(last, day=True)}"
+        )
+    return first, last
+
+
+def _last_occurrence(when: TimeOfDay, before_s: float) -> float:
+    return next(at for day in range(3) if (at := _on(before_s, -day, when)) <= before_s)
 
 
 def clock(seconds: float, day: bool = False) -> str:
@@ -48,62 +180,101 @@ class Stretch(NamedTuple):
     """End of the stretch, s since 1970, as is `begin`."""
 
 
-def span(recording: Recording, begin: str | None, end: str | None) -> Span:
-    """Return the part of a recording between two times, each in seconds or as HH:MM:SS."""
-    found = stretches(recording) if any(":" in text for text in (begin, end) if text) else []
-    return Span(
-        -math.inf if begin is None else _seconds(begin, found),
-        math.inf if end is None else _seconds(end, found),
-    )
+def span(recording: Recording, begin: When | None, end: When | None) -> Span:
+    """Return the part of a recording between two times."""
+    by_clock = any(isinstance(when, TimeOfDay | Moment) for when in (begin, end))
+    found = stretches(recording) if by_clock else []
+    first = None if begin is None else _seconds(begin, found, end=False)
+    last = None if end is None else _seconds(end, found, end=True)
+    return Span(-math.inf if first is None else first, math.inf if last is None else last)
 
 
-def _seconds(text: str, found: list[Stretch]) -> float:
-    if ":" not in text:
-        return float(text)
-    hours, minutes, seconds = [*text.split(":"), "0"][:3]
-    clock = int(hours), int(minutes), float(seconds)
+def _seconds(when: When, found: list[Stretch], end: bool) -> float:
+    if isinstance(when, Offset):
+        return when.seconds
     away, at = math.inf, 0.0
     for number, one in enumerate(found):
         least = one.at if number else -math.inf
         most = found[number + 1].at if number + 1 < len(found) else math.inf
-        for day in (-1, 0, 1):
-            moment = _on(one.begin, day, *clock)
+        if isinstance(when, Moment):
+            moments = [when.end if end else when.begin]
+        else:
+            moments = [_on(one.begin, day, when) for day in (-1, 0, 1)]
+        for moment in moments:
             far = max(one.begin - moment, moment - one.end, 0.0)
             if far < away:
                 away, at = far, min(max(one.at + moment - one.begin, least), most)
     return at
 
 
-def _on(near: float, day: int, hours: int, minutes: int, seconds: float) -> float:
+def part_between(found: list[Stretch], first: float, last: float) -> Span | None:
+    """Return the smallest part with all of a recording between two times, s since 1970.
+
+    Returns None if nothing was recorded between them.
+    """
+    inside = [one for one in found if one.begin <= last and first <= one.end]
+    if not inside:
+        return None
+    begin = min(one.at + max(first, one.begin) - one.begin for one in inside)
+    end = max(one.at + min(last, one.end) - one.begin for one in inside)
+    # The end of the file belongs to the part too if the last step does.
+    whole_begin = inside[0] is found[0] and first <= found[0].begin
+    whole_end = inside[-1] is found[-1] and last >= found[-1].end
+    return Span(-math.inf if whole_begin else begin, math.inf if whole_end else end)
+
+
+def _on(near: float, day: int, when: TimeOfDay) -> float:
     """Return a time of day, s since 1970, `day` days after the date of `near`."""
-    told = time.localtime(near)
-    whole = (told.tm_year, told.tm_mon, told.tm_mday + day, hours, minutes, 0, 0, 0, -1)
-    return time.mktime(whole) + seconds
+    date = time.localtime(near)
+    return _moment((date.tm_year, date.tm_mon, date.tm_mday), when, day)
+
+
+class Contents(NamedTuple):
+    """The times of a recording, and its first and last step."""
+
+    stretches: list[Stretch]
+    first: Step
+    last: Step
 
 
 def stretches(recording: Recording) -> list[Stretch]:
     """Return the stretches between clock steps, in order.
 
-    There is one if the clock was never set.
+    There is one if the clock was never set, and none if no step can be read.
     """
+    contents = read_contents(recording)
+    return contents.stretches if contents else []
+
+
+def read_contents(recording: Recording) -> Contents | None:
+    """Read the times of a recording; return None if no step can be read."""
     found: list[Stretch] = []
+    first: Step | None = None
     last_ns, before = 0, b""
     for topic, wall_ns, data in recording.messages():
         if topic != "steps":
             continue
-        if found and 0 <= wall_ns - last_ns < SET_NS:
+        if first is not None and 0 <= wall_ns - last_ns < SET_NS:
             found[-1] = found[-1]._replace(end=wall_ns / NS_PER_S)
         else:
-            times = [*_instants(before), *_instants(data)]
-            if not found and times:
-                found.append(_from(recording, times[0]))
+            batch = _steps(data)
+            times = [step.inputs.now for step in (*_steps(before), *batch)]
+            if first is None and batch:
+                first = batch[0]
+                found.append(_from(recording, first.inputs.now))
             for one, other in pairwise(times):
                 ahead_ns = other.wall_ns - other.mono_ns - one.wall_ns + one.mono_ns
                 if abs(ahead_ns) >= SET_NS:
                     found[-1] = found[-1]._replace(end=one.wall_ns / NS_PER_S)
                     found.append(_from(recording, other))
         last_ns, before = wall_ns, data
-    return found
+    if first is None:
+        return None
+    last = first
+    if batch := _steps(before):
+        last = batch[-1]
+        found[-1] = found[-1]._replace(end=last.inputs.now.wall_ns / NS_PER_S)
+    return Contents(found, first, last)
 
 
 def _from(recording: Recording, now: Instant) -> Stretch:
@@ -111,9 +282,9 @@ def _from(recording: Recording, now: Instant) -> Stretch:
     return Stretch(at, now.wall_ns / NS_PER_S, now.wall_ns / NS_PER_S)
 
 
-def _instants(data: bytes) -> list[Instant]:
-    """Return the time of each step in a message."""
+def _steps(data: bytes) -> list[Step]:
+    """Return the steps of a message, or nothing if it is damaged."""
     try:
-        return [step.inputs.now for step in decode(data)]
+        return list(decode(data)) if data else []
     except BatchError:
         return []

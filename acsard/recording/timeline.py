@@ -7,6 +7,7 @@ mode `driving`; its entry gives the distance and the duration.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Annotated
@@ -16,11 +17,21 @@ from msgspec.structs import replace
 
 from acsard.core.formatting import many
 from acsard.core.link.link_diagnosis import is_ours
-from acsard.core.values import Event
+from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
 """Largest distance of an entry's time from 1970, s: 292 years. No recording has other times."""
+
+
+REASON_NS = NS_PER_S
+"""Shortest time between two entries about a reason. Two sources may alternate in every step."""
+
+NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
+"""A number, but not a digit of a name.
+
+Reasons that differ only in numbers, such as a duration, count as one reason.
+"""
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
@@ -32,8 +43,8 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     """Name of the event, or a name that only the timeline uses.
 
     The names of the timeline are `link_late` for a `link_stale` that this computer caused,
-    `link_heard` for a further event about a link that is already lost, and `start`, `drive`, `gap`
-    and `end`.
+    `link_heard` for a further event about a link that is already lost, `reason` for a change of the
+    reason without a change of the mode, and `start`, `drive`, `gap` and `end`.
     """
     text: str
     level: str = "info"
@@ -68,6 +79,30 @@ class LinkLosses:
         return before
 
 
+class ReasonChanges:
+    """Detects that the robot does the same for another reason, which no event reports."""
+
+    def __init__(self) -> None:
+        self._mode = self._reason = ""
+        """Mode and reason that the timeline has, the reason without its numbers."""
+        self._reported_ns = -REASON_NS
+        """Monotonic time of the last entry."""
+
+    def step(self, step: Step) -> Iterator[TimelineEntry]:
+        """Yield an entry if the reason changed and the mode did not. The events come before it."""
+        mode, text, _, _ = step.recorded.status
+        now, reason = step.inputs.now, NUMBER.sub("#", text)
+        if reason == self._reason and mode == self._mode:
+            return
+        reported = mode != self._mode or any(event.text == text for event in step.recorded.events)
+        if not reported and mode != "driving":
+            if now.mono_ns - self._reported_ns < REASON_NS:
+                return
+            self._reported_ns = now.mono_ns
+            yield TimelineEntry(now.wall_ns / 1e9, "reason", f"{mode}: {text}")
+        self._mode, self._reason = mode, reason
+
+
 class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
@@ -79,8 +114,13 @@ class TimelineWriter:
         self._distance_m = 0.0
         """Distance of the present drive."""
         self._source = ""
+        self._since = ""
+        """Words for a drive that began before the first step; "" for any other drive."""
+        self._now: Instant | None = None
+        """Time of the last step."""
         self._shutting_down = False
         self._losses = LinkLosses()
+        self._reasons = ReasonChanges()
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield the entries of a step. The steps must come in order."""
@@ -91,12 +131,13 @@ class TimelineWriter:
             missing = step.number - self._number - 1
             gap = f"{many(missing, 'step is', 'steps are')} missing before this one"
             yield TimelineEntry(wall_s, "gap", gap, "warning")
-        self._number = step.number
         yield from self._drive(step, wall_s)
+        self._number, self._now = step.number, step.inputs.now
         for event in step.recorded.events:
             entry = entry_of(event, step.inputs.now.wall_ns)
             repeated = self._losses.repeated(entry.name)
             yield replace(entry, name="link_heard") if repeated else entry
+        yield from self._reasons.step(step)
         if step.inputs.shutting_down and not self._shutting_down:
             yield TimelineEntry(wall_s, "end", "the daemon received the request to end")
         self._shutting_down = step.inputs.shutting_down
@@ -112,11 +153,22 @@ class TimelineWriter:
         if mode == "driving":
             if self._began_ns is None:
                 self._began_ns, self._distance_m, self._source = now_ns, 0.0, source
+                seen = self._number is not None or step.number == 0
+                self._since = "" if seen else ", counted from the beginning of this recording"
         elif self._began_ns is not None:
-            seconds = (now_ns - self._began_ns) / 1e9
-            text = f"drove {self._distance_m:.2f} m in {seconds:.1f} s"
+            text = f"drove {self._driven(now_ns)}{self._since}"
             yield TimelineEntry(wall_s, "drive", text, by=self._source)
             self._began_ns = None
+
+    def end(self) -> Iterator[TimelineEntry]:
+        """Yield the entry of a drive that goes on at the last step, if there is one."""
+        if self._began_ns is not None and self._now is not None:
+            text = f"was driving, {self._driven(self._now.mono_ns)} so far{self._since}"
+            yield TimelineEntry(self._now.wall_ns / 1e9, "drive", text, by=self._source)
+
+    def _driven(self, now_ns: int) -> str:
+        seconds = (now_ns - (self._began_ns or now_ns)) / 1e9
+        return f"{self._distance_m:.2f} m in {seconds:.1f} s"
 
 
 INCIDENTS = {

@@ -210,7 +210,8 @@ def drawn(
             "this version of acsard computes other results than the recorded ones: "
             f"{verdict(comparison)}"
         )
-    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(remarks))
+    names = ", ".join(path.name for path in recording.paths)
+    origin = Origin(names, about.robot, about.version, about.python, tuple(remarks))
     offset_s = time.localtime(data.began).tm_gmtoff
     return page(data, origin, library, clock, offset_s), notes(data, origin)
 

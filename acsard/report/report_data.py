@@ -167,6 +167,8 @@ class ReportData:
     def end(self) -> None:
         """Finish the data after the last step."""
         t = self.seconds
+        for entry in self._timeline.end() if self.began is not None else ():
+            self.marks.add(self._mark(entry, t))
         for band in (self.modes, self.links, *self.sources.bands.values()):
             band.end(t)
         self.serial.end()

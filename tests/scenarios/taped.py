@@ -65,9 +65,17 @@ class Tape:
         starts = range(first, len(self.taken), BATCH)
         return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]
 
-    def write(self, path: Path, config: Config, first: int = 0, apart: bool = True) -> None:
+    def write(
+        self,
+        path: Path,
+        config: Config,
+        first: int = 0,
+        apart: bool = True,
+        end: int | None = None,
+    ) -> None:
         """Write the file that the daemon would have written, from the start or from a state.
 
+        The file ends before the step `end`, or with the last step if `end` is None.
         With `apart` each second has a chunk of its own, which the daemon does not do.
         """
         now = self.taken[first].inputs.now
@@ -84,8 +92,9 @@ class Tape:
         writing = Writing(path, about)
         if first:
             writing.add("state", now.wall_ns, self.states[first])
-        for at in range(first, len(self.taken), BATCH):
-            batch = self.taken[at : at + BATCH]
+        taken = self.taken[:end]
+        for at in range(first, len(taken), BATCH):
+            batch = taken[at : at + BATCH]
             writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
             for _, outputs, _ in batch:
                 for event in outputs.events:

@@ -141,6 +141,9 @@ def test_every_diagnostics_has_the_same_rows_but_those(both: Any) -> None:
     assert {row.name for row in then[-1].status} >= {"acsard: mode", "acsard: commands"}
 
 
+REASON = "reason"
+"""Name of the lines of the log that the export adds; `state` has the reasons that they report."""
+
 COUNTED = {"lines_rejected", "missed_periods", "command_refused", "new_sender"}
 """Events that repeat. `events` has them in one row with a total, and the log has a line each time.
 """
@@ -159,12 +162,22 @@ def test_every_event_is_a_line_of_the_log(both: Any) -> None:
     world, _, said = both
     told = happened(world)
     assert len(told) > 20
-    lines = said[LOG.native]
+    lines = [line for line in said[LOG.native] if line.name != REASON]
     assert [(one.stamp, one.name) for one in told] == [(one.stamp, one.name) for one in lines]
     others = {
         one.name for one, line in zip(told, lines, strict=True) if log(one, line.stamp) != line
     }
     assert others <= COUNTED
+
+
+def test_every_added_line_of_the_log_is_a_reason_that_the_state_has(both: Any) -> None:
+    _, tape, said = both
+    lines = [line for line in said[LOG.native] if line.name == REASON]
+    steps = {step.inputs.now.wall_ns: step.recorded.status for step in tape.steps()}
+    assert lines
+    for line in lines:
+        mode, reason, _, _ = steps[line.stamp.to_ns()]
+        assert line.msg == f"{mode}: {reason}"
 
 
 def test_every_command_is_there_by_its_source_with_the_time_it_came(both: Any) -> None:
@@ -214,6 +227,12 @@ def _as_told(message: Message) -> Any:
     return state(message) if isinstance(message, RobotState) else message
 
 
+def is_reason(data: bytes) -> bool:
+    """Return whether these bytes are a line of the log with the name `reason`."""
+    # CDR: four bytes of encapsulation, eight of the stamp, the level padded to four, the name.
+    return data[16:27] == (len(REASON) + 1).to_bytes(4, "little") + REASON.encode() + b"\0"
+
+
 def test_the_file_has_each_message_that_was_published_to_the_byte(
     recorded: Any, file: Path
 ) -> None:
@@ -221,7 +240,8 @@ def test_the_file_has_each_message_that_was_published_to_the_byte(
     written: dict[str, list[bytes]] = defaultdict(list)
     with file.open("rb") as stream:
         for _, channel, message in SeekingReader(stream).iter_messages():
-            written[channel.topic].append(message.data)
+            if channel.topic != "/log" or not is_reason(message.data):
+                written[channel.topic].append(message.data)
     rows = {row.topic("", "app"): row for row in CHANNELS}
     published = replay_file(world, tape)
     assert set(written) == {*published, "/log"} >= set(rows)
@@ -286,7 +306,9 @@ def test_two_libraries_make_of_the_definitions_in_the_file_what_was_published(
         assert len(told[name]) == len(published) > 0
         for number, (one, ours) in enumerate(zip(told[name], published, strict=True)):
             assert same(one, ours), f"{name}, message {number}: {one} for {ours}"
-    lines = [(one.stamp.sec, one.stamp.nanosec, one.name) for one in told["/log"]]
+    lines = [
+        (one.stamp.sec, one.stamp.nanosec, one.name) for one in told["/log"] if one.name != REASON
+    ]
     assert lines == [(one.stamp.sec, one.stamp.nanosec, one.name) for one in happened(world)]
 
 

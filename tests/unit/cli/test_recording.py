@@ -265,13 +265,21 @@ def test_what_a_stranger_recorded_moves_no_cursor(
         assert all(line.isprintable() for line in out.splitlines())
 
 
-@pytest.mark.parametrize("when", ["late", "12:3", "-1", "12:00:00:00"])
-def test_a_time_that_is_none_is_refused(
-    where: Path, when: str, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("when", "words"),
+    [
+        ("late", "late is not a time; write for example 14:05, "),
+        ("12:3", "12:3 is not a time; write for example 14:05, "),
+        ("25:00", "25:00 is not a time of day: a day goes from 00:00 to 23:59:59; write for "),
+    ],
+)
+def test_a_text_that_is_not_a_time_is_refused_with_examples(
+    where: Path, when: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as end:
         log(capsys, where, "show", "1", f"--from={when}")
-    assert "neither seconds nor HH:MM:SS" in capsys.readouterr().err
+    assert end.value.code == Exit.USAGE
+    assert words in capsys.readouterr().err
 
 
 def test_a_replay_says_that_all_is_the_same(
@@ -433,6 +441,8 @@ def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
     code, out, _ = log(capsys, where)
     assert (code, len(out.splitlines())) == (Exit.OK, HARMED)
     assert min(ends[Exit.OK], ends[Exit.FAILURE]) > HARMED / 2, ends
+    code, out, err = log(capsys, where, "show", "all")
+    assert (code, "  stop: " in out, "Traceback" in err) == (Exit.OK, True, False)
 
 
 def test_what_is_not_there_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -384,7 +384,7 @@ def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_pa
     assert read_end(cut) is None
     rewrite(Recording(cut), new)
     assert read_end(new) == replace(said, cut="open")
-    assert said == EndRecord(said.wall_ns, said.last_ns, said.said)
+    assert said == EndRecord(said.wall_ns, said.last_ns, said.said, earliest_ns=said.wall_ns)
     rewrite(Recording(new), tmp_path / "again.mcap", "crash")
     assert read_end(tmp_path / "again.mcap") == read_end(new), "it was finished before"
     assert read_end(tmp_path / "none") is None

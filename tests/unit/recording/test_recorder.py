@@ -138,12 +138,82 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     assert bench.recorder.status.trouble == ""
     assert missing > 100
     before, after = bench.end()
-    assert [e.level for e in bench.said].count("warning") == 1
+    told = [event.text for event in bench.said if event.text != f"to {bench.where}"]
+    assert told == [
+        "the disk is too slow; steps are lost",
+        f"the disk goes on; {missing} steps are missing",
+    ]
     numbers = [step.number for path in (before, after) for step in steps(Recording(path))]
     assert len(numbers) == bench.world.steps - missing
     for path in (before, after):
         assert replay_file(Recording(path)).comparison.same
     assert after.name.endswith(KEPT) == before.name.endswith(KEPT)
+
+
+@contextmanager
+def slow_syncs(bench: Bench, seconds: float, stalls: bool = False) -> Iterator[None]:
+    """Make each sync take this time, s. The robot drives in it, or this process stalls."""
+    sync = os.fsync
+
+    def slow(handle: int) -> None:
+        if stalls:
+            bench.world.stall(seconds)
+        else:
+            bench.world.hold(0.5, 0.2, seconds=seconds)
+        sync(handle)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(os, "fsync", slow)
+        yield
+
+
+def test_a_disk_that_hangs_is_reported_after_three_seconds_and_so_is_its_return(
+    bench: Bench,
+) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    bench.said.clear()
+    with slow_syncs(bench, 2.9):
+        bench.write()
+    assert (bench.said, bench.recorder.status.trouble) == ([], "")
+    with slow_syncs(bench, 3.2):
+        bench.write()
+    words = "the disk has accepted nothing for 3 s"
+    assert [(e.text, e.level) for e in bench.said] == [(f"{words}; driving goes on", "warning")]
+    assert bench.recorder.status.trouble == words
+    bench.drive(2.0)
+    bench.world.run(0.1)
+    assert bench.recorder.status.trouble == ""
+    assert bench.said[1:] == [Event("recording", "the disk goes on; no steps are missing")]
+
+
+def test_a_disk_that_takes_long_for_every_sync_is_reported_once(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.write()
+    with slow_syncs(bench, 3.5):
+        bench.drive(4.0)
+    assert [e.level for e in bench.said if e.text != f"to {bench.where}"] == ["warning"]
+
+
+def test_a_disk_that_takes_two_seconds_for_every_sync_is_not_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first file and each new file need several syncs in a row."""
+    monkeypatch.setattr(step_writer, "MAX_FILE_NS", 5_000_000_000)
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    with slow_syncs(bench, 2.0):
+        bench.drive(8.0)
+    assert {event.level for event in bench.said} == {"info"}
+    assert len(bench.end()) > 2
+
+
+def test_a_process_that_did_not_run_is_not_a_disk_that_hangs(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.write()
+    with slow_syncs(bench, 5.0, stalls=True):
+        bench.drive(3.0)
+    assert {event.level for event in bench.said} == {"info"}
 
 
 def test_a_disk_that_refuses_is_reported_and_tried_again_and_driving_goes_on(
@@ -162,6 +232,8 @@ def test_a_disk_that_refuses_is_reported_and_tried_again_and_driving_goes_on(
     assert bench.recorder.status.trouble == ""
     levels = [event.level for event in bench.said]
     assert levels == ["warning", "info"]
+    missing = bench.recorder.status.missing
+    assert bench.said[-1].text == f"to {where} again; {missing} steps are missing"
     (path,) = bench.end()
     assert replay_file(Recording(path)).comparison.same
     assert next(steps(Recording(path))).number > 100

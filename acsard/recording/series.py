@@ -1,0 +1,205 @@
+"""Maps a range of time to the recordings in a directory, and reads the files of a drive as one.
+
+A rotation splits the recording of one run of the daemon into files. The last step of a file and the
+first step of the next one have consecutive numbers. Files with this property are one `Series`, so
+that a drive or a replay goes on across a rotation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from msgspec import Struct, field
+
+from acsard.core.values import NS_PER_S, AcsardError
+from acsard.host.errors import RecordingError
+from acsard.recording.directory import listed
+from acsard.recording.end_record import read_end
+from acsard.recording.file import Recording, Topic
+from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
+
+MARGIN_S = 60.0
+"""Time around a recording in which its steps are searched for.
+
+The end record has the time at which the last message began, and a slow disk makes messages long.
+"""
+
+GAP_S = 2.0
+"""Longest time between two recordings that is not reported as a gap."""
+
+
+class Series(Recording):
+    """Several files of one run of the daemon without a missing step between them, read as one."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        """Read the first file. Raises `RecordingError` as `Recording` does."""
+        super().__init__(_present(paths[0]))
+        self.paths = list(paths)
+
+    def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
+        """Yield the messages of all files as `Recording.messages` does.
+
+        Only the state at the beginning of the first file is among them.
+        """
+        self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
+        self.unfinished = None
+        for path in self.paths:
+            part = Recording(_present(path))
+            for message in part.messages():
+                if message[0] != "state" or path == self.paths[0]:
+                    yield message
+            self.damaged += part.damaged
+            self.ended, self.cut, self.why = part.ended, part.cut, part.why
+            self.unfinished = part.unfinished
+
+
+class Found(NamedTuple):
+    """A recording with steps in the range of time, and the part of it that lies in the range."""
+
+    recording: Recording
+    part: Span
+
+
+class Search(Struct):
+    """Result of a search."""
+
+    found: list[Found] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+    """A sentence for each file that cannot be read."""
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+    """Times in the range in which nothing was recorded, s since 1970."""
+
+
+class NothingRecordedError(AcsardError):
+    """No file has a step in the range of time. The text names the nearest recordings."""
+
+
+class _Piece(NamedTuple):
+    """A time that a file covers, s since 1970."""
+
+    begin: float
+    end: float
+    path: Path
+
+
+def search(files: Sequence[Path], first: float, last: float) -> Search:
+    """Find the steps between two times, s since 1970, in the files of a directory, in their order.
+
+    If a drive was under way at the beginning of a found file, the file before it is read too.
+    Raises `NothingRecordedError` if there is no such step.
+    """
+    result, pieces = Search(), list[_Piece]()
+    chosen: dict[int, Contents] = {}
+    for number, path in enumerate(files):
+        try:
+            covered = _covered(path)
+            if covered.begin - MARGIN_S > last or covered.end + MARGIN_S < first:
+                pieces.append(covered)
+                continue
+            contents = read_contents(Recording(_present(path)))
+        except RecordingError as error:
+            result.unreadable.append(str(error))
+            continue
+        if contents is None:
+            continue
+        pieces += [_Piece(one.begin, one.end, path) for one in contents.stretches]
+        if part_between(contents.stretches, first, last) is not None:
+            chosen[number] = contents
+    for group in _groups(files, chosen):
+        paths = [files[number] for number in group]
+        recording = Recording(_present(paths[0])) if len(paths) == 1 else Series(paths)
+        contents = chosen[group[0]] if len(paths) == 1 else read_contents(recording)
+        part = part_between(contents.stretches, first, last) if contents else None
+        if part is not None:
+            result.found.append(Found(recording, part))
+    if not result.found:
+        raise NothingRecordedError(_nearest(pieces, first, last))
+    result.gaps = _gaps(pieces, first, last)
+    return result
+
+
+def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
+    """Return the times between two times that no piece covers."""
+    inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
+    ends = [first]
+    for piece in inside:
+        ends.append(max(ends[-1], piece.end))
+    begins = [*(piece.begin for piece in inside), last]
+    pairs = zip(ends, begins, strict=True)
+    return [(end, begin) for end, begin in pairs if GAP_S < begin - end < math.inf]
+
+
+def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
+    """Return the numbers of the chosen files, grouped into series."""
+    groups: list[list[int]] = []
+    for number, contents in sorted(chosen.items()):
+        if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
+            groups[-1].append(number)
+        else:
+            groups.append([*_earlier(files, number, contents), number])
+    return groups
+
+
+def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
+    """Return the numbers of the files before this one in which its first drive began."""
+    found: list[int] = []
+    while number > 0 and contents.first.recorded.status[0] == "driving":
+        number -= 1
+        try:
+            before = read_contents(Recording(_present(files[number])))
+        except RecordingError:
+            break
+        if before is None or not _continues(before, contents):
+            break
+        found.insert(0, number)
+        contents = before
+    return found
+
+
+def _continues(before: Contents, contents: Contents) -> bool:
+    """Return whether the steps of two files follow each other in one run of the daemon."""
+    follows = contents.first.number == before.last.number + 1
+    mono_ns = contents.first.inputs.now.mono_ns - before.last.inputs.now.mono_ns
+    return follows and 0 <= mono_ns < MARGIN_S * NS_PER_S
+
+
+def _covered(path: Path) -> _Piece:
+    """Return the time that a file covers. The whole file must be read if it has no end."""
+    end = read_end(path) or Recording(_present(path)).compute_end_record()
+    earliest_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
+    return _Piece(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
+
+
+def _present(path: Path) -> Path:
+    """Return the present path of a recording, because the daemon renames a file at its end."""
+    if path.exists() or not path.parent.is_dir():
+        return path
+    stem = path.name.partition(".")[0]
+    return next((p for p in listed(path.parent) if p.name.partition(".")[0] == stem), path)
+
+
+def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
+    """Return the sentence that nothing was recorded, with the nearest recordings."""
+    before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
+    after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
+    text = f"nothing was recorded {in_words(first, last)}"
+    ends = f"the last recording before it is {_described(before)}" if before else ""
+    begins = f"the first one after it is {_described(after)}" if after else ""
+    return "; ".join(filter(None, [text, ends, begins]))
+
+
+def _described(piece: _Piece) -> str:
+    return f"{piece.path.name}, {clock(piece.begin, day=True)} to {clock(piece.end, day=True)}"
+
+
+def in_words(first: float, last: float) -> str:
+    """Describe a range of time, s since 1970, both of which may be infinite."""
+    parts = [
+        f"{word} {clock(at, day=True)}"
+        for word, at in (("from", first), ("to", last))
+        if math.isfinite(at)
+    ]
+    return " ".join(parts) or "at any time"
