@@ -37,7 +37,8 @@ FULL = replace(
 )
 
 VERDICT = re.compile(
-    r"([\d ]+) of \1 lines are the same, ([\d ]+) of \2 poses, ([\d ]+) of \3 modes$"
+    r"([\d ]+) of \1 lines are the same, ([\d ]+) of \2 poses, ([\d ]+) of \3 modes, "
+    r"\3 of \3 reasons, \3 of \3 links, \3 of \3 sources, ([\d ]+) of \4 events$"
 )
 """The verdict when everything is the same to the last bit, not merely to the micrometre."""
 
