@@ -26,6 +26,7 @@ from acsard.recording.recorded_steps import (
     Status,
     Step,
     checksum,
+    input_names,
     microposes,
     status_of,
 )
@@ -33,12 +34,24 @@ from acsard.recording.recorded_steps import (
 FAULT = "fault"
 
 Output = Literal[
-    "line", "sent line", "mode", "link", "source", "pose", "event", "client", "reason", "event text"
+    "line",
+    "sent line",
+    "mode",
+    "link",
+    "source",
+    "pose",
+    "event",
+    "client",
+    "reason",
+    "event text",
+    "input names",
 ]
 """An output that is compared.
 
 `line` is the line that the robot decided, and `sent line` the line that the guard let pass. `event`
 is the name, level, kind or number of an event, and `client` the name of the client in an event.
+`input names` are the names in the inputs of a batch, which differ from its checksum; the difference
+is in the last step of the batch.
 """
 
 WORDING: frozenset[Output] = frozenset({"reason", "event text"})
@@ -131,7 +144,7 @@ class Replay:
         self.comparison = Comparison()
         self._config = self.robot.config
         self._guard = Guard(self.robot.session.codec.stop, self._config, memory)
-        self._checksum = 0
+        self._checksum = self._names = 0
         self._pose: Micropose = (0, 0, 0)
         """The last replayed pose."""
 
@@ -142,7 +155,7 @@ class Replay:
         are equal.
         """
         if step.begins:
-            self._checksum = 0
+            self._checksum = self._names = 0
         outputs = self.outputs = replay_step(self.robot, step)
         # The step changed a setting.
         if self.robot.config is not self._config:
@@ -150,6 +163,7 @@ class Replay:
             self._guard.use(self._config)
         line, trip = self._guard.check(outputs)
         self._checksum = checksum(outputs.estimates, self._checksum)
+        self._names = input_names(step.inputs, self._names)
         if step.recorded.sent is not None:
             # The board obeyed the recorded line, even if the replay decides another one.
             self._guard.left(step.recorded.sent)
@@ -193,6 +207,8 @@ class Replay:
         what = tuple([name for name, new, old in pairs if new != old])
         if replayed.events != recorded.events:
             what += _different_parts(replayed.events, recorded.events)
+        if recorded.names not in (None, self._names):
+            what += ("input names",)
         if not what:
             return None
         seen = Seen(recorded.line, recorded.status, recorded.poses, recorded.events)

@@ -53,7 +53,8 @@ def explain_verdict(other: bool) -> str:
     return (
         "(Each line to the board, each pose by odometry to the um, the mode, reason, link and "
         "source of each step, and each event with its text and its client is computed "
-        f"{computed} from the recorded inputs, and compared with the recorded one.)"
+        f"{computed} from the recorded inputs, and compared with the recorded one. "
+        "The names in the inputs are compared with a checksum.)"
     )
 
 

@@ -152,6 +152,32 @@ def caller(messages: Messages, dice: random.Random) -> None:
     forge_row(messages, dice, forge)
 
 
+def sender(messages: Messages, dice: random.Random) -> None:
+    """Forge the sender of one command, which need not change any output."""
+
+    def forge(rare: Rare) -> Rare | None:
+        if not rare.commands:
+            return None
+        first, *others = rare.commands
+        forged = replace(first, sender=forged_word(first.sender, dice))
+        return replace(rare, commands=(forged, *others))
+
+    forge_row(messages, dice, forge)
+
+
+def refused_source(messages: Messages, dice: random.Random) -> None:
+    """Forge the source of a refused command, which changes no output."""
+
+    def forge(rare: Rare) -> Rare | None:
+        if not rare.refusals:
+            return None
+        first, *others = rare.refusals
+        forged = replace(first, source=forged_word(first.source, dice))
+        return replace(rare, refusals=(forged, *others))
+
+    forge_row(messages, dice, forge)
+
+
 def copy(messages: Messages, dice: random.Random) -> None:
     """Forge the copy of an event from which the list of recordings makes its summary."""
     places = [n for n, (topic, _, _) in enumerate(messages) if topic == "events"]
@@ -204,7 +230,7 @@ def forged_files(
     "forge",
     [
         reason, source, event_client, event_text, event_name, removed_event, added_event, caller,
-        copy, removed_copy,
+        sender, refused_source, copy, removed_copy,
     ],
 )  # fmt: skip
 def test_a_replay_finds_every_forged_reason_name_and_event(
