@@ -115,6 +115,11 @@ class Comparison(Struct):
         """True if every line, pose, mode, reason, link, source and event is equal."""
         return self.first is None
 
+    @property
+    def only_words(self) -> bool:
+        """True if nothing but the words of reasons or events differs."""
+        return not self.same and self.first_by_output.keys() <= WORDING
+
 
 def replay_step(robot: Robot, step: Step) -> Outputs:
     """Run a recorded step on the robot, and return its outputs.
