@@ -69,7 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "replay",
         help="run the recorded inputs through the robot again and compare the results",
         description="Run the recorded inputs through the robot again, and compare every line, "
-        "mode and pose with the recorded ones. With --config, show what another "
+        "pose, mode, reason and event with the recorded ones. With --config, show what another "
         "configuration would have changed.",
     )
     replay.set_defaults(main=main_replay)
@@ -228,7 +228,8 @@ def main_replay(args: argparse.Namespace) -> int:
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with progress(recording) as tell:
-        comparison, trouble, failed_step = replay_file(recording, other, tell)
+        result = replay_file(recording, other, tell)
+    comparison = result.comparison
     print(f"{verdict(comparison)}\n{explain_verdict(other is not None)}")
     began_ns, rows = recording.about.mono_ns, list[str]()
     if other is not None:
@@ -236,11 +237,11 @@ def main_replay(args: argparse.Namespace) -> int:
     if comparison.first is not None:
         difference = describe_difference(comparison.first, began_ns)
         rows = [*difference, *rows, *describe_outcome(comparison)]
-    rows += [failed_step] if failed_step else []
+    rows += filter(None, [result.event_copies, result.failed_step])
     for row in rows:
         print(printable(row))
-    _note(recording, trouble or _bracketed(recording.missing))
-    return int(Exit.OK if comparison.same or other is not None else Exit.FAILURE)
+    _note(recording, result.trouble or _bracketed(recording.missing))
+    return int(Exit.OK if result.same or other is not None else Exit.FAILURE)
 
 
 def main_recover(args: argparse.Namespace) -> int:

@@ -21,6 +21,6 @@ The modules that do I/O:
 - `time_span`: reads the times that a person types, and finds them in a recording.
 - `recovery`: finishes a file that was cut off.
 - `state`: encodes a robot as bytes, and decodes it.
-- `file_replay`: replays a file.
+- `file_replay`: replays a file; `event_copies` compares the copies of its events.
 - `export`: writes files for other programs; `atomic_output` puts each in its place atomically.
 """

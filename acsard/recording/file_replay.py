@@ -13,6 +13,7 @@ from acsard.core.guard import Memory
 from acsard.core.robot import Robot
 from acsard.core.values import Outputs
 from acsard.host.errors import RecordingError
+from acsard.recording.event_copies import EventCopies
 from acsard.recording.file import Recording
 from acsard.recording.merge import adopt
 from acsard.recording.recorded_steps import Step, UnfinishedError, unfinished
@@ -48,6 +49,13 @@ class ReplayResult(NamedTuple):
 
     It is "" if the daemon did not fail.
     """
+    event_copies: str = ""
+    """Sentence about the first copy of an event that differs from its step; "" if none does."""
+
+    @property
+    def same(self) -> bool:
+        """True if all outputs of the replay are equal, and all copies of the events."""
+        return self.comparison.same and not self.event_copies
 
 
 def config_of(recording: Recording) -> Config:
@@ -63,15 +71,22 @@ def config_of(recording: Recording) -> Config:
         ) from None
 
 
-def steps(recording: Recording) -> Iterator[Step]:
-    """Yield every step that can be read, in order. The numbers of the steps show the gaps."""
+def steps(recording: Recording, copies: EventCopies | None = None) -> Iterator[Step]:
+    """Yield every step that can be read, in order. The numbers of the steps show the gaps.
+
+    `copies` takes the same steps and the copies of their events.
+    """
     for topic, _, data in recording.messages():
+        if topic == "events" and copies is not None:
+            copies.copy(data)
         if topic == "steps":
             try:
                 batch = decode(data)
             except BatchError:
                 recording.damaged += 1
                 continue
+            if copies is not None:
+                copies.batch(batch)
             yield from batch
 
 
@@ -89,6 +104,8 @@ class RecordedRun:
         """Why `steps` ended before the end of the file; "" if it did not."""
         self.number: int | None = None
         """Number of the last step that `steps` yielded."""
+        self.copies = EventCopies(recording)
+        """The copies of the events of the steps that `steps` yielded."""
         self._recording = recording
         self._state, new_robot = _state(recording), Robot(self.config)
         self.robot, self.memory = self._state or (new_robot, Memory())
@@ -114,7 +131,7 @@ class RecordedRun:
         Raises `RecordingError` if the first steps are missing, or if no step can be read.
         """
         path = self._recording.path
-        for step in steps(self._recording):
+        for step in steps(self._recording, self.copies):
             number = self.number
             if number is None and self._state is None and step.number > 0:
                 raise RecordingError(f"{path}: its first steps are missing or damaged")
@@ -128,6 +145,7 @@ class RecordedRun:
             yield step
         if self.number is None:
             raise RecordingError(f"{path} has no steps: it ends within its first second")
+        self.copies.end()
 
 
 def replay_file(
@@ -145,7 +163,7 @@ def replay_file(
                 progress(step.inputs.now.wall_ns)
             replay.step(step)
     failed_step = "" if run.trouble else _failed_step(recording, replay.robot, run.number)
-    return ReplayResult(replay.comparison, run.trouble, failed_step)
+    return ReplayResult(replay.comparison, run.trouble, failed_step, run.copies.difference)
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:

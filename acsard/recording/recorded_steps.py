@@ -97,6 +97,11 @@ class RecordedOutputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     checksum: int | None = None
     """CRC-32 of all estimates of the batch, in its last step; None in the other steps."""
+    names: int | None = None
+    """CRC-32 of all `input_names` of the batch, in its last step.
+
+    None in the other steps, and in a batch that an older version recorded.
+    """
 
 
 class Step(Struct, frozen=True):
@@ -147,6 +152,21 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
         data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)
         before = zlib.crc32(data, before)
     return before
+
+
+def input_names(inputs: Inputs, before: int) -> int:
+    """Return the CRC-32 of the names of the sources, senders and clients in the inputs of a step.
+
+    `before` is the CRC-32 of the names in the inputs before these, or 0.
+    """
+    names = [
+        *[name for command in inputs.commands for name in (command.source, command.sender)],
+        *[request.by for request in inputs.requests],
+        *[name for refusal in inputs.refusals for name in (refusal.source, refusal.sender)],
+        *[event.by for event in inputs.events],
+    ]
+    # Most steps have no name. JSON keeps the ends of the names apart.
+    return zlib.crc32(msgspec.json.encode(names), before) if names else before
 
 
 def microposes(estimates: Sequence[Estimate]) -> tuple[Micropose, ...]:

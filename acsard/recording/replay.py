@@ -8,25 +8,54 @@ configuration, the differences show how the robot would have behaved.
 from __future__ import annotations
 
 import math
+import operator
+from collections.abc import Callable
 from functools import lru_cache
+from itertools import zip_longest
+from typing import Literal
 
 from msgspec import Struct
 
 from acsard.core.config.settings import Config
 from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
-from acsard.core.values import Instant, Outputs
+from acsard.core.values import Event, Instant, Outputs
 from acsard.recording.recorded_steps import (
     MICRO,
     Micropose,
     Status,
     Step,
     checksum,
+    input_names,
     microposes,
     status_of,
 )
 
 FAULT = "fault"
+
+Output = Literal[
+    "line",
+    "sent line",
+    "mode",
+    "link",
+    "source",
+    "pose",
+    "event",
+    "client",
+    "reason",
+    "event text",
+    "input names",
+]
+"""An output that is compared.
+
+`line` is the line that the robot decided, and `sent line` the line that the guard let pass. `event`
+is the name, level, kind or number of an event, and `client` the name of the client in an event.
+`input names` are the names in the inputs of a batch, which differ from its checksum; the difference
+is in the last step of the batch.
+"""
+
+WORDING: frozenset[Output] = frozenset({"reason", "event text"})
+"""Outputs that are text for people, so that another version may word them differently."""
 
 
 class Seen(Struct, frozen=True):
@@ -35,6 +64,7 @@ class Seen(Struct, frozen=True):
     line: bytes | None
     status: Status
     poses: tuple[Micropose, ...]
+    events: tuple[Event, ...] = ()
     trip: str = ""
     """Why the guard replaced the line; "" if it did not."""
 
@@ -44,11 +74,8 @@ class Difference(Struct, frozen=True):
 
     number: int
     at: Instant
-    what: tuple[str, ...]
-    """The outputs that differ, out of `line`, `sent line`, `mode` and `pose`.
-
-    `line` is the line that the robot decided, and `sent line` the line that the guard let pass.
-    """
+    what: tuple[Output, ...]
+    """The outputs that differ."""
     recorded: Seen
     replayed: Seen
 
@@ -63,9 +90,17 @@ class Comparison(Struct):
     poses: int = 0
     poses_same: int = 0
     modes_same: int = 0
+    reasons_same: int = 0
+    links_same: int = 0
+    sources_same: int = 0
+    events: int = 0
+    """Number of events. A step counts with the side, recorded or replayed, that has more."""
+    events_same: int = 0
     exact: bool = True
     """True while every recorded checksum matches: all poses are equal to the last bit."""
     first: Difference | None = None
+    first_by_output: dict[Output, Difference] = {}
+    """First difference of each output that differs."""
     fault: Difference | None = None
     """First step in which the replay is in fault and the recording is not."""
     apart: float = 0.0
@@ -77,8 +112,13 @@ class Comparison(Struct):
 
     @property
     def same(self) -> bool:
-        """True if every line, mode and pose is equal."""
+        """True if every line, pose, mode, reason, link, source and event is equal."""
         return self.first is None
+
+    @property
+    def only_words(self) -> bool:
+        """True if nothing but the words of reasons or events differs."""
+        return not self.same and self.first_by_output.keys() <= WORDING
 
 
 def replay_step(robot: Robot, step: Step) -> Outputs:
@@ -109,7 +149,7 @@ class Replay:
         self.comparison = Comparison()
         self._config = self.robot.config
         self._guard = Guard(self.robot.session.codec.stop, self._config, memory)
-        self._checksum = 0
+        self._checksum = self._names = 0
         self._pose: Micropose = (0, 0, 0)
         """The last replayed pose."""
 
@@ -120,7 +160,7 @@ class Replay:
         are equal.
         """
         if step.begins:
-            self._checksum = 0
+            self._checksum = self._names = 0
         outputs = self.outputs = replay_step(self.robot, step)
         # The step changed a setting.
         if self.robot.config is not self._config:
@@ -128,10 +168,13 @@ class Replay:
             self._guard.use(self._config)
         line, trip = self._guard.check(outputs)
         self._checksum = checksum(outputs.estimates, self._checksum)
+        self._names = input_names(step.inputs, self._names)
         if step.recorded.sent is not None:
             # The board obeyed the recorded line, even if the replay decides another one.
             self._guard.left(step.recorded.sent)
-        replayed = Seen(outputs.line, status_of(outputs), microposes(outputs.estimates), trip)
+        replayed = Seen(
+            outputs.line, status_of(outputs), microposes(outputs.estimates), outputs.events, trip
+        )
         difference = self._compare(step, replayed, line)
         self._count(step, outputs, replayed)
         if difference is not None:
@@ -139,9 +182,14 @@ class Replay:
         return difference
 
     def _keep(self, difference: Difference) -> None:
-        """Keep the first difference, and the first fault that only the replay has."""
+        """Keep the first difference of all and of each output, and the first fault of the replay.
+
+        A fault that the recording has too is not kept.
+        """
         comparison = self.comparison
         comparison.first = comparison.first or difference
+        for output in difference.what:
+            comparison.first_by_output.setdefault(output, difference)
         if difference.replayed.status[0] == FAULT != difference.recorded.status[0]:
             comparison.fault = comparison.fault or difference
 
@@ -150,21 +198,25 @@ class Replay:
         recorded = step.recorded
         exact = recorded.checksum is None or recorded.checksum == self._checksum
         self.comparison.exact = self.comparison.exact and exact
-        mode, _, *others = replayed.status
-        recorded_mode, _, *recorded_others = recorded.status
-        what = tuple(
-            name
-            for name, same in (
-                ("line", replayed.line == recorded.line),
-                ("sent line", recorded.sent is None or guarded == recorded.sent),
-                ("mode", mode == recorded_mode and others == recorded_others),
-                ("pose", replayed.poses == recorded.poses),
-            )
-            if not same
+        mode, reason, link, source = replayed.status
+        recorded_mode, recorded_reason, recorded_link, recorded_source = recorded.status
+        pairs: tuple[tuple[Output, object, object], ...] = (
+            ("line", replayed.line, recorded.line),
+            ("sent line", guarded if recorded.sent is not None else None, recorded.sent),
+            ("mode", mode, recorded_mode),
+            ("link", link, recorded_link),
+            ("source", source, recorded_source),
+            ("pose", replayed.poses, recorded.poses),
+            ("reason", reason, recorded_reason),
         )
+        what = tuple([name for name, new, old in pairs if new != old])
+        if replayed.events != recorded.events:
+            what += _different_parts(replayed.events, recorded.events)
+        if recorded.names not in (None, self._names):
+            what += ("input names",)
         if not what:
             return None
-        seen = Seen(recorded.line, recorded.status, recorded.poses)
+        seen = Seen(recorded.line, recorded.status, recorded.poses, recorded.events)
         return Difference(step.number, step.inputs.now, what, seen, replayed)
 
     def _count(self, step: Step, outputs: Outputs, replayed: Seen) -> None:
@@ -173,7 +225,14 @@ class Replay:
         if recorded.line is not None or replayed.line is not None:
             comparison.lines += 1
             comparison.lines_same += recorded.line == replayed.line
-        comparison.modes_same += replayed.status[0] == recorded.status[0]
+        mode, reason, link, source = map(operator.eq, replayed.status, recorded.status)
+        comparison.modes_same += mode
+        comparison.reasons_same += reason
+        comparison.links_same += link
+        comparison.sources_same += source
+        for new, old in zip_longest(replayed.events, recorded.events):
+            comparison.events += 1
+            comparison.events_same += new == old
         comparison.poses += len(recorded.poses)
         pairs = zip(recorded.poses, replayed.poses, strict=False)
         comparison.poses_same += sum(a == b for a, b in pairs)
@@ -190,6 +249,18 @@ class Replay:
             if pose != self._pose:
                 apart = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1]) / MICRO
                 comparison.apart = max(comparison.apart, apart)
+
+
+def _different_parts(
+    replayed: tuple[Event, ...], recorded: tuple[Event, ...]
+) -> tuple[Output, ...]:
+    """Return the parts in which the events of a step differ."""
+    parts: tuple[tuple[Output, Callable[[Event], object]], ...] = (
+        ("event", lambda event: (event.name, event.level, event.kind, event.count, event.news)),
+        ("client", lambda event: event.by),
+        ("event text", lambda event: event.text),
+    )
+    return tuple([name for name, part in parts if [*map(part, replayed)] != [*map(part, recorded)]])
 
 
 @lru_cache(64)

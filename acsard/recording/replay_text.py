@@ -9,6 +9,7 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
 from acsard.core.formatting import listed, printable
+from acsard.core.values import Event
 from acsard.recording.recorded_steps import MICRO
 from acsard.recording.replay import Comparison, Difference, Seen, fastest
 
@@ -24,12 +25,19 @@ MAX_KEYS = 8
 
 def verdict(comparison: Comparison) -> str:
     """Return the result of a replay in one line."""
-    lines = _share(comparison.lines_same, comparison.lines)
-    poses = _share(comparison.poses_same, comparison.poses)
-    modes = _share(comparison.modes_same, comparison.steps)
-    rounded = comparison.same and not comparison.exact
+    c = comparison
+    shares = (
+        ("poses", c.poses_same, c.poses),
+        ("modes", c.modes_same, c.steps),
+        ("reasons", c.reasons_same, c.steps),
+        ("links", c.links_same, c.steps),
+        ("sources", c.sources_same, c.steps),
+        ("events", c.events_same, c.events),
+    )
+    rest = ", ".join(f"{_share(same, total)} {name}" for name, same, total in shares)
+    rounded = c.same and not c.exact
     bits = " (poses agree to 1 um, but not to the last bit)" if rounded else ""
-    return f"{lines} lines are the same, {poses} poses, {modes} modes{bits}"
+    return f"{_share(c.lines_same, c.lines)} lines are the same, {rest}{bits}"
 
 
 def _share(same: int, total: int) -> str:
@@ -43,8 +51,10 @@ def explain_verdict(other: bool) -> str:
     """
     computed = "with that configuration" if other else "by this version"
     return (
-        "(Each line to the board, each pose by odometry to the um, and the mode of each step is "
-        f"computed {computed} from the recorded inputs, and compared with the recorded one.)"
+        "(Each line to the board, each pose by odometry to the um, the mode, reason, link and "
+        "source of each step, and each event with its text and its client is computed "
+        f"{computed} from the recorded inputs, and compared with the recorded one. "
+        "The names in the inputs are compared with a checksum.)"
     )
 
 
@@ -72,7 +82,13 @@ def _side(name: str, seen: Seen) -> list[str]:
         f"            mode {mode} ({reason}), link {link}, source {source or 'none'}",
         *[f"            pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
     ]
+    rows += [f"            event {_event(event)}" for event in seen.events]
     return [*rows, f"            the guard: {seen.trip}"] if seen.trip else rows
+
+
+def _event(event: Event) -> str:
+    by = f" (by {event.by})" if event.by else ""
+    return printable(f"{event.name}: {event.text}{by}")
 
 
 def explain_settings(
@@ -88,16 +104,22 @@ def explain_settings(
     keys = [key for key in before | after if before.get(key) != after.get(key)]
     changes = [f"{key} was {_value(key, before)}, is {_value(key, after)}" for key in keys]
     rows = [f"changed settings: {listed(changes, MAX_KEYS, '; ') or 'none'}"]
-    first, fault = comparison.first, comparison.fault
-    if first is not None and "line" in first.what:
+    first, fault = comparison.first_by_output.get("line"), comparison.fault
+    if first is not None:
+        if first is not comparison.first:
+            seconds = (first.at.mono_ns - began_ns) / 1e9
+            rows.append(
+                f"the first line that differs is in step {first.number}, {seconds:.3f} s after the "
+                "beginning"
+            )
         speeds = _speeds(fastest(first.recorded.line), fastest(first.replayed.line))
         shaping = [key for key in keys if key.startswith(LINE_SETTINGS)]
         because = f", because of {', '.join(shaping[:MAX_KEYS])}" if shaping else ""
         rows.append(f"the fastest wheel of that line: {speeds}{because}")
-    if first is not None and fault is not None:
+    if fault is not None:
         seconds = (fault.at.mono_ns - began_ns) / 1e9
         rows.append(f"in fault from {seconds:.3f} s on: {printable(fault.replayed.status[1])}")
-        if first.number < fault.number:
+        if first is not None and first.number < fault.number:
             rows.append(
                 "  the recorded wheels obeyed the recorded commands, not those of this replay: a "
                 "robot with this configuration need not have had that fault. Only the part before "

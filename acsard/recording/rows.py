@@ -37,6 +37,7 @@ from acsard.recording.recorded_steps import (
     Step,
     Taken,
     checksum,
+    input_names,
     micropose,
     status_of,
 )
@@ -129,6 +130,8 @@ class Batch(Struct, frozen=True, array_like=True):
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
     """CRC-32 of all estimates of the batch."""
+    names: int | None = None
+    """CRC-32 of all names in the inputs of the batch; None if an older version recorded it."""
 
 
 class _First(Struct, frozen=True, array_like=True):
@@ -175,7 +178,11 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
             )
         )
     crc = checksum([e for t in taken for e in t.outputs.estimates], 0)
-    return msgspec.msgpack.encode(Batch(first, start.mono_ns, offset_ns, unit, tuple(rows), crc))
+    names = 0
+    for inputs, _, _ in taken:
+        names = input_names(inputs, names)
+    batch = Batch(first, start.mono_ns, offset_ns, unit, tuple(rows), crc, names)
+    return msgspec.msgpack.encode(batch)
 
 
 def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
@@ -285,6 +292,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
             poses=tuple(poses),
             events=rare.events_out,
             checksum=batch.checksum if index == last else None,
+            names=batch.names if index == last else None,
         )
         if row.tick:
             tick_ns = now.mono_ns

@@ -206,9 +206,9 @@ def drawn(
     remarks = [*filter(None, [recording.missing]), *replayed.notes]
     comparison = replayed.replay.comparison
     if not (comparison.same or replayed.notes or data.missing):
+        what = "other words for reasons or events" if comparison.only_words else "other results"
         remarks.append(
-            "this version of acsard computes other results than the recorded ones: "
-            f"{verdict(comparison)}"
+            f"this version of acsard computes {what} than the recorded ones: {verdict(comparison)}"
         )
     names = ", ".join(path.name for path in recording.paths)
     origin = Origin(names, about.robot, about.version, about.python, tuple(remarks))

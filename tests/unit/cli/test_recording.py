@@ -301,7 +301,8 @@ def test_a_replay_says_what_it_has_compared(
     for word in (
         "Each line to the board",
         "each pose",
-        "the mode of each step",
+        "the mode, reason, link and source of each step",
+        "each event",
         "the recorded inputs",
     ):
         assert word in told

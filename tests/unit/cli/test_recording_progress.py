@@ -8,24 +8,43 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import main
+from acsard.core.config.settings import Config
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
 from tests.unit.cli.test_mcu import on_terminal
 
-QUIET = Path(__file__).parents[2] / "recordings" / "quiet.mcap"
-
-
 SLOW = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of this version, which is long enough to show progress."""
+    tape = Tape()
+    World(recorder=tape).drive(0.5, 0.3, seconds=8.0)
+    path = tmp_path_factory.mktemp("recorded") / "drive.mcap"
+    tape.write(path, Config())
+    return path
 
 
 @pytest.mark.parametrize(
     "verb", ["replay", pytest.param("report", marks=SLOW), pytest.param("export", marks=SLOW)]
 )
-def test_it_says_how_far_it_is(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["recording", verb, str(QUIET), *([] if verb == "replay" else [str(tmp_path / "new")])]
+def test_it_says_how_far_it_is(
+    verb: str, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [
+        "recording",
+        verb,
+        str(recorded),
+        *([] if verb == "replay" else [str(tmp_path / "new")]),
+    ]
     told = on_terminal(80, lambda: main(words), monkeypatch)
     assert re.match(r"\r0 of \d s\r\d of \d s", told)
     assert told.endswith("\r\x1b[K")
 
 
-def test_into_a_pipe_it_says_nothing_of_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["recording", "replay", str(QUIET)]) == 0
+def test_into_a_pipe_it_says_nothing_of_it(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["recording", "replay", str(recorded)]) == 0
     assert capsys.readouterr().err == ""

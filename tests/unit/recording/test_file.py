@@ -364,10 +364,10 @@ def test_a_replay_ends_at_missing_steps_and_reports_them(whole: Path, tmp_path: 
     data, path = whole.read_bytes(), tmp_path / "gap.mcap"
     start, _ = chunks(data)[2]
     path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
-    comparison, trouble, _ = replay_file(Recording(path))
-    assert comparison.steps == 2 * BATCH
-    assert comparison.same
-    assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
+    result = replay_file(Recording(path))
+    assert result.comparison.steps == 2 * BATCH
+    assert result.same
+    assert result.trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
 
 
 def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_path: Path) -> None:
