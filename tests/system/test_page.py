@@ -701,7 +701,7 @@ def test_the_dials_say_command_and_measurement_in_one_line_and_offer_degrees(pag
     wide = (
         "[...document.querySelectorAll('.dials > *')].map(one => one.scrollWidth - one.clientWidth)"
     )
-    for size in (DESKTOP, SIDEWAYS, PHONE):
+    for size in ((320, 568), (360, 640), (568, 320), (667, 375), DESKTOP, SIDEWAYS, PHONE):
         browser.size(*size)
         assert max(browser.js(high)) < 40, size  # a second line would be 20 px more
         assert max(browser.js(wide)) <= 0, size
@@ -764,7 +764,7 @@ def test_somebody_else_who_drives_is_named(page: Phone) -> None:
         page.browser.tap("tab-drive")
         until(lambda: page.browser.text("who") not in ("–", "nobody", "you"), 5.0, "who drives")
         assert re.search(HEX, page.browser.text("who")) is None
-        page.shows("hint", "drives: you can when they release.")
+        page.shows("hint", "drives: you can drive when they stop.")
     page.shows("reason", "Nobody drives.")
     page.shows("hint", "Hold and push to drive")
 
@@ -782,7 +782,7 @@ def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(page: 
         browser = page.browser
         page.shows("reason", "Driven by another page on the robot itself.")
         page.shows("who", "another page on the robot itself")
-        page.shows("hint", "another page on the robot itself drives: you can when they release.")
+        page.shows("hint", "another page on the robot itself drives: you can drive when they stop.")
         assert greyed(browser)
         browser.push(0, 0, "Start")
         browser.push(0, 90)

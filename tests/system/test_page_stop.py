@@ -99,6 +99,7 @@ def test_a_page_without_this_module_says_reload_and_its_stick_is_grey(
     browser = robot.browser
     with robot.without(name):
         robot.alarms("did not load, so only STOP works here. Reload the page.")
+        assert browser.text("mode") == "NOT LOADED"
         assert browser.js("document.getElementById('stick').ariaDisabled") == "true"
         browser.key("Down", "Space", " ")
         browser.key("Up", "Space", " ")

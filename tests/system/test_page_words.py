@@ -272,12 +272,18 @@ def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_
             shows(browser, "mode", "READY")
             page.vault.revoke("tv")
             shows(browser, "mode", "NO CONNECTION")
+            shows(browser, "hint", "No connection.")
+            red = "getComputedStyle(document.getElementById('stop')).backgroundColor"
+            until(lambda: browser.js(red) != "rgb(196, 18, 10)", 5.0, "STOP is grey")
             time.sleep(1.0)
             before = sum(page.refused().values())
             time.sleep(2.0)
             assert sum(page.refused().values()) - before <= 1.0
             browser.tap("stop")
             shows(browser, "alarm", "STOP needs an invitation to this page")
-            red = "getComputedStyle(document.getElementById('stop')).backgroundColor"
-            assert browser.js(red) != "rgb(196, 18, 10)"
+            browser.open(f"{page.away}/#token={page.invite('operator', 'phone')}")
+            shows(browser, "role", "operator")
+            assert browser.js(red) == "rgb(196, 18, 10)"
+            browser.tap("tab-set")
+            shows(browser, "guide-note", "checks and calibrations are for maintainers")
     stream.close()

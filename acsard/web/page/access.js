@@ -30,11 +30,11 @@ async function shown(token, replace) {
   return asked("token", how, 5000, (answer) => (answer.type === "opaqueredirect" ? { status: 303, error: "" } : null));
 }
 
-/** Return why a WebSocket is refused, as {why, shut}, because no browser reports this. `shut` means that a
- *  repeated attempt is pointless. */
+/** Return why a WebSocket is refused, as {why, shut, barred}, because no browser reports this. `shut` means that a
+ *  repeated attempt is pointless, `barred` that the robot refuses this browser, also its STOP. */
 export async function refusal() {
   const { status, error, full } = await asked("api/whoami", {}, 2000);
-  return { why: error || full || "", shut: SHUT.includes(status) };
+  return { why: error || full || "", shut: SHUT.includes(status), barred: BARRED.includes(status) };
 }
 
 /** Return the JSON answer with its status, or status 0 if there was no answer. */

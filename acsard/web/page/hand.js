@@ -39,9 +39,9 @@ export function still(state, source, sender) {
   const ours = state.sources.find((one) => one.name === source);
   if (!ours) return `This robot takes no commands from a page: ${source} is not one of its sources.`;
   const driver = driving(state, source, sender);
-  if (state.source === source) return driver && `${driver} drives: you can when they release.`;
+  if (state.source === source) return driver && `${driver} drives: you can drive when they stop.`;
   const above = driver && state.sources.find((one) => one.name === state.source)?.priority >= ours.priority;
-  return above ? `${driver} drives and has priority: you can when they release.` : "";
+  return above ? `${driver} drives and has priority: you can drive when it stops.` : "";
 }
 
 /** Return who drives instead of `sender`, in words, or "". */

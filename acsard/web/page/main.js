@@ -71,8 +71,11 @@ function open(name) {
   followed("diagnostics", 1, view === "status");
   followed("fleet", 2, view === "robots");
   if (view === "events") listed();
-  if (view === "set") configured();
-  if (view === "set") guided();
+  if (view === "set") {
+    said({ ok: true, text: "" }); // the note of an earlier button is outdated
+    configured();
+    guided();
+  }
   map.redraw();
 }
 
@@ -139,7 +142,8 @@ async function configured() {
 }
 
 async function guided() {
-  guide.choices(await got("api/guide"));
+  const why = hello && barred(hello, "set"); // both need the same role
+  guide.choices(why ? { error: `checks and calibrations are ${why}` } : await got("api/guide"));
 }
 
 function limited() {
@@ -189,7 +193,7 @@ function readied() {
   $("stick").setAttribute("aria-disabled", String(off));
   const driver = driving(state, SOURCE, hello?.sender);
   const over = driver && `${driver} drives. Hold and push to take over.`;
-  views.text("hint", (drive.allowed && (drive.barred || over)) || hint(hello, OTHER));
+  views.text("hint", ((drive.allowed || !link.open) && (drive.barred || over)) || hint(hello, OTHER));
 }
 
 /** Show the button that ends the mode, only while this page shows the mode. */
@@ -287,8 +291,9 @@ function elsewhere() {
 
 /** Show why the robot rejects the connection. Returns true if another attempt is pointless. */
 async function refused() {
-  const { why, shut } = await refusal();
+  const { why, shut, barred: uninvites } = await refusal();
   if (link.open) return false;
+  if (uninvites) stopping.uninvited();
   if (why) views.lost(shut && uninvited ? uninvited : why);
   $("again").hidden = !shut;
   return shut;

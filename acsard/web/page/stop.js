@@ -81,18 +81,27 @@ class Stopping {
 
   /** Say that a part of the page is missing, unless the modules run. */
   lacks() {
-    if (!this.#whole && !this.#waits) this.#tell(RELOAD);
+    if (this.#whole) return;
+    const mode = document.getElementById("mode");
+    if (mode) mode.textContent = "NOT LOADED";
+    if (!this.#waits) this.#tell(RELOAD);
+  }
+
+  /** Grey STOP, because the robot has refused this browser. A press is still sent. */
+  uninvited() {
+    document.documentElement.classList.remove("stops");
   }
 
   #ends(told) {
     if (told.barred) {
       this.#waits = false;
       this.#tell(NOT_HERE);
-      document.documentElement.classList.remove("stops"); // a STOP that cannot work is grey
+      this.uninvited();
       return true;
     }
     if (!told.ok && !(told.lost && this.#arrived)) return false;
     this.#waits = false;
+    document.documentElement.classList.add("stops"); // this browser was invited again in another tab
     this.#tell(this.#whole ? "" : "STOP: the robot has confirmed it. This page is not complete: reload it.");
     this.after(told);
     return true;
