@@ -414,7 +414,7 @@ def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
     page.server.process.kill()
     page.shows("age", "no connection")
     page.browser.tap("stop")
-    page.shows("alarm", "STOP: no connection to the robot")
+    page.shows("alarm", "STOP is not confirmed. This page sends it again")
 
 
 @alone
@@ -1077,7 +1077,11 @@ STOPPING = """(async () => {
     return out;
 })()"""
 
-FAILS = ["sent", "STOP: no answer; this page sends it again"]
+FAILS = [
+    "sent",
+    "STOP is not confirmed. This page sends it again; the robot's own switch stops it too. "
+    "(no answer)",
+]
 """The expected trace of a first attempt that gets no answer."""
 
 

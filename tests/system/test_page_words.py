@@ -142,7 +142,7 @@ def test_a_program_that_drives_is_named_and_a_push_takes_over(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
     with robot[1].commanding(0.1):
-        shows(browser, "hint", "commander (app) drives. Hold and push to take over.")
+        shows(browser, "hint", "commander (app) drives. Hold and push to take over. It drives on")
     shows(browser, "hint", "Hold and push to drive")
 
 

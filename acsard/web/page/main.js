@@ -192,7 +192,7 @@ function readied() {
   const off = !drive.allowed || Boolean(drive.barred);
   $("stick").setAttribute("aria-disabled", String(off));
   const driver = driving(state, SOURCE, hello?.sender);
-  const over = driver && `${driver} drives. Hold and push to take over.`;
+  const over = driver && `${driver} drives. Hold and push to take over. It drives on when you release: STOP ends that.`;
   views.text("hint", ((drive.allowed || !link.open) && (drive.barred || over)) || hint(hello, OTHER));
 }
 

@@ -49,7 +49,7 @@ class Stopping {
       const told = await this.send();
       if (press !== this.#press) return; // a newer press took over
       if (this.#ends(told)) return;
-      this.#tell(`STOP: ${told.text}; this page sends it again`);
+      this.#tell(`STOP is not confirmed. This page sends it again; the robot's own switch stops it too. (${told.text})`);
       await new Promise((done) => setTimeout(done, PAUSE));
       if (press !== this.#press || this.#ends(told)) return;
       if (Date.now() > last || performance.now() > this.#since + URGENT) return this.over();
