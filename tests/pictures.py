@@ -152,7 +152,7 @@ class _States:
             board.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
             look("fault", "FAULT", "Fault")
             board.unplug()
-            look("fault-no-board", "FAULT · NO BOARD", "Fault")
+            look("fault-no-board", "FAULT · NO BOARD", "The board is missing, too.")
             daemon.signal(signal.SIGSTOP)
             try:
                 look("no-data", "NO DATA", "Nothing is received")

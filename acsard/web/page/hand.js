@@ -34,7 +34,7 @@ export function boarded(state) {
  *  source of a lower priority, but not from another sender of this one. */
 export function still(state, source, sender) {
   if (!state) return "Nothing is received from the robot.";
-  if (BARS[state.mode]) return BARS[state.mode];
+  if (BARS[state.mode]) return BARS[state.mode] + (boarded(state) ? "" : " The board is missing, too.");
   if (!boarded(state)) return "No board: nothing can drive.";
   const ours = state.sources.find((one) => one.name === source);
   if (!ours) return `This robot takes no commands from a page: ${source} is not one of its sources.`;
