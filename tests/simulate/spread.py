@@ -14,7 +14,7 @@ from tests.simulate.roads import NS
 
 Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
 
-ROOM = 3.0
+ROOM = 10.0
 """Factor allowed beside the bound. It covers terms of second order and the shape of a path."""
 
 COUNTS_M2, COUNTS_RAD2 = 1e-4, 1e-3
@@ -22,6 +22,9 @@ COUNTS_M2, COUNTS_RAD2 = 1e-4, 1e-3
 
 CALM_NS = NS
 """For this time after trouble the wheels of a side may still seem to slip."""
+
+SHORTEST_NS = 10_000_000
+"""Shortest period in which the counts of an encoder do not look like slip."""
 
 LEAST_NS = 12_000_000
 """The lines of a board that answers each line come in at least this period."""
@@ -32,11 +35,10 @@ class Spread:
 
     def __init__(self, witness: Witness) -> None:
         config = witness.config
-        odometry = config.get("odometry", {})
-        self._by_metre = odometry.get("distance_variance_per_metre", 1e-4)
-        self._yaw_by_metre = odometry.get("yaw_variance_per_metre", 1e-4)
-        self._yaw_by_radian = odometry.get("yaw_variance_per_radian", 1e-2)
-        self._judged = not odometry.get("gyro")
+        self._by_metre, self._yaw_by_metre, self._yaw_by_radian = 1e-4, 1e-4, 1e-2
+        """The rates of `[odometry]` that a configuration without this table has."""
+        # Slow motors, odd radii and counts in short periods look like slip, which widens it too.
+        self._judged = not config.get("odometry") and witness.period_ns >= SHORTEST_NS
         self._track = 2 * witness.half
         every_s = max(witness.period_ns / NS, config["mcu"].get("reply_period", 0.0))
         self._longest_ns = 2 * max(int(every_s * NS), LEAST_NS)
