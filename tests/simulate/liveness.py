@@ -101,7 +101,7 @@ class Liveness:
         run = self.run
         if not self._since or run.active != run.lasting or run.witness.held is not None:
             return
-        if not run.product.plugged:
+        if not run.product.plugged or run.witness.perhaps_latched:
             return
         for name, since_ns in self._since.items():
             heard_ns, identity = self._latest[name]

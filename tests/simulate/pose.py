@@ -43,6 +43,8 @@ class PoseWitness:
         self.fastest: float = fastest * drive.get("wheel_radius", 0.05)
         multiplier = drive.get("wheel_separation_multiplier", 1.0)
         self.track: float = drive.get("wheel_separation", 0.3) * multiplier
+        self._seldom = config.get("control", {}).get("rate") == 10.0
+        """Whether lines come so seldom that two of them say little of a longer gap between."""
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False
@@ -137,6 +139,8 @@ class PoseWitness:
                 )
         if lies:
             return
+        if self._seldom and last is not None and at_ns - last[0] >= GAP_NS:
+            self.doubt(mute=True)
         true = self._true_at(at_ns)
         if true is None:
             return

@@ -119,6 +119,8 @@ class Witness:
         """Begin and end of the host's last stall, or of several that follow each other."""
         self.stops: list[int] = []
         """Arrivals of the stops that no clear has released."""
+        self.perhaps_latched = False
+        """Whether a latch may be in force that is not certain, since the daemon ended."""
         self.offs: list[int] = []
         """Arrivals of each `deactivate` that no `activate` has released."""
         self.dormant_ns: int | None = None
@@ -250,10 +252,12 @@ class Witness:
             self.fault_ns = None
         if "still" in text:
             return
+        self.perhaps_latched = False
         self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
 
     def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
         """Note an `activate` that worked, as the daemon says."""
+        self.perhaps_latched = False
         if self.dormant_ns is not None or self.offs:
             self.arming(asked_ns)
         self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
@@ -298,6 +302,7 @@ class Witness:
 
         It may be in force after the restart, or not.
         """
+        self.perhaps_latched = True
         match verb:
             case "stop":
                 self.stops = [at_ns for at_ns in self.stops if at_ns != arrived_ns]
@@ -316,6 +321,7 @@ class Witness:
 
     def file_is_behind(self) -> None:
         """Note that the daemon ended before the latch file had what was in force."""
+        self.perhaps_latched = True
         self.stops.clear()
         self.offs.clear()
         self.fault_ns = None
