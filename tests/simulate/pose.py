@@ -112,7 +112,9 @@ class PoseWitness:
         self.latest = ex, ey, eyaw
         if silent_only:
             last_ns = sampled_ns + offset_ns
-            self._before = last_ns, self.latest, (x, y, yaw), self._speed, xx + yy
+            # After a stall, the sample may be much older than this step.
+            true = self._true_at(last_ns)
+            self._before = true and (last_ns, self.latest, true, self._speed, xx + yy)
 
     def end_step(self) -> bool:
         """Forget the pose if it was set in this step, and return whether it was."""
