@@ -98,7 +98,7 @@ def unwritable(where: str, reason: str) -> str:
     return f"a stop cannot be kept over a restart: {where}: {reason}"
 
 
-def stopped(latches: Latches, why: str, now: Instant, by: str = BY) -> Latches:
+def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
     """Return these latches with a stop. A stop that is latched already stays.
 
     Args:
@@ -106,11 +106,12 @@ def stopped(latches: Latches, why: str, now: Instant, by: str = BY) -> Latches:
         why: text of the stop.
         now: time of the stop.
         by: the client that asked for the stop, or `BY` for the daemon itself.
+        before: the number of the stop before this one, or -1.
     """
     if latches.stop is not None:
         return latches
     numbers = [latch.number for latch in (latches.fault, latches.inactive) if latch is not None]
-    number = max(now.wall_ns // 1_000_000, *[n + 1 for n in numbers], 0)
+    number = max(now.wall_ns // 1_000_000, *[n + 1 for n in numbers], before + 1)
     return replace(latches, stop=Latch(number, now.wall_ns, by, why))
 
 
@@ -176,10 +177,13 @@ class Handover:
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
         """Hand these latches to the keeper, with the stops that no control step has taken.
 
-        `by` names the clients that asked for these stops.
+        `by` names the clients that asked for these stops. The stop has a new number, so that a
+        clear of the stop before it does not release it.
         """
-        for name in by:
-            latches = stopped(latches, f"stopped by {name or 'request'}", now, name)
+        if by:
+            before = -1 if latches.stop is None else latches.stop.number
+            text = f"stopped by {by[0] or 'request'}"
+            latches = stopped(replace(latches, stop=None), text, now, by[0], before)
         self.take(latches)
 
     @property

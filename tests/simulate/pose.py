@@ -188,6 +188,11 @@ class PoseWitness:
         sampled_ns, ex, ey, _, (xx, _, _, yy, _, _), _ = estimate
         if sampled_ns + offset_ns - then_ns < GAP_NS or speed < MOVES:
             return
+        # A step that stands still reads older samples than its own time.
+        at_sample = self._true_at(sampled_ns + offset_ns)
+        if at_sample is None:
+            return
+        true = at_sample
         if variance > VAGUE:
             variance = 0.0
         x, y, _ = _through((true_then, pose), true)

@@ -222,6 +222,17 @@ def test_a_stop_that_no_step_served_is_latched_with_the_name_of_its_client() -> 
     assert latches.stop == Latch(NOW.wall_ns // 1_000_000, NOW.wall_ns, "joe", "stopped by joe")
 
 
+@pytest.mark.parametrize("ahead", [-5, 0, 5])
+def test_a_stop_that_no_step_served_is_newer_than_the_stop_before_it(ahead: int) -> None:
+    earlier = Latch(NOW.wall_ns // 1_000_000 + ahead, 0, "anna", "stopped by anna")
+    keeper = Keeper()
+    Handover(Latches(), keeper).take_stops(Latches(stop=earlier), ["joe"], NOW)
+    (latches,) = keeper.given
+    assert latches.stop
+    assert latches.stop.number > earlier.number
+    assert latches.stop.by == "joe"
+
+
 def test_a_stop_without_a_name_is_stopped_by_a_request() -> None:
     keeper = Keeper()
     Handover(Latches(), keeper).take_stops(Latches(), [""], NOW)
