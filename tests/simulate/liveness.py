@@ -58,7 +58,7 @@ class Liveness:
         return self._event_ns
 
     def event(self) -> None:
-        """Note that something happened beside commands."""
+        """Note an event that is not a command."""
         self._event_ns = self.run.true_ns
 
     def command(self, sender: dict[str, Any], sample: Sample) -> None:

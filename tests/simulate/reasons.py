@@ -91,7 +91,7 @@ class _Heard:
 
 
 class Reasons:
-    """What arrived at one daemon, and what it says while it stands."""
+    """The messages that one daemon received, and the reasons that it publishes while it stands."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
