@@ -560,7 +560,7 @@ def test_a_pose_in_state_that_moves_while_the_board_is_silent_is_a_finding() -> 
 
 
 class Board(NamedTuple):
-    """What the judge of the plugging knows of the board."""
+    """The knowledge of the judge of the plugging about the board."""
 
     plugged: bool
     unplugged_ns: int = 0
