@@ -576,7 +576,7 @@ class Board(NamedTuple):
         ("stale", 499, b"", ""),
         ("up", 41, b"", "a linked board gets a line in each period"),
         ("up", 39, b"", ""),
-        ("stale", 501, b"", "a board that is plugged in gets a line"),
+        ("stale", 531, b"", "a board that is plugged in gets a line"),
         ("stale", 501, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", ""),
         ("stale", 9, b"ap00.00,bp00.01,cp00.01,dp00.00\r\n", "the first line is a zero"),
     ],
