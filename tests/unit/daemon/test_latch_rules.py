@@ -233,6 +233,12 @@ def test_a_stop_that_no_step_served_is_newer_than_the_stop_before_it(ahead: int)
     assert latches.stop.by == "joe"
 
 
+def test_without_such_a_stop_the_latches_are_handed_over_as_they_are() -> None:
+    keeper = Keeper()
+    Handover(Latches(), keeper).take_stops(ALL, [], NOW)
+    assert keeper.given == [ALL]
+
+
 def test_a_stop_without_a_name_is_stopped_by_a_request() -> None:
     keeper = Keeper()
     Handover(Latches(), keeper).take_stops(Latches(), [""], NOW)
