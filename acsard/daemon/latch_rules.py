@@ -120,7 +120,8 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
 
     The previous process may have set latches that the file lacks. So the robot starts stopped, and
     each latch of the file takes a new number: a `clear` or `activate` that names its old number may
-    have been sent before the latches that are lost.
+    have been sent before the latches that are lost. If the wall clock went back, the time since the
+    computer started makes the numbers of two such starts differ.
 
     Args:
         latches: the latches in the file.
@@ -128,7 +129,10 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
         now: time of the start.
     """
     found = latches.fault, latches.inactive, latches.stop
-    number = max(now.wall_ns // 1_000_000, *[latch.number + 1 for latch in found if latch], 0)
+    least = max((latch.number + 1 for latch in found if latch), default=0)
+    number = now.wall_ns // 1_000_000
+    if number < least:
+        number = least + now.mono_ns // 1_000_000
     fault, inactive, stop = (
         latch and replace(latch, number=number + place) for place, latch in enumerate(found)
     )

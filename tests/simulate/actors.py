@@ -353,7 +353,7 @@ class Run:
                 self._troubled("reset")
                 deaf_ns = int(event["deaf"] * NS)
                 if deaf_ns > 12 * NS // 10:
-                    self.at(self.true_ns + deaf_ns, lambda: self._disarmed(self.true_ns))
+                    self.at(self.true_ns + deaf_ns, self._hears_again)
             case "unplug":
                 product.unplug()
                 self.pose.doubt()
@@ -367,6 +367,10 @@ class Run:
             case "stall" | "stall in step":
                 self._stalled_ns = after_ns
                 self.witness.stalls(self.true_ns, after_ns)
+                if self.true_ns > event["at"] * NS + NS // 1000:
+                    # One stall behind another: the daemon could read between, but take no step,
+                    # so it does not know when the lines came.
+                    self.pose.unknown_until(after_ns + NS // 5)
                 if event["do"] == "stall":
                     product.stall(lasts_ns / NS)
                 else:
@@ -424,6 +428,7 @@ class Run:
         self.active.remove(fault)
         self.liveness.event()
         self._troubled(fault[0])
+        self.pose.mended(fault[0], self.true_ns)
         self._board()
         self.echo.on = "echo" in self._names
         if fault[0] == "echo" and self.product.plugged:
@@ -436,6 +441,8 @@ class Run:
         self.liveness.event()
         if not self.product.plugged:
             self.product.plug(new)
+            if self.witness.blocked_ns is not None:
+                self.witness.blocked_ns = self.true_ns  # The new port has taken no line either.
             self.damage.forget()
             self._disarmed(self.true_ns)
             self._linked = False
@@ -460,7 +467,8 @@ class Run:
         product, witness = self.product, self.witness
         if event.get("stop"):
             product.stop_unseen()
-            witness.stops.append(self.true_ns)
+            # A clear of the same moment came before it: the daemon has taken no step since.
+            witness.stops.append(self.true_ns + 1)
         moving = witness.last
         if event["way"] == "term":
             witness.ending_ns = self.true_ns
@@ -508,8 +516,8 @@ class Run:
             self.damage.fed(data)
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
-        if "endless" in self._names:
-            return
+        if "endless" in self._names and b"\n" not in data and not self.echo.on:
+            return  # A line from just before may still arrive.
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
         if gap_ns > 9 * NS // 10:
@@ -517,7 +525,12 @@ class Run:
             self.liveness.event()
             if gap_ns > 11 * NS // 10 and self._stalled_ns < self._fed_ns:
                 self._disarmed(true_ns)
-        self._fed_ns, self._linked = true_ns, True
+        self._fed_ns = true_ns
+
+    def _hears_again(self) -> None:
+        # A daemon that hears itself cannot know that the board was deaf.
+        if not self.echo.on:
+            self._disarmed(self.true_ns)
 
     def _disarmed(self, true_ns: int) -> None:
         self.liveness.event()
@@ -578,6 +591,8 @@ class Run:
         self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.linked = seen.link == "up"
+        # A line without the check that the configuration requires is no link.
+        self._linked |= witness.linked
         witness.cut |= not witness.linked
         self._whole = bool(seen.lines) and seen.lines[-1][1].endswith(b"\n")
         for at_ns, line in seen.lines:
@@ -587,7 +602,8 @@ class Run:
             if any(witness.last):
                 self.moved_ns = at_ns + offset
         driven = self.followed.wish if seen.mode == "driving" and not witness.pending else None
-        self.course.step(true_ns, driven, witness.last, len(seen.lines))
+        whole = sum(line.endswith(b"\n") for _, line in seen.lines)
+        self.course.step(true_ns, driven, witness.last, whole)
         self.liveness.look(true_ns)
         self.reasons.look(true_ns, self._stalled_ns)
         if self._plain and not self.echo.on:

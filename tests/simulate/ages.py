@@ -99,8 +99,7 @@ class Ages:
         foreign = sender["way"] in FOREIGN
         if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
             clock.loose = True
-        # A stamp that goes back shows an adjustment to the daemon, also if the network swapped two.
-        if (foreign and (sender["clock"] or sender["swap"])) or sender.get("bad_stamps"):
+        if (foreign and sender["clock"]) or sender.get("bad_stamps"):
             clock.loose = True
         clock.stamp_ns = message.stamp_ns
         recent = clock.recent

@@ -32,7 +32,7 @@ class Course:
     def step(
         self, true_ns: int, wish: tuple[float, float] | None, wheels: tuple[float, ...], lines: int
     ) -> None:
-        """Judge the last line of a step, which had this many, by the command that it follows."""
+        """Judge the last line of a step by its command; `lines` is the number of whole ones."""
         witness = self._witness
         if lines:
             self._ramp(true_ns, wish, wheels)

@@ -153,6 +153,15 @@ CORRECTED: tuple[tuple[str, tuple[str, ...]], ...] = (
         (LINK + "echo.py", LINK + "negotiation.py", LINK + "session.py"),
     ),
     (
+        "two starts with a latch file that cannot be written give different numbers, also if the "
+        "wall clock went back, and so does a stop that arrives as the daemon crashes",
+        ("acsard/runtime/kept_latches.py",),
+    ),
+    (
+        "one stamp that goes back or stands shows no adjustment until the next command confirms it",
+        (MOTION + "freshness.py",),
+    ),
+    (
         "a clock is proven by fewer rules, its proof does not end inside a burst, and a silence "
         "does not make a steady clock forget its lowest delay",
         (MOTION + "freshness.py",),
@@ -185,8 +194,8 @@ CORRECTED: tuple[tuple[str, tuple[str, ...]], ...] = (
         (MOTION + "arbiter.py",),
     ),
     (
-        "neither one feedback line after a stall nor a wheel that follows sooner than its response "
-        "time is a wheel fault",
+        "neither one feedback line after a stall, nor a wheel that follows sooner than its "
+        "response time, nor one that sped up during a stall is a wheel fault",
         (MOTION + "sanity.py",),
     ),
     (

@@ -23,6 +23,9 @@ OBEYED_NS = 20_000_000
 EVEN_NS = 20_000_000
 """Delays within this time of their lowest are even."""
 
+FALL_NS = 5_000_000
+"""A delay that is lower than all before by more than this falls."""
+
 UNBROKEN_NS = NS
 """A longer silence begins a new run of even delays."""
 
@@ -64,6 +67,10 @@ class Followed:
         self._arrived: dict[int, Command | None] = {}
         """By arrival; None if several arrived at that time."""
         self._runs: dict[str, Run] = {}
+        self._least: dict[str, tuple[int, int]] = {}
+        """The lowest delay of each clock, and when the daemon last forgot all delays."""
+        self._fell_ns: dict[str, int] = {}
+        """When the lowest delay of each clock last fell clearly."""
         self._newest: dict[str, int] = {}
         """The highest number that arrived, by clock."""
         self._waiting: dict[Who, Command] = {}
@@ -119,8 +126,17 @@ class Followed:
             return False
         newest = self._newest.get(sample.clock, 0)
         self._newest[sample.clock] = max(newest, message.number)
-        least = witness.ages.clocks[sample.clock].least_ns
         age, at_ns = wish.arrived_ns - message.sent_ns, wish.arrived_ns
+        learned_ns, least = self._least.get(sample.clock, (0, age))
+        if learned_ns != witness.ages.learned_ns:
+            least = age
+        if age < least - FALL_NS:
+            self._fell_ns[sample.clock] = (
+                wish.arrived_ns
+            )  # a backlog pours in, or the clock was set
+        # The daemon may know a clock that it has never followed, also behind a silence.
+        least = min(least, age)
+        self._least[sample.clock] = witness.ages.learned_ns, least
         run = self._runs.get(sample.clock)
         if (
             run is None
@@ -132,8 +148,8 @@ class Followed:
         run.low, run.high, run.last_ns = min(run.low, age), max(run.high, age), at_ns
         proof_ns = 3 * NS + 2 * min(witness.timeout[found.who[0]], 2 * NS)
         proven = run.followed or (not sender.get("jitter") and at_ns - run.begun_ns > proof_ns)
-        lowest = least is not None and age <= least + EVEN_NS
-        return proven and lowest and message.number > newest
+        proven &= at_ns - self._fell_ns.get(sample.clock, -NS) >= NS
+        return proven and age <= least + EVEN_NS and message.number > newest
 
     @property
     def wish(self) -> tuple[float, float] | None:
@@ -196,7 +212,7 @@ class Followed:
             if OBEYED_NS + witness.period_ns < age < witness.timeout[source] - witness.period_ns:
                 raise BrokenError(
                     "the highest priority wins", true_ns,
-                    f"{found.who} is followed, {source} by {identity} sent {age / NS:.3f} s ago",
+                    f"{found.who} is followed, {source} by {identity} arrived {age / NS:.3f} s ago",
                 )  # fmt: skip
 
     def _newest_counts(self, true_ns: int, decided_ns: int, found: Command) -> None:

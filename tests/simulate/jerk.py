@@ -27,7 +27,7 @@ class Slope:
         """
         before, self._seen = self._seen, speed
         seen = (speed - before + 2 * room) / seconds if seconds > 0.0 else acceleration
-        if speed < before or speed <= 0.0:
+        if speed < before or speed <= room:
             self._high, self._slope = speed + room, seen
             return True
         most = min(acceleration, max(self._slope, 0.0) + jerk * seconds)

@@ -193,6 +193,10 @@ class Liveness:
             run.run_to(now_ns + step_ns)
         mode, reason = run.witness.mode, run.witness.reason
         moving = run.true_ns - run.moved_ns < NS // 5
+        if mode == "stopped" and run.witness.stops:
+            return  # a stop of the plan was still under way
+        if run.witness.armed_since_ns > begin_ns:
+            return  # an event of the plan that came late asks each sender for a new zero
         if mode != "driving" or not moving:
             raise BrokenError("a lawful sender drives", run.true_ns, f"{mode}: {reason}")
         self._check_course(speed, turn)

@@ -28,7 +28,7 @@ class Plugging:
         self._judged_ns = -1
         """The plugging of which the first line was judged."""
         self._line_ns = -1
-        """When the last line was made, or the link was not up."""
+        """When the step ended that made the last line, or in which the link was not up."""
 
     def see(self, true_ns: int, seen: Seen, product: Product, calm_ns: int) -> None:
         """Judge a step. At `calm_ns` the last stall of the host or of the output was over."""
@@ -40,7 +40,7 @@ class Plugging:
             return
         plugged_ns = product.plugged_ns
         if seen.lines or seen.link != "up":
-            self._line_ns = seen.decided_ns
+            self._line_ns = seen.at_ns
         else:
             late_ns = seen.decided_ns - max(self._line_ns, plugged_ns, calm_ns)
             if late_ns > PERIODS * self._period_ns + SEEN_NS:

@@ -17,6 +17,15 @@ LIARS = {
 }  # fmt: skip
 """Board faults with which the encoders lie, or say nothing while the robot may move."""
 
+MOTORS = {"reversed_motor", "dead_motor", "swapped_motors"}
+"""Faults behind which a wheel still turns against its command until its motor has followed."""
+
+COUNTLESS = {"no_sample", "no_check", "plain_only"}
+"""Faults behind which the lines may have no counts until the board is connected again."""
+
+RATES = {None, "auto", 10.0, 20.0, 50.0, 100.0}
+"""Control rates at which the pose does not drift with 96 counts."""
+
 GAP_NS = 3 * NS // 10
 """A gap of the estimates of this length and more is judged by itself."""
 
@@ -43,8 +52,22 @@ class PoseWitness:
         self.fastest: float = fastest * drive.get("wheel_radius", 0.05)
         multiplier = drive.get("wheel_separation_multiplier", 1.0)
         self.track: float = drive.get("wheel_separation", 0.3) * multiplier
+        self._follows_ns = int(
+            (4.0 * config.get("sim", {}).get("motor_time_constant", 0.1) + 0.1) * NS
+        )
+        """Time that a motor needs to follow its command again."""
+        counts = config.get("sim", {}).get("encoder_counts")
+        self._coarse = counts == 96 and config.get("control", {}).get("rate") not in RATES
+        """Whether the pose drifts if the lines do not have the counts."""
+        self._known_ns = 0
+        """From when on the lines show the motion again."""
         self._seldom = config.get("control", {}).get("rate") == 10.0
         """Whether lines come so seldom that two of them say little of a longer gap between."""
+        rates = config.get("odometry", {})
+        sure = rates.get("yaw_variance_per_metre", 1.0) < 1e-4
+        sure |= rates.get("yaw_variance_per_radian", 1.0) < 1e-2
+        # At ten lines a second nobody knows the heading as well as these rates say.
+        self._drifts = self._seldom and sure
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False
@@ -72,6 +95,15 @@ class PoseWitness:
         if not mute:
             self._before = None
 
+    def mended(self, fault: str, at_ns: int) -> None:
+        """Note that a fault of the board ended."""
+        if fault in MOTORS:
+            self.unknown_until(at_ns + self._follows_ns)
+
+    def unknown_until(self, at_ns: int) -> None:
+        """Note that until then nobody can know the motion from the lines."""
+        self._known_ns = max(self._known_ns, at_ns)
+
     def begin(self) -> None:
         """Note that a new daemon or a new pose begins: nothing before it counts."""
         self.doubt()
@@ -96,7 +128,8 @@ class PoseWitness:
         at_ns, x, y, yaw, _ = truth
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         self._speed = self._present_speed()
-        lies = not LIARS.isdisjoint(faults)
+        lies = not LIARS.isdisjoint(faults) or now_ns < self._known_ns
+        self._drifts |= self._coarse and not COUNTLESS.isdisjoint(faults)
         silent_only = not lies or faults & LIARS == {"mute"}
         if lies:
             self.doubt(silent_only)
@@ -139,7 +172,7 @@ class PoseWitness:
                 raise BrokenError(
                     "the pose never jumps", now_ns, f"{last[1]} to {pose} in {seconds:.3f} s"
                 )
-        if lies:
+        if lies or self._drifts:
             return
         if self._seldom and last is not None and at_ns - last[0] >= GAP_NS:
             self.doubt(mute=True)

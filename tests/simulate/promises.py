@@ -534,7 +534,7 @@ class Witness:
         ev = self.radius * 0.011
         ew = self.radius * 0.011 / self.half
         seconds = min(dt / NS, max(0.05, 1.5 * self.period_ns / NS)) + 0.002
-        saturated = fastest > limits["wheel_speed"] - 0.1
+        saturated = fastest > limits["wheel_speed"] - 0.1 or "wheel_speed" in self.unsure
         spare = 1.0
         """By how much both speeds were scaled down together, at least, so that no wheel is over its
         limit. Before that, each of them was within its own limits."""
@@ -703,13 +703,14 @@ class Witness:
         """Return the highest priority of a source that certainly sends now."""
         if self.churned:
             return 0
-        found = 0
+        # A call without an answer may be in force.
+        found, since_ns = 0, max(self.armed_since_ns, *self.pending.values(), 0)
         for source, wish in self.wishes:
             if self.neutral_first and wish.shared and wish.armed_ns <= self.armed_since_ns:
                 continue  # a zero of a shared identity counts only behind its pause
             age = at_ns - wish.arrived_ns
             live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS
-            if live and wish.certain and wish.arrived_ns > self.armed_since_ns + MARGIN_NS:
+            if live and wish.certain and wish.arrived_ns > since_ns + MARGIN_NS:
                 found = max(found, self.priority[source])
         return found
 

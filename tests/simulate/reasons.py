@@ -37,6 +37,9 @@ STEADY_NS = 15_000_000
 PAUSE_NS = 19 * NS // 10
 """After a silence of this length a proof that was not over may begin again."""
 
+PROOF = 10
+"""Number of commands after which a proof through jitter is certainly over."""
+
 FORGOTTEN_NS = 200 * NS
 """After a silence of this length a clock may be new again."""
 
@@ -57,6 +60,8 @@ class _Clock:
         self.first_ns = self.last_ns = at_ns
         """Arrival of the first message from which its proof may begin, and of the last one."""
         self.least_ns = self.most_ns = delay_ns
+        self.count = 0
+        """Messages since `first_ns`."""
         self.proved = False
         """Its proof was certainly over once."""
         self.unsure = False
@@ -70,7 +75,8 @@ class _Clock:
 
     def known(self, at_ns: int, timeout_ns: int) -> bool:
         """Return whether its proof certainly was over at this time."""
-        return self.steady and at_ns - self.first_ns > 5 * min(timeout_ns, 2 * NS) + NS
+        lasted = at_ns - self.first_ns
+        return self.steady and lasted > 5 * min(timeout_ns, 2 * NS) + NS and self.count >= PROOF
 
     def may_be_known(self, at_ns: int, timeout_ns: int) -> bool:
         """Return whether its proof may have been over at this time."""
@@ -138,8 +144,9 @@ class Reasons:
         silent_ns = at_ns - clock.last_ns
         if silent_ns > FORGOTTEN_NS or (silent_ns > PAUSE_NS and not clock.proved):
             # Its proof may begin again, unless it was over.
-            clock.first_ns, clock.unsure, clock.proved = at_ns, True, False
+            clock.first_ns, clock.unsure, clock.proved, clock.count = at_ns, True, False, 0
         clock.last_ns = at_ns
+        clock.count += 1
         clock.least_ns = min(clock.least_ns, delay_ns)
         clock.most_ns = max(clock.most_ns, delay_ns)
         return clock

@@ -26,6 +26,10 @@ CALM_NS = NS
 SHORTEST_NS = 10_000_000
 """Shortest period in which the counts of an encoder do not look like slip."""
 
+LONGEST_NS = NS // 10
+"""From this period on, a line that a command has caused shortly before the next one looks like slip
+too: the board computes its speeds from few counts, and the daemon takes them for a whole period."""
+
 LEAST_NS = 12_000_000
 """The lines of a board that answers each line come in at least this period."""
 
@@ -38,7 +42,8 @@ class Spread:
         self._by_metre, self._yaw_by_metre, self._yaw_by_radian = 1e-4, 1e-4, 1e-2
         """The rates of `[odometry]` that a configuration without this table has."""
         # Slow motors, odd radii and counts in short periods look like slip, which widens it too.
-        self._judged = not config.get("odometry") and witness.period_ns >= SHORTEST_NS
+        usual = SHORTEST_NS <= witness.period_ns < LONGEST_NS
+        self._judged = not config.get("odometry") and usual
         self._track = 2 * witness.half
         every_s = max(witness.period_ns / NS, config["mcu"].get("reply_period", 0.0))
         self._longest_ns = 2 * max(int(every_s * NS), LEAST_NS)

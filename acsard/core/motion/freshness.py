@@ -11,9 +11,10 @@ There are two kinds of clocks. A *steady* clock is never adjusted: our client, t
 with `"steady": true`. Its command that looks late is late, and stays refused. A *foreign* clock may
 be set or slewed, which looks like a delay. A new delay that has proved constant is believed; the
 sender must return to neutral. What is forgiven in this way is bounded, because a congested network
-looks the same: `FORGIVE_NS`, refilled by 1 s a minute. A stamp that goes back, or stands, shows an
-adjustment that no network can cause, so it costs nothing. While the sender pauses, its clock may be
-set by any amount. Arrivals are monotonic: our own wall clock may step.
+looks the same: `FORGIVE_NS`, refilled by 1 s a minute. Stamps that go back, or stand, and do so for
+more than one command show an adjustment that no network can cause, so it costs nothing. While the
+sender pauses, its clock may be set by any amount. Arrivals are monotonic: our own wall clock may
+step.
 """
 
 from __future__ import annotations
@@ -163,6 +164,9 @@ class _Clock:
         """Delay before the first adjustment that showed since the clock was last prompt."""
         self._shown = 0
         """Sum of the visible clock adjustments since then, ns."""
+        self._doubted: tuple[int, int, int] | None = None
+        """An adjustment that the next command must confirm, because the network may have swapped
+        or repeated a command: the delay before it, its amount, and the stamp before it."""
         self._paused = False
         """Its sender has paused since then, so any adjustment may have happened."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
@@ -191,7 +195,7 @@ class _Clock:
         else:
             self._least += silence // DRIFT
             if not command.steady:
-                self._look_for_adjustment(silence, departed, command.sequence)
+                self._look_for_adjustment(stamp_ns, silence, command.sequence)
             verdict = self._compare(delay, at_ns, silence, timeout_ns, command.steady)
         self.at_ns, self._stamp_ns, self._delay = at_ns, stamp_ns, delay
         self._number = command.sequence
@@ -213,15 +217,22 @@ class _Clock:
         self._floor = min(floor, delay)
         return delay - self._floor
 
-    def _look_for_adjustment(self, silence: int, departed: int, number: int | None) -> None:
-        """Note a pause, or stamps that go back or stand, unless the numbers show a loss."""
+    def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int | None) -> None:
+        """Note a pause, or stamps that go back or stand, unless the numbers show a loss.
+
+        Stamps have gone back only if the command after that also lies below the highest one.
+        """
+        doubted, self._doubted = self._doubted, None
         if number is not None and self._number is not None and number != self._number + 1:
             return
+        departed = stamp_ns - self._stamp_ns
+        if doubted is not None and (departed <= STANDS_NS or stamp_ns <= doubted[2]):
+            self._before = doubted[0] if self._before is None else self._before
+            self._shown += doubted[1]
         if departed > GAP_NS:
             self._paused = True
         elif departed <= STANDS_NS and silence > APART_NS:
-            self._before = self._delay if self._before is None else self._before
-            self._shown += silence - departed
+            self._doubted = self._delay, silence - departed, self._stamp_ns
 
     def _prove(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Verdict:
         proof = self._proof
@@ -280,7 +291,7 @@ class _Clock:
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
     def _forget_adjustments(self) -> None:
-        self._before, self._shown, self._paused = None, 0, False
+        self._before, self._shown, self._doubted, self._paused = None, 0, None, False
 
     def _believe(self, proof: _Proof, verdict: Verdict) -> Verdict:
         self.state, self._least, self._proof = "known", proof.least, None

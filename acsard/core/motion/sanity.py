@@ -80,6 +80,8 @@ class _Wheel:
         # fast would never count as slowing down: slow motors latched "runaway" that way.
         self.slowest = math.inf
         """Slowest speed since the wheel became too fast, rad/s."""
+        self._fast = False
+        """Whether the last line showed the wheel too fast."""
 
     def signs(self, told: float, speed: float, share: float, still: bool) -> tuple[bool, ...]:
         """Return whether the wheel shows each of the `_FAULTS`, in their order.
@@ -96,6 +98,9 @@ class _Wheel:
         slowing = turns < self.slowest - SLACK
         if slowing or not fast:
             self.slowest = turns
+        elif not self._fast:
+            self.slowest = max(self.slowest, turns)
+        self._fast = fast
         moving = size > SLACK and expected * told > 0
         # A wheel that slows down to its command sooner than `response_time` says is not dead.
         least = min(size, abs(told))

@@ -167,6 +167,17 @@ def test_each_latch_of_a_file_that_cannot_be_written_takes_a_new_number() -> Non
     assert made.lowered == ALL.lowered
 
 
+def test_two_such_starts_with_a_wall_clock_that_went_back_give_different_numbers() -> None:
+    """Otherwise a clear of what the first one latched releases a stop that the crash has lost."""
+    wall_ns = NOW.wall_ns - 40_828_000_000_000
+    starts = [doubted(ALL, "", Instant(mono_ns, wall_ns)) for mono_ns in (76 * 10**9, 78 * 10**9)]
+    numbers = [
+        latch.number for made in starts for latch in (made.fault, made.inactive, made.stop) if latch
+    ]
+    assert len(set(numbers)) == 6
+    assert numbers == sorted(numbers)
+
+
 def test_a_file_without_a_stop_that_cannot_be_written_starts_the_robot_stopped() -> None:
     made = doubted(Latches(), "the file cannot be written", NOW)
     assert made.stop

@@ -378,6 +378,16 @@ def test_a_wheel_that_slows_down_slowly_a_second_time_is_no_fault() -> None:
             assert sanity.watch(STILL, only(1, speed), DT) == ""
 
 
+def test_a_slow_wheel_that_sped_up_during_a_stall_and_now_slows_down_is_no_fault() -> None:
+    """The line behind the stall is the first that is too fast, and shows a much higher speed."""
+    sanity = Sanity(FeedbackConfig())
+    lines = [(9.29, 0.23, 0.1), (17.52, 1.41, 0.1), (17.95, 4.47, 0.1), (17.95, 7.86, 0.1)]
+    lines += [(0.0, 11.83, 0.25), (1.21, 13.48, 0.02), (4.18, 12.63, 0.03)]
+    lines += [(0.0, speed, 0.1) for speed in (11.1, 8.77, 6.55, 4.85, 3.6, 2.7, 2.0)]
+    for told, speed, dt in lines:
+        assert sanity.watch(only(1, told), only(1, speed), dt) == ""
+
+
 def test_a_runaway_seen_by_a_coarse_encoder_does_not_look_like_slowing_down() -> None:
     sanity = driven(10.0)
     found = [sanity.watch(STILL, only(1, 10.0 + 2.5 * (step % 2)), DT) for step in range(100)]
