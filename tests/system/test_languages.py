@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from tests.pages import blocks
+from tests.system.browser import Page
 from tests.system.harness import (
     ROOT,
     Bus,
@@ -84,6 +85,100 @@ def followed(words: Sequence[str], where: Path, bus: Bus) -> None:
 def test_the_python_example_follows_the_robot(shared: Daemon, bus: Bus, tmp_path: Path) -> None:
     words = [sys.executable, str(CLIENTS / "python/follow.py"), shared.endpoint]
     followed(words, tmp_path, bus)
+
+
+def driven(words: Sequence[str], where: Path, bus: Bus, **more: str) -> None:
+    """Check that the program drives the robot and prints the positions, then ends by itself."""
+    begun = bus.state()["x"]
+    with Program(words, where, environment(**more)) as driver:
+        until(lambda: bus.state()["source"] == "app", 30.0, f"it drives\n{driver}")
+        assert driver.ended(20.0) == 0, driver
+        found = [LINE.fullmatch(line) for line in driver.out]
+    told = [match for match in found if match]
+    assert len(told) > 20, driver
+    assert len(told) == len(found), driver
+    assert float(told[-1][1]) - begun == pytest.approx(bus.state()["x"] - begun, abs=0.01)
+    assert 0.2 < float(told[-1][1]) - begun < 0.6
+    assert 0.15 < max(float(match[3]) for match in told) < 0.25
+    bus.at_rest()
+
+
+@pytest.mark.slow
+def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
+    node = program("node", "it runs the program")
+    version = run([node, "--version"], tmp_path)
+    flags = ["--experimental-websocket"] if version < "v22" else []
+    words = [node, *flags, str(CLIENTS / "node/drive.mjs")]
+    driven([*words, page.here], tmp_path, standing)
+    away = [*words, page.away, page.invite("operator", "node")]
+    driven(away, tmp_path, standing, NODE_EXTRA_CA_CERTS=str(page.tls / "ca.pem"))
+
+
+@pytest.mark.slow
+def test_the_java_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
+    java = program("java", "it runs the program")
+    words = [java, str(CLIENTS / "java/Drive.java")]
+    driven([*words, page.here], tmp_path, standing)
+    nowhere = f"http://{free_endpoint().partition('/')[2]}"
+    missing = subprocess.run(
+        [*words, nowhere], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert missing.returncode == 1, missing
+    assert missing.stderr.startswith(f"no connection to {nowhere}: "), missing
+
+
+@pytest.mark.languages
+@pytest.mark.timeout(300)
+def test_the_go_program_drives_the_robot(page: Page, standing: Bus, kept: Path) -> None:
+    go = program("go", "it builds the program")
+    here = copied("go", kept)
+    run([go, "build", "-o", "drive", "."], here)
+    driven([str(here / "drive"), page.here], here, standing)
+    away = [str(here / "drive"), page.away, page.invite("operator", "go")]
+    driven(away, here, standing, SSL_CERT_FILE=str(page.tls / "ca.pem"))
+
+
+@pytest.mark.slow
+def test_the_program_for_curl_stops_and_releases_the_robot(page: Page, standing: Bus) -> None:
+    program("curl", "the program calls it")
+
+    here = {"ADDRESS": page.here}
+    away = {"ADDRESS": page.away, "CURL_CA_BUNDLE": str(page.tls / "ca.pem")}
+
+    def asks(verb: str, robot: dict[str, str] = here) -> dict[str, Any]:
+        done = called(verb, robot)
+        assert done.returncode == 0, done
+        answer: dict[str, Any] = json.loads(done.stdout)
+        return answer
+
+    assert asks("state")["mode"] == "ready"
+    assert asks("stop")["success"] is True
+    assert standing.state()["mode"] == "stopped"
+    answer = asks("clear")
+    assert answer["success"] is True, answer
+    until(lambda: standing.state()["mode"] == "ready", 5.0, "it is released")
+    viewer = away | {"TOKEN": page.invite("viewer", "curl")}
+    assert asks("stop", viewer)["success"] is True
+    refused = called("clear", viewer)
+    assert refused.returncode != 0, refused
+    assert standing.state()["mode"] == "stopped"
+    assert asks("clear")["success"] is True
+
+
+@pytest.mark.parametrize("verb", ["state", "stop", "clear"])
+def test_the_program_for_curl_fails_if_no_robot_answers(verb: str) -> None:
+    program("curl", "the program calls it")
+    missing = called(verb, {"ADDRESS": f"http://{free_endpoint().partition('/')[2]}"})
+    assert missing.returncode != 0, missing
+    assert missing.stderr.startswith("curl: ")
+
+
+def called(verb: str, robot: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """Run the program for curl."""
+    words = ["sh", str(CLIENTS / "curl/robot.sh"), verb]
+    return subprocess.run(
+        words, env=environment(**robot), capture_output=True, text=True, timeout=30, check=False
+    )
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,31 @@
+#!/bin/sh
+# Shows, stops or releases the robot by curl: `sh robot.sh state`, `stop` or `clear`.
+# ADDRESS and TOKEN in the environment name another robot.
+# The exit code is 0 only if the robot answers and obeys.
+set -e
+
+robot=${ADDRESS:-http://127.0.0.1:8080}
+
+ask() {
+    curl --silent --show-error --fail-with-body --max-time 5 --write-out '\n' \
+        ${TOKEN:+--header "Authorization: Bearer $TOKEN"} "$@"
+}
+
+case ${1:-state} in
+state)
+    ask "$robot/api/state"
+    ;;
+stop)
+    ask --request POST "$robot/api/srv/stop"
+    ;;
+clear)
+    # The number says which stop you have seen. The robot keeps a later one.
+    state=$(ask "$robot/api/state")
+    latch=$(echo "$state" | sed -n 's/.*"latch": *\([0-9]*\).*/\1/p')
+    ask --json "{\"latch\": ${latch:-0}}" "$robot/api/srv/clear"
+    ;;
+*)
+    echo "usage: sh robot.sh [state | stop | clear]" >&2
+    exit 64
+    ;;
+esac

@@ -1,0 +1,40 @@
+// Drives the robot forward for two seconds and prints where it is: `node drive.mjs [ADDRESS [TOKEN]]`.
+// Node 22 or later; Node 20 needs `node --experimental-websocket`.
+
+const [address = "http://127.0.0.1:8080", token] = process.argv.slice(2);
+const PERIOD_MS = 50;
+
+const socket = new WebSocket(
+  address.replace("http", "ws") + "/ws",
+  token ? ["acsard", "acsard.token." + token] : [],
+);
+const say = (message) => socket.send(JSON.stringify(message));
+const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+
+async function drive(speed, seconds) {
+  for (let sent = 0; sent < (seconds * 1000) / PERIOD_MS; sent++) {
+    const stamp = performance.timeOrigin + performance.now();
+    say({ cmd: { linear_x: speed, angular_z: 0 }, stamp });
+    await pause(PERIOD_MS);
+  }
+}
+
+socket.onmessage = ({ data }) => {
+  const { key, value, refused, reason } = JSON.parse(data);
+  if (refused) console.error(`${refused} was refused: ${reason}`);
+  if (key !== "odom") return;
+  const { x, y } = value.pose.pose.position;
+  const speed = value.twist.twist.linear.x;
+  console.log(`x ${x.toFixed(3)} m, y ${y.toFixed(3)} m, ${speed.toFixed(3)} m/s`);
+};
+socket.onerror = () => {
+  console.error(`no connection to ${address}`);
+  process.exitCode = 1;
+};
+socket.onopen = async () => {
+  say({ subscribe: "odom", rate: 10 });
+  await drive(0, 0.75); // the robot follows a new sender only after some zeros
+  await drive(0.2, 2);
+  await drive(0, 1);
+  socket.close();
+};
