@@ -261,6 +261,16 @@ COMMANDS: dict[str, How] = {
     "python deploy/clients/python/follow.py": Elsewhere(
         CLIENTS, "test_the_python_example_follows_the_robot"
     ),
+    "sh deploy/clients/curl/robot.sh stop": Elsewhere(
+        CLIENTS, "test_the_program_for_curl_stops_and_releases_the_robot"
+    ),
+    "node deploy/clients/node/drive.mjs": Elsewhere(
+        CLIENTS, "test_the_node_program_drives_the_robot"
+    ),
+    "cd deploy/clients/go && go run .": Elsewhere(CLIENTS, "test_the_go_program_drives_the_robot"),
+    "java deploy/clients/java/Drive.java": Elsewhere(
+        CLIENTS, "test_the_java_program_drives_the_robot"
+    ),
     "cd deploy/clients/rust && cargo run": Elsewhere(
         CLIENTS, "test_the_rust_example_follows_the_robot"
     ),
@@ -350,7 +360,8 @@ COMMANDS: dict[str, How] = {
     "--invite operator --name phone": BY_THE_SERVICE,
     "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
     "--revoke phone": BY_THE_SERVICE,
-    'sudo sh -c "/opt/acsard/venv/bin/acsard tls renew && systemctl restart acsard"': Elsewhere(
+    'sudo sh -c "/opt/acsard/venv/bin/acsard tls renew && '
+    'systemctl try-restart acsard-web acsard-gateway"': Elsewhere(
         OPEN, "test_a_renewed_certificate_is_shown_after_the_restart_and_tokens_still_count"
     ),
     # deploy/ros2
@@ -420,6 +431,9 @@ COMMANDS: dict[str, How] = {
     "sudo /opt/acsard/venv/bin/acsard recording": Elsewhere(
         LOG, "test_the_list_has_a_line_for_each_recording_with_its_events"
     ),
+    "sudo /opt/acsard/venv/bin/acsard recording --from yesterday": Elsewhere(
+        LOG, "test_the_list_takes_only_the_recordings_of_a_time"
+    ),
     "sudo /opt/acsard/venv/bin/acsard recording show --from 14:05": Elsewhere(
         "tests/unit/cli/test_recording_times.py",
         "test_a_time_of_day_is_looked_up_before_now_in_the_ring",
@@ -458,6 +472,7 @@ COMMANDS: dict[str, How] = {
     "for n in {1..10}; do acsard tls add robot$n --directory fleet; done": TEN,
     "acsard tls router robot{1..10} --operator laptop-anna > router.json5": TEN,
     "acsard tls add laptop-anna --role operator --directory fleet": Run("operators = "),
+    "acsard tls renew --name laptop-anna --directory fleet": Run("has a new certificate"),
     "sudo install -d -o zenohd -m 0700 /etc/zenohd/tls": PLACES,
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": PLACES,
     "sudo install -m 0644 router.json5 /etc/zenohd/": PLACES,
@@ -477,6 +492,11 @@ COMMANDS: dict[str, How] = {
     f"acsard call stop {_ROUTER} laptop-anna": LAPTOP,
     f"acsard fleet {_ROUTERS} laptop-anna": MANY,
     f"acsard call stop {_ROUTERS} laptop-anna": MANY,
+    f"acsard set limits.linear_speed 0.8 {_ROUTERS} fleet/clients/maintainer": Elsewhere(
+        "tests/system/test_many.py",
+        "test_set_changes_named_robots_and_prints_a_line_for_each",
+        "without certificates",
+    ),
     f"acsard echo state -n 1 {_ROUTER} fleet/clients/viewer": LAPTOP,
     f"acsard call clear {_ROUTER} fleet/clients/viewer": LAPTOP,
     f"acsard call clear {_ROUTER} fleet/clients/operator": LAPTOP,

@@ -57,8 +57,9 @@ VERBS = {
 """The subcommands and their help texts, in the order of `acsard --help`. Each is a module here."""
 
 _EPILOG = """\
-exit codes: 0 done, 1 failure, 2 wrong usage, 66 no such port, 69 daemon unreachable, 75 port,
-bus address or robot id in use, 77 no permission, 78 bad configuration
+exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording is damaged, 66 no such
+port, 69 daemon unreachable, 75 port, bus address or robot id in use, 77 no permission, 78 bad
+configuration
 
 try:  acsard run                (start the robot on the built-in simulator)
       acsard drive              (in a second terminal: drive it with the keyboard)
@@ -110,7 +111,11 @@ def main(argv: list[str] | None = None) -> int:
         words.insert(0, "run")
     try:
         try:
-            args = parser(words[:1]).parse_args(words)
+            whole = parser(words[:1])
+            args, unknown = whole.parse_known_args(words)
+            if unknown:
+                text = f"unrecognized arguments: {' '.join(unknown)}"
+                whole.error(f"{text}; `acsard {args.verb} --help` lists the options")
             return int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)

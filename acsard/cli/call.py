@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 from acsard.cli.connection import MANY, add_bus, connected_to_many
-from acsard.cli.echo import of_robot
+from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
-from acsard.core.formatting import json_line, lines, printable
+from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
-from acsard.core.messages.schema import MESSAGES, ServiceReply
+from acsard.core.messages.schema import MESSAGES
 from acsard.core.messages.topics import PLAIN_SERVICES, SERVICES
-from acsard.core.values import AcsardError, Verb
+from acsard.core.values import Verb
 from acsard.daemon.bus import robot_discovery
-from acsard.daemon.bus.robot_discovery import ALL, named, present, seen
-from acsard.host.errors import Exit, UsageError
+from acsard.daemon.bus.robot_discovery import named
+from acsard.host.errors import UsageError
 
 CALLED = tuple(service for service in SERVICES if service != "set")
 """The services of this subcommand.
@@ -89,25 +87,6 @@ def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
     """
     # Send the stop to every named robot first. Finding out which robots are present would delay it.
     robot_discovery.stop(robot.session, ids, robot.caller)
-    wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
-
-    def stop(one: str) -> ServiceReply | AcsardError:
-        try:
-            return robot.like(one).call("stop")
-        except AcsardError as error:  # the robot did not answer, or its answer cannot be decoded
-            return error
-
-    with ThreadPoolExecutor(min(len(wanted), 32)) as calls:
-        replies = dict(zip(wanted, calls.map(stop, wanted), strict=True))
-    for one, reply in replies.items():
-        if isinstance(reply, AcsardError):
-            told = f"NO ANSWER: go to the robot, or use its emergency switch ({reply})"
-            reply = ServiceReply(False, told)
-        line = encode(reply, "json").decode()
-        print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
-    if ALL in ids:
-        print(f"acsard: {seen(robot.where.endpoint, len(replies))}", file=sys.stderr)
-    if any(isinstance(reply, AcsardError) for reply in replies.values()):
-        return int(Exit.UNREACHABLE)
-    stopped = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]
-    return int(Exit.OK if all(stopped) else Exit.FAILURE)
+    replies = of_each(robot, ids, lambda one: one.call("stop"))
+    silence = "NO ANSWER: go to the robot, or use its emergency switch ({error})"
+    return print_each(replies, robot, ids, silence, as_json=as_json)

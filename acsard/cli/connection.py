@@ -61,7 +61,7 @@ def require_one(args: argparse.Namespace) -> None:
     if named(args.id or ""):
         raise UsageError(
             f"--id '{args.id}' names several robots, but `acsard {args.verb}` takes one: "
-            "`acsard fleet` lists the robots; only echo, get and call stop take several"
+            "`acsard fleet` lists the robots; only echo, get, set, fleet and call stop take several"
         )
 
 

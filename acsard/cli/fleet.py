@@ -1,25 +1,35 @@
 """Show mode, speed, link, version and reason of every robot that the bus or router at --connect
 knows, live; q or Ctrl-C quits. Over TLS a role may use only exact keys, so name the robots: --id
-robot1,robot2. Into a pipe, or with --once, the tool prints one table.
+robot1,robot2. Into a pipe, or with --once, the tool prints one table. SEEN has the age of the last
+report. FILE marks a robot whose settings in force differ from its configuration file; the end of
+WHY names them. A terminal cuts long lines; `acsard fleet | cat` does not.
 """
 
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 
+import msgspec
+
 from acsard.cli.connection import MANY, add_bus, connected_to_many
+from acsard.core.formatting import json_line
 from acsard.daemon.bus.robot_discovery import ALL
 from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.fleet import Fleet
+from acsard.top.line_by_line import output_size
 from acsard.top.roster import table
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="print one table and end")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print one list as JSON and end, with the whole `state` of each robot",
+    )
     add_bus(parser, MANY + " (the default)")
 
 
@@ -27,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
     with connected_to_many(args) as (robot, many):
         ids = (many or (robot.where.robot_id,)) if args.id else (ALL,)
         fleet = Fleet(robot, ids)
-        if not args.once and has_screen():
+        if not (args.once or args.json) and has_screen():
             terminal.roster(fleet)
             return int(Exit.OK)
         rows = fleet.gather()
@@ -36,7 +46,10 @@ def main(args: argparse.Namespace) -> int:
             named = robot.where.tls and ids != (ALL,)
             silence = robot.like(ids[0]).whoami().silence if named else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
-        width = shutil.get_terminal_size((160, 24)).columns
+        if args.json:
+            print(json_line(msgspec.json.encode(rows).decode()), flush=True)
+            return int(Exit.OK)
+        width = output_size().columns
         # Flush now: nothing that delays the end of the session may hold back the table.
         print("\n".join(table(rows, width)), flush=True)
     for told in filter(None, (fleet.seen, fleet.more)):

@@ -1,6 +1,7 @@
 """Work with the recordings that the daemon has made. Without a subcommand, list them, oldest
-first, with the main events of each. FILE is a recording, its number in that list, or `all` of them.
-Without FILE, --from and --to search all recordings, and without these too the newest is taken.
+first, with the main events of each. `!` marks those with a stop, a fault or a crash, and --from and
+--to list those of a time. FILE is a recording, its number in that list, or `all` of them. Without
+FILE, --from and --to search all recordings, and without these too the newest is taken.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import argparse
 import re
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -16,16 +18,19 @@ import msgspec
 from acsard.cli import recording_files
 from acsard.cli.common import load
 from acsard.cli.recording_files import progress
+from acsard.core.config.settings import Config
 from acsard.core.formatting import json_line, listed, many, printable
-from acsard.core.ros.shapes import how_often
+from acsard.core.values import NS_PER_S
 from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
 from acsard.recording.atomic_output import replacing
+from acsard.recording.directory import is_being_recorded
 from acsard.recording.directory import listed as recordings_in
-from acsard.recording.end_record import EndRecord, how_it_ends, read_end
-from acsard.recording.file import Recording, rewrite
+from acsard.recording.end_record import CRASHES, EndRecord, how_it_ends, read_end
+from acsard.recording.file import UNFINISHED, Recording, is_part, rewrite
 from acsard.recording.file_replay import config_of, replay_file, steps
 from acsard.recording.replay_text import (
     describe_difference,
+    describe_gaps,
     describe_outcome,
     explain_settings,
     explain_verdict,
@@ -40,11 +45,12 @@ from acsard.recording.time_span import (
     TimeError,
     When,
     clock,
+    date,
     parse_when,
     resolve,
     span,
 )
-from acsard.recording.timeline import TimelineEntry, TimelineWriter
+from acsard.recording.timeline import TimelineEntry, TimelineWriter, is_serious
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
@@ -57,11 +63,13 @@ SERVICE = Path("/var/lib/acsard/record")
 def add_options(parser: argparse.ArgumentParser) -> None:
     _directory(parser, None)
     _own_config(parser, None)
+    _times(parser, None)
     actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
     shown = actions.add_parser(
         "show",
         help="print the events of a recording as text",
-        description="Print the events of a recording as text, one line per event.",
+        description="Print the events of a recording as text, one line per event. A line `gap` "
+        "stands for missing steps, as after damage to the file; the exit code stays 0.",
     )
     shown.add_argument("--json", action="store_true", help="print one JSON object a line")
     shown.set_defaults(main=main_show)
@@ -70,7 +78,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="run the recorded inputs through the robot again and compare the results",
         description="Run the recorded inputs through the robot again, and compare every line, "
         "pose, mode, reason and event with the recorded ones. With --config, show what another "
-        "configuration would have changed.",
+        "configuration would have changed. A part that a damaged place makes unreadable is not "
+        "compared. Exit codes: 0 everything is the same, 1 something differs, 65 a part was not "
+        "compared and the rest is the same.",
     )
     replay.set_defaults(main=main_replay)
     recover = actions.add_parser(
@@ -111,10 +121,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for action in (recover, export, report):
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
     for action in (shown, export, report):
-        for option, name in (("--from", "begin"), ("--to", "end")):
-            action.add_argument(
-                option, dest=name, type=_when, metavar="TIME", help=f"for example {EXAMPLES}"
-            )
+        _times(action, argparse.SUPPRESS)
     for action in (shown, replay, recover, export, report):
         _directory(action, argparse.SUPPRESS)
     # For `replay` and `export`, --config is the configuration that they try.
@@ -131,6 +138,18 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
     )
 
 
+def _times(parser: argparse.ArgumentParser, default: object) -> None:
+    for option, name in (("--from", "begin"), ("--to", "end")):
+        parser.add_argument(
+            option,
+            dest=name,
+            default=default,
+            type=_when,
+            metavar="TIME",
+            help=f"for example {EXAMPLES}",
+        )
+
+
 def _own_config(parser: argparse.ArgumentParser, default: object) -> None:
     parser.add_argument(
         "--config",
@@ -143,31 +162,39 @@ def _own_config(parser: argparse.ArgumentParser, default: object) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    first, last = _range(args)
     where, files = _files(args)
-    if not files:
-        print(f"no recordings in {where}")
     rows: list[tuple[str, ...]] = []
     for path in files:
         try:
-            last = read_end(path)
-            rows.append(_row(path, last) if last else _row_of_unfinished(Recording(path)))
+            end, note = read_end(path), ""
+            if end is None:
+                recording = Recording(path)
+                end = recording.compute_end_record()
+                fresh = is_being_recorded(path, time.time())
+                note = "being recorded" if fresh else recording.missing
+            begin_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
+            if begin_ns / NS_PER_S <= last and first <= end.last_ns / NS_PER_S:
+                rows.append(_row(path, end, note))
+        except FileNotFoundError:
+            # The daemon has just renamed or removed the file.
+            continue
         except RecordingError as error:
             rows.append((path.name, "", "", "", printable(str(error))))
     if rows:
         show(table(rows, right={2, 3}))
+    else:
+        words = f" {in_words(first, last)}" if files else ""
+        print(f"no recordings{words} in {where}")
     return int(Exit.OK)
 
 
-def _row(path: Path, last: EndRecord, note: str = "") -> tuple[str, ...]:
-    began = clock(last.wall_ns / 1e9, day=True)
-    seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
-    said = last.said + _bracketed(how_it_ends(last.cut, last.why)) + note
-    return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", printable(said).strip()
-
-
-def _row_of_unfinished(recording: Recording) -> tuple[str, ...]:
-    """Return the row of a recording without an end. The whole recording must be read for it."""
-    return _row(recording.path, recording.compute_end_record(), _bracketed(recording.missing))
+def _row(path: Path, end: EndRecord, note: str) -> tuple[str, ...]:
+    began = clock(end.wall_ns / 1e9, day=True)
+    seconds, size = (end.last_ns - end.wall_ns) / 1e9, path.stat().st_size / 1000
+    mark = "! " if is_serious(end.said) or end.cut in CRASHES else "  "
+    said = end.said + _bracketed(how_it_ends(end.cut, end.why)) + _bracketed(note)
+    return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", mark + printable(said).strip()
 
 
 def _bracketed(text: str) -> str:
@@ -178,20 +205,31 @@ def main_show(args: argparse.Namespace) -> int:
     for recording, part in _parts(args):
         if not _show(recording, part, args.json) and part != WHOLE:
             raise RecordingError(f"{recording.path} has no step in that span of time")
-        _note(recording, _bracketed(recording.missing))
+        note = recording.missing
+        if _is_being_recorded(recording):
+            note = note.replace(UNFINISHED, "being recorded")
+        _note(recording, _bracketed(note))
     return int(Exit.OK)
+
+
+def _is_being_recorded(recording: Recording) -> bool:
+    """Return whether a daemon still writes to this recording. Read it before."""
+    if recording.ending != UNFINISHED:
+        return False
+    with suppress(OSError):  # the daemon has just renamed or removed the file
+        return is_being_recorded(recording.paths[-1], time.time())
+    return False
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
     """Print the events of a part, and return whether the part has steps."""
-    story, last_s = TimelineWriter(), recording.about.wall_ns / 1e9
+    story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
         if over:
             # Read the rest, so that the notes count every damaged place.
             continue
-        now = step.inputs.now
-        seconds, last_s = (now.mono_ns - recording.about.mono_ns) / 1e9, now.wall_ns / 1e9
+        seconds = (step.inputs.now.mono_ns - recording.about.mono_ns) / NS_PER_S
         over = seconds > part.end
         entries = list(story.end() if over and found else story.step(step))
         if part.begin <= seconds <= part.end or (over and found):
@@ -200,12 +238,17 @@ def _show(recording: Recording, part: Span, as_json: bool) -> bool:
                 _tell(entry, as_json)
     if over or (part.begin > 0.0 and not found):
         return found
-    for entry in story.end():
+    for entry in story.end("" if _is_being_recorded(recording) else recording.ending):
         _tell(entry, as_json)
-    if recording.ending:
-        words = recording.ending.removeprefix("cut: ")
-        _tell(TimelineEntry(last_s, "cut", words, "warning"), as_json)
     return found
+
+
+def _config_of(recording: Recording) -> Config | None:
+    """Return the recorded configuration, or None if this version cannot read it."""
+    try:
+        return config_of(recording)
+    except RecordingError:
+        return None
 
 
 def _note(recording: Recording, note: str) -> None:
@@ -223,8 +266,10 @@ def _tell(one: TimelineEntry, as_json: bool) -> None:
 def main_replay(args: argparse.Namespace) -> int:
     """Replay a recording and compare the result with the recorded one.
 
-    Returns 1 if they differ; with --config a difference is expected and it returns 0.
+    Returns 1 if they differ, except with --config, with which a difference is expected. Otherwise
+    returns 65 if a part was not compared, else 0.
     """
+    _refuse_times(args, "replay")
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with progress(recording) as tell:
@@ -240,26 +285,44 @@ def main_replay(args: argparse.Namespace) -> int:
     rows += filter(None, [result.event_copies, result.failed_step])
     for row in rows:
         print(printable(row))
-    _note(recording, result.trouble or _bracketed(recording.missing))
-    return int(Exit.OK if result.same or other is not None else Exit.FAILURE)
+    left_out = describe_gaps(result.gaps, "not compared")
+    _note(recording, left_out)
+    _note(recording, _bracketed(recording.missing))
+    if not result.same and other is None:
+        return int(Exit.FAILURE)
+    return int(Exit.INCOMPLETE if left_out else Exit.OK)
 
 
 def main_recover(args: argparse.Namespace) -> int:
+    _refuse_times(args, "recover")
     recording, new = _recording(args), Path(args.new)
+    replaces = ""
+
+    def is_earlier_result(old: Recording) -> bool:
+        nonlocal replaces
+        if new.samefile(recording.path) or not is_part(old, recording):
+            return False
+        replaces = ", which replaces an earlier copy of the same recording"
+        return True
+
     try:
-        with replacing(new, args.force) as part:
+        with replacing(new, args.force, is_earlier_result) as part:
             count = rewrite(recording, part)
     except OSError as error:
         raise MendableError(f"cannot write {new}: {error.strerror}") from None
-    print(f"{many(count, 'message')} in {new}{_bracketed(recording.missing)}")
+    print(f"{many(count, 'message')} in {new}{replaces}{_bracketed(recording.missing)}")
     return int(Exit.OK)
 
 
 def main_export(args: argparse.Namespace) -> int:
+    code = Exit.OK
     for recording, part in _files_to_write(args):
-        trouble = recording_files.export(recording, part, args)
-        _note(recording, trouble or _bracketed(recording.missing))
-    return int(Exit.OK)
+        left_out = recording_files.export(recording, part, args)
+        _note(recording, left_out)
+        _note(recording, _bracketed(recording.missing))
+        if left_out:
+            code = Exit.INCOMPLETE
+    return int(code)
 
 
 def main_report(args: argparse.Namespace) -> int:
@@ -268,6 +331,12 @@ def main_report(args: argparse.Namespace) -> int:
         for note in recording_files.report(recording, part, args, plotly):
             _note(recording, note)
     return int(Exit.OK)
+
+
+def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
+    """Refuse --from and --to, which are options of the list and of other subcommands."""
+    if args.begin is not None or args.end is not None:
+        raise UsageError(f"{subcommand} takes a whole recording: leave out --from and --to")
 
 
 def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
@@ -286,24 +355,29 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
     times = [when for when in (args.begin, args.end) if when is not None]
     by_clock = bool(times) and not any(isinstance(when, Offset) for when in times)
     if args.file == "all" or (args.file is None and by_clock):
-        return _search(args, by_clock or not times)
+        return _search(args)
     recording = _recording(args)
     if args.file is None and times:
         _note(recording, "the newest recording: a number of seconds counts from its beginning")
     return [(recording, span(recording, args.begin, args.end))]
 
 
-def _search(args: argparse.Namespace, by_clock: bool) -> list[tuple[Recording, Span]]:
-    """Search all recordings, and say on standard error which ones have the time."""
-    if not by_clock:
+def _range(args: argparse.Namespace) -> tuple[float, float]:
+    """Return the range of time that the arguments name, s since 1970; it may be infinite."""
+    if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
             "a number of seconds counts from the beginning of one recording: name that recording, "
             f"or write a time, for example {EXAMPLES}"
         )
     try:
-        first, last = resolve(args.begin, args.end, time.time())
+        return resolve(args.begin, args.end, time.time())
     except TimeError as error:
         raise UsageError(str(error)) from None
+
+
+def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
+    """Search all recordings, and say on standard error which ones have the time."""
+    first, last = _range(args)
     where, files = _files(args)
     try:
         result = search(files, first, last)
@@ -354,10 +428,9 @@ def _recording(args: argparse.Namespace) -> Recording:
 
 
 def _sentence(one: TimelineEntry) -> str:
-    by = f" (by {one.by})" if one.by else ""
-    times = how_often(one.text, one.count)
     mark = {"warning": "! ", "error": "!! "}.get(one.level, "")
-    return f"{clock(one.seconds)}  {mark}{one.name.replace('_', ' ')}: {one.text}{by}{times}"
+    at = f"{date(one.seconds)} {clock(one.seconds)}"
+    return f"{at}  {mark}{one.name.replace('_', ' ')}: {one.sentence}"
 
 
 def _when(text: str) -> When:

@@ -17,6 +17,7 @@ from acsard.recording import export as exports
 from acsard.recording.atomic_output import replacing
 from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording
+from acsard.recording.replay_text import describe_gaps
 from acsard.recording.time_span import Span
 from acsard.report.page import drawn
 
@@ -24,12 +25,14 @@ EXPORT = """\
 Write the messages of a recorded robot as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag
 play`. The file is MCAP with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each
 source, diagnostics, state and log as ROS 2 messages, and with their definitions. With --config,
-write the messages that the robot would have published with another configuration.
+write the messages that the robot would have published with another configuration. A part that a
+damaged place makes unreadable is left out. Exit codes: 0 complete, 65 a part is left out.
 """
 
 REPORT = """\
 Draw a recording as one HTML file that needs no network. Needs the library plotly; if it is missing,
-a message gives the command that installs it.
+a message gives the command that installs it. A part that a damaged place makes unreadable is left
+out and named; the exit code stays 0.
 """
 
 
@@ -92,9 +95,9 @@ def add_export(parser: argparse.ArgumentParser) -> None:
 
 
 def export(recording: Recording, part: Span, args: argparse.Namespace) -> str:
-    """Write a part of the recording, print a summary, and return why it ends early.
+    """Write a part of the recording, print a summary, and say which steps are missing in it.
 
-    Returns "" if the part is complete.
+    Returns "" if no step is missing.
     """
     kind: exports.Kind = args.kind
     # The default is this directory, because that of the recordings belongs to the service.
@@ -103,7 +106,7 @@ def export(recording: Recording, part: Span, args: argparse.Namespace) -> str:
     with _written(new), progress(recording) as tell:
         done = exports.export(recording, new, kind, other, part, tell, args.force)
     print(f"{done.count} {'rows' if kind == 'csv' else 'messages'} in {new}")
-    return done.trouble
+    return describe_gaps(done.gaps, "not exported")
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:

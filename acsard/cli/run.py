@@ -14,12 +14,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from acsard import __version__
-from acsard.cli.common import add_config, load, recorded
+from acsard.cli.common import add_config, by_environment, load, recorded, tables
 from acsard.core.config.contradictions import warnings
+from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.values import ROOT, Event
 from acsard.daemon import daemon
 from acsard.daemon.bus.zenoh_sessions import reachable
+from acsard.daemon.settings_file import SettingsFile
 from acsard.host.logs import Log, Writer
 
 _BANNER = """\
@@ -117,11 +119,27 @@ def main(args: argparse.Namespace) -> int:
     if sys.stderr is not None:  # it is None if standard error was closed before the start
         faulthandler.enable()
     try:
-        asyncio.run(daemon.run(config, log, announce, None if args.no_gateway else gateway, served))
+        asyncio.run(
+            daemon.run(
+                config,
+                log,
+                announce,
+                None if args.no_gateway else gateway,
+                served,
+                settings_file(where, config, options(args)),
+            )
+        )
     finally:
         log.close()
         screen.close(0.2)
     return 0
+
+
+def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
+    """Return the configuration file at `where`, read as a restart with these options would do."""
+    overrides = tables(given, by_environment())
+    file = Path(where).absolute() if Path(where).is_file() else None
+    return SettingsFile(file, lambda text: recorded(parse(text, overrides)), config)
 
 
 def page(config: Config, where: str) -> list[str] | None:

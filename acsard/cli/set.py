@@ -1,10 +1,13 @@
 """Change settings of the running robot: limits, timeouts, covariances, publishing rates, the log
 level. Either all given settings change or none. The daemon checks them like the configuration file,
 logs them and publishes them on the key `config`. They last until the daemon's next start; only a
-lowered speed, acceleration or jerk survives it. --write also puts the settings into the
-configuration file, except a source's timeout: edit [[commands.sources]] yourself. The robot
-decelerates to a lowered speed limit. Without a setting, list the settings that can be changed. The
-exit code is 1 if the robot refuses.
+lowered speed, acceleration or jerk survives it, except on the simulator. With --keep the robot also
+writes them into its own configuration file, and the answer names that file. With --write this tool
+writes them into the configuration file of this machine. Neither --keep nor --write changes a file
+for a source's timeout: edit [[commands.sources]] yourself. The robot decelerates to a lowered speed
+limit. Without a setting, list the settings that can be changed. If --id names several robots, all
+of them get the settings at the same time, and each line has the answer of one robot. The exit code
+is 1 if a robot refuses, and 69 if one does not answer.
 """
 
 from __future__ import annotations
@@ -16,14 +19,18 @@ from pathlib import Path
 
 import msgspec
 
-from acsard.cli.connection import add_bus, connected
+from acsard.cli.connection import MANY, add_bus, connected_to_many
+from acsard.cli.replies import of_each, print_each
+from acsard.client import Client
 from acsard.core.config.live import flat, live
 from acsard.core.config.lowered import stays
 from acsard.core.config.validation import show
 from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
+from acsard.daemon.bus.robot_discovery import named
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
@@ -37,36 +44,48 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="a key of acsard.toml with its table, for example limits.linear_speed; write a "
         "list as [1, 2]",
     )
-    parser.add_argument(
+    files = parser.add_mutually_exclusive_group()
+    files.add_argument(
+        "--keep",
+        action="store_true",
+        help="the robot also writes them into its own configuration file, and keeps its comments. "
+        "Nothing is set if its daemon may not change that file, if git tracks the file, or if the "
+        "robot lacks the library tomlkit",
+    )
+    files.add_argument(
         "--write",
         action="store_true",
         help="also write them into the local configuration file and keep its comments (needs an "
         f"extra: {install('write')})",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
-    add_bus(parser)
+    add_bus(parser, MANY + " (to change settings)")
 
 
 def main(args: argparse.Namespace) -> int:
     settings = pairs(args.settings)
+    if args.keep and not settings:
+        raise UsageError("--keep needs a setting: acsard set limits.linear_speed 0.8 --keep")
+    if named(args.id or ""):
+        _require_for_many(args, settings)
     file = _file(args.config, settings) if args.write else None
     if file is not None:
         require_changeable(file, settings)
-    with connected(args) as robot:
+    with connected_to_many(args) as (robot, many):
         if not settings:
             _tell(robot.get("config"), args.json)
             return int(Exit.OK)
-        reply = robot.set(settings)
-    until = "until the next start"
-    if any(stays(key) for key in settings):
-        until += "; a lowered limit survives the restart"
+        if many:
+            return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
+        reply = robot.set(settings, keep=args.keep)
+    until = _until(settings)
     if reply.success and file is not None:
         try:
             change(file, settings)
         except MendableError as error:
             raise MendableError(f"{reply.message}, {until}; not written: {error}") from None
         until = f"written to {file}"
-    text = f"{reply.message}; {until}" if reply.success else reply.message
+    text = f"{reply.message}; {until}" if reply.success and not args.keep else reply.message
     print(json_line(encode(reply, "json").decode()) if args.json else lines(text))
     return int(Exit.OK if reply.success else Exit.FAILURE)
 
@@ -89,6 +108,38 @@ def _value(word: str) -> Plain:
     value: Plain = found["value"]
     one = len(found) == 1 and isinstance(value, bool | int | float | str | list)
     return value if one else word
+
+
+def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> None:
+    """Raise `UsageError` if the options do not fit several robots."""
+    if not settings:
+        raise UsageError("name one robot in --id to list its settings")
+    if args.write:
+        raise UsageError(
+            f"--write changes the file of this machine, but --id '{args.id}' names several robots: "
+            "with --keep each robot writes its own file"
+        )
+
+
+def _until(settings: dict[str, Plain]) -> str:
+    """Return how long the settings last, in words."""
+    survives = "; a lowered limit survives the restart, except on the simulator"
+    return f"until the next start{survives if any(map(stays, settings)) else ''}"
+
+
+def _set_all(
+    robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, keep: bool, as_json: bool
+) -> int:
+    """Change the settings of all these robots, print each robot's answer, return the exit code."""
+
+    def change_one(one: Client) -> ServiceReply:
+        reply = one.set(settings, keep=keep)
+        if as_json or keep or not reply.success:
+            return reply
+        return ServiceReply(True, f"{reply.message}; {_until(settings)}")
+
+    replies = of_each(robot, ids, change_one)
+    return print_each(replies, robot, ids, "NO ANSWER: {error}", as_json=as_json)
 
 
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:

@@ -63,9 +63,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     more.set_defaults(main=main_add)
     renew = actions.add_parser(
         "renew",
-        help="make a new certificate for the robot by the same authority",
-        description="Make a new certificate for the robot before the old one expires. All other "
+        help="replace a certificate that ends soon by a new one of the same authority",
+        description="Replace the robot's certificate, or with --name one that `tls add` made, "
+        "before it ends. The new one has the names and addresses of the old one. All other "
         "certificates stay valid.",
+    )
+    renew.add_argument(
+        "--name",
+        type=_name,
+        metavar="NAME",
+        help="the certificate in clients/NAME of the directory, for example robot4 of a fleet; "
+        "without it, the robot's own",
     )
     renew.set_defaults(main=main_renew)
     for action in (init, more, renew):
@@ -172,22 +180,24 @@ def main_add(args: argparse.Namespace) -> int:
         print(f"{place} is for {args.name}; {args.write}: set access.{listed} = {names}")
     else:
         names = write(keys(config)[f"access.{listed}"])
-        print(
-            f"{place} is for {args.name}; add the name to its role in acsard.toml (keep the "
-            "names that"
-        )
-        print(f"{where} already has as {listed}; --write FILE does all this):\n")
+        print(_ADDED.format(place=place, name=args.name, where=where))
         print(f"[access]\n{listed} = {names}\n")
     print("The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`")
     return 0
 
 
 def main_renew(args: argparse.Namespace) -> int:
+    if args.name:
+        place = certificates.renew_client(args.directory, args.name, args.address, args.days)
+        files = ", ".join((CA, CERTIFICATE, KEY))
+        print(f"{place} has a new certificate. Copy {files} to the place of the old ones.\n")
+        print(TAKEN)
+        return 0
     names, warning = certificates.renew(args.directory, args.address, args.days)
     print(_certified(names))
     if warning:
         print(f"{warning}\n")
-    print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
+    print(f"{args.directory / CERTIFICATE} is new.\n\n{TAKEN}")
     return 0
 
 
@@ -233,6 +243,25 @@ def _address(text: str) -> str:
         raise argparse.ArgumentTypeError(f"{text!r} is not a host name or an IP address")
     return text
 
+
+_ADDED = """\
+{place} is for {name}. Add the name to its role in the robot's acsard.toml, and keep the names
+that are there. The lines below have those of {where}; --write FILE changes a file
+itself. Behind a fleet's router leave the lines out, because router.json5 has the roles.
+"""
+
+TAKEN = """\
+`acsard router`, `acsard web` and the gateway of `acsard run` use it within 5 s by themselves. The
+gateway and the router disconnect their clients for about a second for this, and a robot that one
+of those clients drives ramps to zero. `acsard gateway` that you started by hand ends with code 1:
+start it again. A robot that connects to a router uses it for its next connection. Until then
+`acsard doctor` warns of the old one; a restart of `acsard run` ends the warning at once.
+
+A service of systemd has copies of the files from its start. Type for it, where it runs:
+
+  sudo systemctl try-restart acsard-gateway acsard-web   the robot drives on
+  sudo systemctl restart acsard                          if it connects to a router: it stops
+"""
 
 _LINES = """\
 On the robot, in acsard.toml (--write FILE does it):

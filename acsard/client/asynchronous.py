@@ -64,9 +64,11 @@ class AsyncClient:
         """Call a service, as `Client.call` does."""
         return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
 
-    async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
+    async def set(
+        self, settings: Mapping[str, Plain], *, keep: bool = False
+    ) -> schema.ServiceReply:
         """Change settings, as `Client.set` does."""
-        return await in_thread(lambda: self._client.set(settings), 2 * REPLY_TIMEOUT_S)
+        return await in_thread(lambda: self._client.set(settings, keep=keep), 2 * REPLY_TIMEOUT_S)
 
     async def get(self, name: str) -> Any:
         """Return the last value of a key, as `Client.get` does."""

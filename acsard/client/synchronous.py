@@ -207,12 +207,15 @@ class Client:
             fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 
-    def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
+    def set(self, settings: Mapping[str, Plain], *, keep: bool = False) -> schema.ServiceReply:
         """Change settings until the next start, for example `{"rates.state": 5.0}`; all or none.
 
-        A lowered speed, acceleration or jerk of `limits` survives the next start.
+        A lowered speed, acceleration or jerk of `limits` survives the next start. With `keep` the
+        daemon also writes the settings into its configuration file. The reply then names the file,
+        or says why the settings are refused or not written.
         """
-        return self.request("set", {"settings": settings})
+        fields: dict[str, object] = {"settings": settings}
+        return self.request("set", fields | {"keep": True} if keep else fields)
 
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         """Call any service with this payload, and return its reply."""

@@ -7,7 +7,7 @@ call it in virtual time.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
 
@@ -48,9 +48,11 @@ from acsard.core.values import (
     Snapshot,
 )
 from acsard.daemon.latch_rules import ANSWER_NS, Handover, LatchKeeper
+from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
-from acsard.recording.recorded_steps import BlackBox
+from acsard.daemon.settings_file import SettingsFile, keeps
+from acsard.recording.recorded_steps import BlackBox, count_superseded
 
 FEEDBACK = ("odom", "tf", "wheel_states")
 """Keys that are published from the feedback lines."""
@@ -73,29 +75,33 @@ class ControlLoop:
         start: Instant,
         log: Callable[[Event], None],
         mono_ns: Callable[[], int],
-        certificate_ends_ns: int | None = None,
+        certificate_ends: Mapping[str, int] | None = None,
         others: list[Event] | None = None,
         beside: Callable[[str], Message | None] | None = None,
         adopted: Callable[[Config], None] | None = None,
         recorder: BlackBox | None = None,
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
+        settings_file: SettingsFile | None = None,
+        late_watch: LateWatch | None = None,
     ) -> None:
         """Make a robot with these latches, which `keeper` keeps over a restart.
 
         `others` are the events of the daemon's other parts. Each step takes them and empties the
         list. `beside` returns the present value of a key that another part publishes. `adopted` is
         called with a configuration that is in force from now on. `recorder` is the black box.
+        `settings_file` is the configuration file.
+        `late_watch` names the causes of late periods.
         """
         self.robot = Robot(config, latches)
-        self.report = Report(config, start, certificate_ends_ns)
+        self.report = Report(config, start, certificate_ends)
         self.shutting_down = False
         """Set it to go down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
         self._beside = beside
-        self._config, self._adopted = config, adopted
+        self._config, self._adopted, self._settings_file = config, adopted, settings_file
         self._recorder, self._handover = recorder, Handover(latches, keeper)
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that wait until the file has the latches, each with its monotonic time."""
@@ -118,7 +124,7 @@ class ControlLoop:
         # The longest line of either direction: answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
-        self._stopwatch = Stopwatch()
+        self._stopwatch, self._late_watch = Stopwatch(), late_watch
 
     @property
     def at_rest(self) -> bool:
@@ -149,14 +155,22 @@ class ControlLoop:
             return self._step(now, period)
         except Exception:
             # A stop that this step took is lost otherwise: the bug may have come before it.
-            self._handover.take_stops(self.robot.latches, _stops(self._got), now)
+            self._handover.take_stops(self._to_keep(self.robot.latches), _stops(self._got), now)
             raise
 
     def _step(self, now: Instant, period: Period) -> Outputs:
         ended, missed = period.expired > 0, max(0, period.expired - 1)
         if ended:
-            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
+            late_ns = now.mono_ns - period.due_ns
+            self._stopwatch.period(now.mono_ns, late_ns, missed)
+            if self._late_watch is not None:
+                self._late_watch.period(now.mono_ns, late_ns, missed)
+                # A line of the log has the text of its last event. In a late step that would be
+                # the number of periods, not the cause.
+                if not missed:
+                    self._others += self._late_watch.news()
         commands, refusals, requests = self._from_bus(now)
+        requests += self._keepable(now)
         self._others += self._handover.news()
         port, pace = self._port, self._pace
         # Take the bytes first: `take` closes the port when the computer was suspended.
@@ -201,7 +215,7 @@ class ControlLoop:
         """Return the outputs and whether their line left, and record the step in any case."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
-            self._handover.take(outputs.latches)
+            self._handover.take(self._to_keep(outputs.latches))
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
             went = self._send(outputs, inputs.now, inputs.tick)
@@ -212,6 +226,12 @@ class ControlLoop:
         if self._recorder is not None:
             self._recorder.step(inputs, outputs, went, self.robot, self._guard)
         return outputs, went is not None
+
+    def _to_keep(self, latches: Latches) -> Latches:
+        """Return the latches of the robot as the next start of the daemon needs them."""
+        if self._settings_file is None:
+            return latches
+        return self._settings_file.latches(latches, self.robot.config.limits)
 
     def finish(self, now: Instant) -> None:
         """Keep the stops that arrived after the last step, and give the last answers."""
@@ -230,6 +250,8 @@ class ControlLoop:
         self._guard.use(config)
         self.report.use(config)
         self._queries.use(config)
+        if self._settings_file is not None:
+            self._settings_file.use(config)
 
     def _from_bus(
         self, now: Instant
@@ -245,7 +267,8 @@ class ControlLoop:
         for arrival in got.arrivals:
             if arrival.key == GATEWAY:
                 ends_ns = self._gateway.receive(arrival, self.robot.counters)
-                self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
+                if ends_ns:
+                    self.report.certificate_ends[""] = ends_ns
                 continue
             if arrival.key == IMU:
                 heard = self._imu.receive(arrival, self.robot.counters, self._others)
@@ -271,6 +294,8 @@ class ControlLoop:
                         arrival.arrived_ns,
                     )
                 )
+        if superseded := count_superseded(commands):
+            self.robot.counters["commands_superseded"] += superseded
         for source in got.overrun_sources:
             text = f"source {source}: too many commands came at once, and the oldest were dropped"
             refusals.append(Refusal("displaced", text, source))
@@ -301,11 +326,31 @@ class ControlLoop:
             reply = refused(query, str(error), now.wall_ns)
             served = [] if reply is None else [reply]
         if isinstance(served, Request):
+            wants = query.via == "native" and served.verb == "set"
+            if wants and keeps(query.encoding, query.payload):
+                self._keep(served, now)
+                return None
             return served
         for reply in served:
             self._bus.reply(reply)
         self._bus.retire(query.ticket)
         return None
+
+    def _keep(self, request: Request, now: Instant) -> None:
+        """Hand a `set` with `keep` to the configuration file, which says if it can be written."""
+        if self._settings_file is None:
+            text = "nothing is set: this daemon has no configuration file"
+            self._answers.append((now.mono_ns, Answer(request.id, False, text)))
+        else:
+            self._settings_file.keep(request, now.mono_ns)
+
+    def _keepable(self, now: Instant) -> tuple[Request, ...]:
+        """Return the requests whose settings can be written, and queue the answers to others."""
+        if self._settings_file is None:
+            return ()
+        results = self._settings_file.results(now.mono_ns, self._others)
+        self._answers.extend((now.mono_ns, one) for one in results if isinstance(one, Answer))
+        return tuple([one for one in results if isinstance(one, Request)])
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
         """Offer the line, and return it if it left. The next step tells the robot its fate."""
@@ -335,7 +380,12 @@ class ControlLoop:
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, told_ns)
         if outputs.answers:
-            self._answers.extend((outputs.now.mono_ns, answer) for answer in outputs.answers)
+            file, now_ns = self._settings_file, outputs.now.mono_ns
+            self._answers.extend(
+                (now_ns, answer)
+                for answer in outputs.answers
+                if file is None or not file.obeyed(answer)
+            )
         if self._answers:
             self._answer(outputs.now)
         for event in outputs.events:
@@ -360,6 +410,8 @@ class ControlLoop:
 
     def _look(self) -> Snapshot:
         outputs = self.outputs
+        if self._settings_file is not None:
+            self.report.settings_differ = self._settings_file.differ
         now_ns = 0 if outputs is None else outputs.now.mono_ns
         return replace(
             self.robot.snapshot(now_ns),

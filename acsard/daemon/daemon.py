@@ -26,13 +26,16 @@ from acsard.core.ros.transports import left_out
 from acsard.core.values import NS_PER_S, Event, Latches
 from acsard.daemon.bus.access import access_control
 from acsard.daemon.bus.bus import ZenohBus
-from acsard.daemon.bus.tls import ends_ns as ends_ns_of
+from acsard.daemon.bus.certificate_watch import watch_certificates
+from acsard.daemon.bus.tls import ends as ends_of
 from acsard.daemon.bus.tls import require_usable
 from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
+from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulated_board import Simulated
+from acsard.daemon.settings_file import SettingsFile
 from acsard.daemon.supervisor import GATEWAY, PAGE, Kind, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
@@ -104,6 +107,7 @@ async def run(
     announce: Announce,
     gateway: Sequence[str] | None = None,
     page: Sequence[str] | None = None,
+    settings_file: SettingsFile | None = None,
 ) -> None:
     """Run until a signal; raise a `MendableError` if the daemon cannot start.
 
@@ -113,6 +117,7 @@ async def run(
         announce: Called once when everything runs.
         gateway: Arguments of the `acsard gateway` process to run, None if it is a service.
         page: Arguments of the `acsard web` process to run, None for no page.
+        settings_file: The configuration file, to compare it with the settings in force.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -126,7 +131,7 @@ async def run(
     if refused:
         log.info("real_time", text=refused)
     try:
-        await _run(config, log, announce, departure, wake, manager, gateway, page)
+        await _run(config, log, announce, departure, wake, manager, gateway, page, settings_file)
     except asyncio.CancelledError:
         if departure.begun_ns is None:
             raise
@@ -143,6 +148,7 @@ async def _run(
     manager: Systemd,
     gateway: Sequence[str] | None,
     page: Sequence[str] | None,
+    settings_file: SettingsFile | None,
 ) -> None:
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
@@ -154,7 +160,7 @@ async def _run(
         path = config.mcu.port if simulated is None else simulated.path
         after = stack.enter_context(ExitStack())
         bus, port = _bus(config, wake), _port(config, path, wake, events.append)
-        ends_ns = _certificates(config, gateway is not None)
+        ends = _certificates(config, gateway is not None)
         # The bus comes first: an id or address in use must end the daemon before the port opens.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
@@ -170,7 +176,7 @@ async def _run(
             start,
             log.event,
             clock.mono_ns,
-            ends_ns,
+            ends,
             events,
             None if simulated is None else simulated.current,
             lambda adopted: log.use(adopted.log),
@@ -178,7 +184,12 @@ async def _run(
             # After the bus and the port: a second daemon must end before it touches the latches.
             Latches() if keeper is None else await keeper.start(clock.now()),
             keeper,
+            settings_file,
+            stack.enter_context(LateWatch()),
         )
+        if settings_file is not None:
+            settings_file.start()
+            stack.callback(settings_file.close)
         between.callback(lambda: control.finish(clock.now()))
         after.callback(lambda: control.keep_last_stops(clock.now()))
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
@@ -187,6 +198,8 @@ async def _run(
         departure.started()
         served = ((gateway if config.bus.outside else None, GATEWAY), (page, PAGE))
         helpers = [_keep(words, events.append, kind) for words, kind in served if words is not None]
+        if ends:
+            helpers.append(watch_certificates(config.bus, control.report.certificate_ends))
         async with _beside([port.keep_open(), _repeat_latched(bus, control), *helpers]):
             await _control(config, control, departure, wake, manager)
 
@@ -245,16 +258,16 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, None]]) -> AsyncIterator
             task.cancel()
 
 
-def _certificates(config: Config, ours: bool) -> int | None:
-    """Return when the certificates used by this process end, None without any.
+def _certificates(config: Config, ours: bool) -> dict[str, int]:
+    """Return when the certificates used by this process end, {} without any.
 
     Raises a `MendableError` if they cannot be used.
     """
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
-        return None
+        return {}
     require_usable(bus.tls)
-    return ends_ns_of(bus.tls)
+    return ends_of(bus.tls)
 
 
 async def _control(

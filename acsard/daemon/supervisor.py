@@ -33,13 +33,21 @@ class Kind(Struct, frozen=True):
     """Exit codes after which it is not started again."""
     again_s: float = AGAIN_S
     """Seconds before it is started again."""
+    final_at_first: frozenset[int] = frozenset()
+    """Exit codes that are final for the first process only. A later one may have met files that a
+    person was changing."""
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
 """The gateway is always started again: the robot drives on, and an operator may fix its files
 meanwhile."""
 
-ROUTER = Kind("the router", "router_ended", frozenset({Exit.USAGE, Exit.BAD_CONFIG}))
+ROUTER = Kind(
+    "the router",
+    "router_ended",
+    final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
+)
+"""A fleet must not lose its router because its files were incomplete when it opened again."""
 
 PAGE = Kind(
     "the robot's page",
@@ -57,6 +65,7 @@ async def keep_running(
 
     Return an exit code after which it must not be started again.
     """
+    final = kind.final | kind.final_at_first
     while True:
         child = Child(acsard(*words, "--supervised"))
         try:
@@ -65,8 +74,9 @@ async def keep_running(
         except (OSError, RuntimeError) as error:  # no room for a process or a thread
             code, why = Exit.USAGE, f"could not be started ({error})"
         else:
-            if code in kind.final:
+            if code in final:
                 return code
+            final = kind.final
         finally:
             child.release()
         log(Event(kind.ended, f"{kind.name} {why}; it is restarted", "warning"))

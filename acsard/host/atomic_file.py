@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 NEW_MODE = 0o644
@@ -44,9 +45,12 @@ def replace(
                 if kept:
                     os.fchown(new.fileno(), *kept)
             except PermissionError:
-                # The file of another user in a directory of ours becomes ours.
-                if owner:
+                # The file of another user in a directory of ours becomes ours. Its group stays
+                # if we are in it.
+                if owner or kept is None:
                     raise
+                with suppress(PermissionError):
+                    os.fchown(new.fileno(), -1, kept[1])
             if synced:
                 os.fsync(new.fileno())
         os.replace(name, file)

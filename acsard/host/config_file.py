@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
+
+from msgspec import Struct
 
 from acsard.core.config.editing import edited
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
-from acsard.host.atomic_file import replace
+from acsard.host.atomic_file import replace, sync
+from acsard.host.edit_process import edited_apart
 from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 
@@ -59,16 +64,112 @@ def writable(path: str | None) -> Path:
     return Path(where)
 
 
+Keys = Mapping[str, object]
+"""Values by dotted keys, such as "mcu.port"."""
+
+
+class Edit(Struct, frozen=True):
+    """A change of a configuration file that a daemon may make by itself."""
+
+    file: Path
+    keys: Keys
+    before: bytes
+    """The content of the file for which `after` was computed."""
+    after: str
+    """The new text."""
+
+
+def keepable(file: Path | None, keys: Keys) -> Edit:
+    """Return the change that writes these settings into the file of a running daemon.
+
+    Raises `MendableError` with the reason if the file is None, tracked by git or read-only, if the
+    library tomlkit is missing, or if the text before or after the change is no configuration.
+    """
+    if file is None:
+        raise MendableError(
+            "the daemon runs without a configuration file: make an acsard.toml on the robot (it "
+            "may be empty), name it with --config, and restart the daemon"
+        )
+    try:
+        if any(key.startswith("commands.sources.") for key in keys):
+            raise ValueError("a source's timeout in [[commands.sources]] cannot be changed there")
+        place = file.resolve(strict=True)
+        _require_writable(place)
+        if is_tracked(place):
+            raise ValueError(
+                "git tracks it, and a changed file hinders the next `git pull`; start the daemon "
+                "with a copy of it (--config)"
+            )
+        before = place.read_bytes()
+        return Edit(file, keys, before, edited_apart(before.decode(), keys))
+    except (OSError, ValueError) as error:
+        raise _left(file, error) from None
+
+
+TRIES = 3
+"""Number of times that a change is computed before the daemon leaves the file to another program.
+
+The computation takes 0.2 s, and a person's editor may write the file meanwhile.
+"""
+
+
+def keep(edit: Edit) -> None:
+    """Write the change. It is computed again if another program has changed the file meanwhile.
+
+    Raises `MendableError` and leaves the file unchanged if that is impossible.
+    """
+    try:
+        for _ in range(TRIES):
+            place = edit.file.resolve(strict=True)
+            _require_writable(place)
+            if place.read_bytes() == edit.before:
+                replace(place, edit.after.encode())
+                # Without this a power cut may bring the old file back after the answer. Some file
+                # systems refuse it.
+                with suppress(OSError):
+                    sync(place.parent)
+                return
+            edit = keepable(edit.file, edit.keys)
+        raise ValueError("another program changes it again and again")
+    except (OSError, ValueError) as error:
+        raise _left(edit.file, error) from None
+
+
+def _require_writable(place: Path) -> None:
+    """Raise `ValueError` if a daemon may not replace the file at this resolved path."""
+    if not place.is_file():
+        raise ValueError("it is not a regular file")
+    # Root may write every file, and a new file can take the place of one that is read-only.
+    if not (os.access(place, os.W_OK) and place.stat().st_mode & 0o222):
+        raise ValueError("it is read-only for the daemon")
+    if not os.access(place.parent, os.W_OK):
+        raise ValueError(f"the daemon has no permission to write to {place.parent}")
+
+
+GIT_S = 2.0
+"""Time limit of git, s. It takes some milliseconds."""
+
+
+def is_tracked(place: Path) -> bool:
+    """Return whether git tracks the file at this resolved path, as far as git can say it."""
+    if not any((parent / ".git").exists() for parent in place.parents):
+        return False
+    # git refuses to read the repository of another user, whose configuration could make git run
+    # that user's programs with the rights of the daemon. Such a file counts as not tracked.
+    words = ["git", "-C", str(place.parent), "ls-files", "--error-unmatch", "--", place.name]
+    try:
+        asked = subprocess.run(words, capture_output=True, timeout=GIT_S)
+    except (OSError, subprocess.TimeoutExpired):
+        return _is_reference(place)
+    return asked.returncode == 0 or _is_reference(place)
+
+
 def _is_reference(file: Path) -> bool:
     """Return whether this is the `acsard.toml` in the top directory of a clone of acsard."""
     place = file.resolve()
     top = place.parent
     in_clone = (top / ".git").exists() and (top / "acsard" / "__init__.py").is_file()
     return in_clone and place.name == "acsard.toml"
-
-
-Keys = Mapping[str, object]
-"""Values by dotted keys, such as "mcu.port"."""
 
 
 def require_tomlkit() -> None:

@@ -19,6 +19,7 @@ class Exit(IntEnum):
     OK = 0
     FAILURE = 1
     USAGE = 2
+    INCOMPLETE = 65
     NO_PORT = 66
     UNREACHABLE = 69
     IN_USE = 75
@@ -30,6 +31,7 @@ WORDS: dict[int, str] = {
     Exit.OK: "done",
     Exit.FAILURE: "failure",
     Exit.USAGE: "wrong usage",
+    Exit.INCOMPLETE: "part of the recording is damaged",
     Exit.NO_PORT: "no such port",
     Exit.UNREACHABLE: "daemon unreachable",
     Exit.IN_USE: "port, bus address or robot id in use",

@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
+from acsard.host.atomic_file import replace
 from acsard.machine.certificates import CA_KEY
 
 LOCAL = ("local", "localhost")
@@ -225,7 +226,5 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """Write a new file that is never readable beyond `mode`."""
-    path.unlink(missing_ok=True)
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-        file.write(data)
+    """Replace a file by one of this user that is never readable beyond `mode`."""
+    replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import socket
 import sys
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from acsard.core.config.settings import Config
 from acsard.core.values import ROLES
-from acsard.daemon.bus.tls import CA
+from acsard.daemon.bus.tls import CA, CERTIFICATE
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.host.extras import missing
 from acsard.host.own_identity import own_addresses
@@ -29,6 +30,8 @@ PORT = 7449
 CA_KEY = "ca-key.pem"
 """Key of the authority. Clients do not get it."""
 
+OWN = "robot"
+"""Common name of the certificate that `tls init` makes for the robot itself."""
 
 UNLIMITED = (
     "The authority was made by an earlier version and may sign for any web site. If browsers trust "
@@ -60,7 +63,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
     _writable(directory)
     names = _robot_names(addresses)
     authority = maker.make(directory, f"acsard at {socket.gethostname()}", days, names)
-    authority.issue(directory, "robot", names, days)
+    authority.issue(directory, OWN, names, days)
     for role in ROLES:
         authority.issue(directory / "clients" / role, role, [], days)
     return names
@@ -78,6 +81,27 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
     return place
 
 
+def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
+    """Replace the certificate that `add` made for this name, and return its directory.
+
+    The new certificate has the host names and addresses of the old one, and `addresses`.
+    """
+    authority = _load(directory)
+    clients = directory / "clients"
+    place = clients / name
+    if not (place / CERTIFICATE).is_file():
+        there = sorted(one.parent.name for one in clients.glob(f"*/{CERTIFICATE}"))
+        raise MendableError(
+            f"{clients} has no certificate for {name}, only for: {', '.join(there) or 'nobody'}; "
+            f"`acsard tls add {shlex.quote(name)} --directory {shlex.quote(str(directory))}` makes "
+            "a first one"
+        )
+    _require_permitted(authority, addresses)
+    kept = [one for one in authority.names_in(place) if authority.permits(one)]
+    authority.issue(place, name, [*kept, *addresses], days)
+    return place
+
+
 def renew(directory: Path, addresses: Sequence[str], days: int) -> tuple[list[str], str]:
     """Replace the robot's own certificate.
 
@@ -88,7 +112,7 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> tuple[list[st
     known = _robot_names(authority.names_in(directory))
     # The machine may have another name or address than when the authority was made.
     names = [*filter(authority.permits, known), *addresses]
-    authority.issue(directory, "robot", names, days)
+    authority.issue(directory, OWN, names, days)
     return list(dict.fromkeys(names)), "" if authority.limited else UNLIMITED
 
 
@@ -152,7 +176,10 @@ def _load(directory: Path) -> Authority:
         if (directory / CA).exists():
             text = f"{directory} has no {CA_KEY}: bring the authority's key back for this command"
         else:
-            text = f"{directory} has no authority: run `acsard tls init` first"
+            text = (
+                f"{directory} has no authority: name the directory of {CA_KEY} with --directory; "
+                "if there is none yet, run `acsard tls init` first"
+            )
         raise MendableError(text) from None
     except (OSError, ValueError) as error:
         raise MendableError(f"cannot use the authority in {directory}: {error}") from None

@@ -13,9 +13,11 @@ from acsard.core.link.link_diagnosis import BUSY, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.gyro import WORDS
+from acsard.core.motion.lifecycle import utc
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import reachable
+from acsard.daemon.late_causes import cause_in
 from acsard.host.errors import NoAnswerError
 from acsard.machine.finding import LEVELS, Finding, Level
 from acsard.machine.running import Running, answers, asked
@@ -118,6 +120,11 @@ GYRO_MENDS = {
 }
 """Remedy for each gyro status in `state`; "" if the status is good."""
 
+CAUSES_SHOWN = 3
+"""Number of events with a cause of lateness that are shown, the last ones."""
+
+CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
+
 START = (
     "see systemctl status acsard; or start the daemon: acsard run; if it was started with "
     "--listen, name that address with --connect"
@@ -188,7 +195,9 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from link(running)
     yield from clocks(running)
     yield from gyro(state.gyro, state.counters)
-    yield from linked({row.name: row for row in running.rows})
+    rows = {row.name: row for row in running.rows}
+    yield from linked(rows)
+    yield from certificate(rows.get("acsard: certificate"), running.here)
     if state.counters.get("gateway_full"):
         text = "clients from the network took all connections at times: the log names them"
         yield Finding(
@@ -198,7 +207,30 @@ def daemon(running: Running) -> Iterator[Finding]:
             "remove the client's certificate from [access], or end its program",
         )
     yield from latch_file(state.latch_file_error)
+    # On this machine `compared` has read the file itself.
+    yield from settings_file("" if running.here else state.settings_differ)
     yield from late(running)
+
+
+def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
+    """Yield a finding if a certificate that the daemon or its gateway uses ends soon.
+
+    Args:
+        row: the row of the daemon's diagnostics, None without TLS.
+        here: whether the daemon runs on this machine, where its files are examined too.
+    """
+    if row is None or not row.level:
+        return
+    mend = "run `acsard doctor` on that machine, which examines its files"
+    if here:
+        mend = (
+            "if the files above are new, a robot that connects to a router uses them for its next "
+            "connection: restart its daemon, which stops it (`sudo systemctl restart acsard`, or "
+            "`acsard run` again); for a robot without a router run `sudo systemctl try-restart "
+            "acsard-gateway acsard-web`"
+        )
+    text = f"the daemon's certificate that ends first: {row.message}"
+    yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 
 def latch_file(trouble: str) -> Iterator[Finding]:
@@ -206,6 +238,14 @@ def latch_file(trouble: str) -> Iterator[Finding]:
     if trouble:
         mend = "free disk space, or name a writable directory: control.state_directory"
         yield Finding("latch file", "warning", trouble, mend)
+
+
+def settings_file(differ: str) -> Iterator[Finding]:
+    """Yield a warning if the settings of a daemon on another machine differ from its file."""
+    if differ:
+        mend = "its next start uses the file's values; set them again, or correct its file there"
+        text = f"the settings in force differ from the robot's file: {differ}"
+        yield Finding("configuration", "warning", text, mend)
 
 
 def late(running: Running) -> Iterator[Finding]:
@@ -221,6 +261,15 @@ def late(running: Running) -> Iterator[Finding]:
     for text in told:
         mend = "which other program uses the processor? `top` shows it; the service runs real-time"
         yield Finding("daemon", "warning", text, mend)
+    causes = [
+        (event, cause)
+        for event in running.events
+        if event.name == "missed_periods" and (cause := cause_in(event.text))
+    ]
+    for event, cause in causes[-CAUSES_SHOWN:]:
+        level: Level = "warning" if told else "ok"
+        text = f"was late before {utc(event.stamp.to_ns())}: {cause}"
+        yield Finding("daemon", level, text, CAUSES_PAGE)
 
 
 def clocks(running: Running) -> Iterator[Finding]:

@@ -1,7 +1,8 @@
 """All examinations in their order, from the configuration to a moving robot.
 
-This module itself examines the configuration, the certificates, the machine and the serial port;
-`daemon_findings.py` examines the daemon and its link. The doctor opens no port and sends nothing to
+This module itself examines the configuration, the machine and the serial port;
+`certificate_findings.py` examines the certificates, and `daemon_findings.py` the daemon and its
+link. The doctor opens no port and sends nothing to
 a robot. If a daemon runs, its own configuration is examined, because the file may have changed
 since and options may override it. For a daemon on another machine, only its own reports are
 examined: its port, files and gateway are there.
@@ -19,55 +20,17 @@ from pathlib import Path
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
-from acsard.core.messages.expiry import expiry
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address, address_of
-from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
+from acsard.daemon.late_causes import present
 from acsard.host import clock, real_time
-from acsard.host.clock import now
-from acsard.host.errors import MendableError
-from acsard.host.extras import install
+from acsard.host.kernel_counters import Kernel
 from acsard.host.processes import holders, running
+from acsard.machine.certificate_findings import certificates, router_certificates
 from acsard.machine.daemon_findings import daemon, found, gateway, routers
-from acsard.machine.finding import LEVELS, Finding, Level
+from acsard.machine.finding import Finding, Level
 from acsard.machine.running import Running, compared
 from acsard.machine.serial_ports import BOARDS, serial_devices
-
-
-def certificates(tls: str) -> Iterator[Finding]:
-    """Yield findings about the certificates in the directory `tls`; none if `tls` is "".
-
-    The findings say whether the files exist, are private and have not expired.
-    """
-    if not tls:
-        return
-    directory = Path(tls)
-    for name in (CA, CERTIFICATE, KEY):
-        file = directory / name
-        if not os.access(file, os.R_OK):
-            text = f"{file} is missing, or you may not read it"
-            yield Finding(
-                "certificates",
-                "failure",
-                text,
-                "run `sudo acsard tls init`, or this command with sudo",
-            )
-        elif name == KEY and file.stat().st_mode & 0o077:
-            yield Finding(
-                "certificates", "failure", f"other users may read {file}", f"chmod 600 {file}"
-            )
-    try:
-        require_usable(tls)
-    except MendableError as error:
-        yield Finding("certificates", "failure", str(error), "see `acsard tls init --help`")
-        return
-    ends = ends_ns(tls)
-    level, words = expiry(ends, now().wall_ns)
-    mend = "run `acsard tls renew`, or in a fleet `tls add`, where ca-key.pem is"
-    if ends is None:
-        mend = f"run {install('tls')}, to read the certificate"
-    yield Finding("certificates", LEVELS[level], words, mend if level else "")
-
 
 REAL = (
     "run the daemon as the service (deploy/systemd), which has it; without it, load makes "
@@ -93,9 +56,9 @@ def clock_set() -> Iterator[Finding]:
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < 2026:  # boards without a battery start in the past
         mend = "set it (timedatectl), or let chrony set it; odometry stamps are wall-clock times"
-        yield Finding("clock", "warning", f"stands in {year}", mend)
+        yield Finding("clock", "warning", f"the year is {year}", mend)
     else:
-        yield Finding("clock", "ok", f"stands in {year}")
+        yield Finding("clock", "ok", f"the year is {year}")
 
 
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
@@ -116,6 +79,24 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
         yield Finding("real time", "ok", "is permitted")
     else:
         yield Finding("real time", "warning", "is not permitted for this user", REAL)
+
+
+LOOK_S = 0.3
+"""Time between two readings of the kernel's counters, s: 30 ticks of its clock."""
+
+
+def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
+    """Yield findings about the causes that make any program on this computer late now."""
+    kernel = kernel or Kernel()
+    before, began_ns = kernel.read(), clock.mono_ns()
+    time.sleep(LOOK_S)
+    after, passed_ns = kernel.read(), clock.mono_ns() - began_ns
+    causes = present(before, after, passed_ns)
+    for clause, advice in causes:
+        yield Finding("computer", "warning", f"{clause}, so the daemon can be late", advice)
+    if not causes:
+        text = "the kernel reports no undervoltage, heat, slow clock or high steal time"
+        yield Finding("computer", "ok", text)
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
@@ -218,11 +199,13 @@ def examine(
     yield from scheduling(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
+    yield from slowness()
     # The service has copies of the certificates from its start. A file that has since been deleted
     # is reported at its original place.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)
+    yield from router_certificates(config)
     if isinstance(running, Running):
         yield from daemon(running)
     else:

@@ -11,12 +11,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.client import Client, connect
-from acsard.core.config.live import flat, live
-from acsard.core.config.parsing import effective, from_builtins
+from acsard.core.config.live import Difference, differences, live
+from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.config.validation import write
 from acsard.core.formatting import listed
-from acsard.core.messages.schema import DiagnosticStatus, Info, RobotState
+from acsard.core.messages.schema import DiagnosticStatus, Info, LogEvent, RobotState
 from acsard.core.values import AcsardError
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
@@ -38,19 +38,20 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: key in OPTIONS,
         "ok",
-        "by its options (`acsard run --help`), or the file has changed since",
-        "to keep {which}, write it into the file: {lines}",
+        "by its options (`acsard run --help`) or another file, or the file has changed since",
+        "to keep {which}, write into the file: {lines}",
     ),
     (
         lambda key: key not in OPTIONS and live(key) is None,
         "warning",
-        "by its environment, or the file has changed since",
-        "the following is about the running daemon; write its values into the file, or restart it",
+        "by another file or its environment, or the file has changed since",
+        "if it runs with another file, name that with --config; otherwise write its values into "
+        "the file, or restart it. The following is about the running daemon",
     ),
     (
         lambda key: live(key) is not None,
         "warning",
-        "set while it ran, or the file has changed since",
+        "set while it ran, or by another file, or the file has changed since",
         "its next start uses the file's values; `acsard set KEY VALUE --write` writes one into "
         "the file",
     ),
@@ -76,6 +77,8 @@ class Running(Struct, frozen=True):
 
     A tunnel or a router may stand between.
     """
+    events: tuple[LogEvent, ...] = ()
+    """The daemon's last events."""
 
 
 def asked(config: Config, address: Address) -> Running:
@@ -87,13 +90,13 @@ def asked(config: Config, address: Address) -> Running:
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
         time.sleep(1.0)  # about a hundred lines are counted meanwhile
-        rows = tuple(robot.get("diagnostics").status)
+        rows, events = tuple(robot.get("diagnostics").status), tuple(robot.get("events").events)
         runs, here = _configuration(robot, info, config), name_of(info.pid) == "acsard"
         asked = clock.now()
         state, answered = robot.get("state"), clock.now()
         trip_ns = answered.mono_ns - asked.mono_ns
         looked_ns = asked.wall_ns + trip_ns // 2
-        return Running(info, runs, before, state, looked_ns, trip_ns, rows, here)
+        return Running(info, runs, before, state, looked_ns, trip_ns, rows, here, events)
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
@@ -107,27 +110,6 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
         mcu = replace(file.mcu, port=SIMULATOR if info.simulated else info.port)
         bus = replace(file.bus, listen=tuple(info.listen), connect=tuple(info.connect))
         return replace(file, robot=replace(file.robot, id=info.id), mcu=mcu, bus=bus)
-
-
-class Difference(Struct, frozen=True):
-    """The daemon's and the file's value of a key."""
-
-    its: object
-    ours: object
-
-    def words(self, key: str) -> str:
-        """Return both values in words."""
-        return f"{key} = {_text(self.its)}, not {_text(self.ours)}"
-
-
-def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return each key whose value differs between the daemon and the file, with both values."""
-    its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
-    return {
-        key: Difference(its.get(key), ours.get(key))
-        for key in its | ours
-        if its.get(key) != ours.get(key)
-    }
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
@@ -167,7 +149,3 @@ def answers(endpoint: str) -> bool:
     except OSError:
         return False
     return True
-
-
-def _text(value: object) -> str:
-    return msgspec.json.encode(value).decode()

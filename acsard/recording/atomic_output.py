@@ -2,13 +2,14 @@
 
 The content is written under another name in the same directory and renamed at the end. Therefore
 the target is complete or absent. With `force` an existing target is replaced, but only if it is a
-regular file or a ROS bag. A recording, or a directory with other files, is never replaced.
+regular file or a ROS bag. A recording is replaced only by one that has everything in it, and a
+directory with other files never.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from errno import EEXIST
 from pathlib import Path
@@ -22,19 +23,29 @@ BAG_SUFFIXES = (".mcap", ".db3")
 """Suffixes of the data files of a ROS bag."""
 
 
+def never(recording: Recording) -> bool:
+    """Return False: a caller that does not write recordings replaces none."""
+    return False
+
+
 @contextmanager
-def replacing(new: Path, force: bool) -> Iterator[Path]:
+def replacing(
+    new: Path, force: bool, may_replace: Callable[[Recording], bool] = never
+) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it to `new` when the block succeeds.
 
     Without `force`, an existing `new` is an error. Raises `FileExistsError` if `new` must not be
     replaced, and any other `OSError`. After an error `new` is unchanged and the temporary file is
     removed.
+
+    Args:
+        may_replace: takes the recording at `new`, and returns whether `force` may replace it.
     """
-    _require_free(new, force)
+    _require_free(new, force, may_replace)
     part = _near(new, "part")
     try:
         yield part
-        _require_free(new, force)
+        _require_free(new, force, may_replace)
         _put(part, new)
     except BaseException:
         _remove(part)
@@ -70,14 +81,14 @@ def _near(new: Path, ending: str) -> Path:
     return new.with_name(f".{new.name}.{os.getpid()}.{ending}")
 
 
-def _require_free(new: Path, force: bool) -> None:
+def _require_free(new: Path, force: bool, may_replace: Callable[[Recording], bool]) -> None:
     if not (new.exists() or new.is_symlink()):
         return
     if new.is_dir():
         _require_bag(new)
     elif new.exists() and not new.is_file():
         raise FileExistsError(EEXIST, "it is a device or a pipe, not a file; name a file")
-    elif new.is_file() and _is_recording(new):
+    elif new.is_file() and (recording := _recording(new)) and not may_replace(recording):
         raise FileExistsError(EEXIST, "it is a recording; name another file")
     if not force:
         raise FileExistsError(EEXIST, "it exists; --force overwrites it")
@@ -94,18 +105,17 @@ def _require_bag(directory: Path) -> None:
                 f"it is a directory that also contains {path.name}, which is not a part of a ROS "
                 "bag; name another directory",
             )
-        if path.suffix == ".mcap" and _is_recording(path):
+        if path.suffix == ".mcap" and _recording(path):
             raise FileExistsError(
                 EEXIST, f"it contains a recording, {path.name}; name another directory"
             )
 
 
-def _is_recording(path: Path) -> bool:
+def _recording(path: Path) -> Recording | None:
     try:
-        Recording(path)
+        return Recording(path)
     except RecordingError:
-        return False
-    return True
+        return None
 
 
 def _remove(path: Path) -> None:

@@ -71,6 +71,12 @@ Ten minutes are short enough, because a file may cover an hour.
 
 S_PER_DAY = 86400
 
+FRESH_S = 10.0
+"""Age of the last write, s, from which a `.part` file does not count as being recorded.
+
+A daemon writes once a second. A disk that hangs for longer than this is reported in the log.
+"""
+
 STAMP = "%Y%m%dT%H%M%SZ"
 """Format of the time in a file's name: the time at which the file began, in UTC."""
 
@@ -84,6 +90,14 @@ def listed(directory: Path) -> list[Path]:
         if _number(path) is not None and path.is_file() and not path.is_symlink()
     ]
     return sorted(found, key=lambda path: (_number(path), path.name))
+
+
+def is_being_recorded(path: Path, now_s: float) -> bool:
+    """Return whether a daemon writes to this recording at the time `now_s`, s since 1970.
+
+    Raises `OSError`.
+    """
+    return path.name.endswith(PART) and abs(now_s - path.stat().st_mtime) < FRESH_S
 
 
 def _number(path: Path) -> int | None:

@@ -23,7 +23,7 @@ END = "acsard end"
 TAIL_BYTES = 1 << 16
 """Number of bytes at the end of a file in which the end record is searched for.
 
-In the recordings of the tests the end record begins 1141 bytes before the end of the file.
+The end record of a plain recording begins 1960 bytes before the end of the file.
 """
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
@@ -75,6 +75,10 @@ class EndRecord(Struct, frozen=True):
     """
 
 
+CRASHES = frozenset({"bug", "crash"})
+"""The causes after which the robot was left without its daemon."""
+
+
 def how_it_ends(cut: str, why: str = "") -> str:
     """Describe how a recording was cut off, from the fields `cut` and `why` of its end record.
 
@@ -103,9 +107,19 @@ def read_end(path: Path) -> EndRecord | None:
             if stream.read(len(MAGIC)) != MAGIC:
                 return None
             stream.seek(max(len(MAGIC), stream.seek(0, os.SEEK_END) - TAIL_BYTES))
-            metadata = _last(stream.read(TAIL_BYTES))
-            return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
-    except (OSError, *DAMAGE):
+            tail = stream.read(TAIL_BYTES)
+    except OSError:
+        # A caller that reads the whole file reports the error.
+        return None
+    return end_in(tail)
+
+
+def end_in(data: bytes) -> EndRecord | None:
+    """Return the end record in the last bytes of a file, or None if they have none."""
+    try:
+        metadata = _last(data[-TAIL_BYTES:])
+        return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
+    except DAMAGE:
         # A caller that reads the whole file reports the damage.
         return None
 

@@ -32,10 +32,15 @@ class EventCopies:
         """The events of the last batch of steps."""
         self._copies: list[TimelineEntry] = []
         """The copies that followed that batch."""
+        self._number: int | None = None
+        """Number of the step after that batch."""
+        self._damaged = 0
+        """Number of damaged places before that batch."""
 
     def batch(self, steps: list[Step]) -> None:
         """Take a batch of steps; its copies follow."""
-        self._compare(last=False)
+        self._compare(last=False, follows=self._number in (None, steps[0].number))
+        self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [
             entry_of(event, step.inputs.now.wall_ns)
             for step in steps
@@ -61,13 +66,20 @@ class EventCopies:
         if end is not None and end.said != said:
             self._differs(f'the end of the file says "{end.said}", and its events say "{said}"')
 
-    def _compare(self, last: bool) -> None:
-        """Compare the copies with the events; `last` is true for those of the last batch.
+    def _compare(self, last: bool, follows: bool = True) -> None:
+        """Compare the copies with the events of the batch before them.
 
-        Copies may be missing after damage, and at the end of a file that was cut off.
+        Copies may be missing at the end of a file that was cut off. If there is damage between this
+        batch and the next one, the copies may belong to a batch that cannot be read.
+
+        Args:
+            last: true for the copies of the last batch.
+            follows: true if no step is missing between this batch and the next one.
         """
         recording = self._recording
-        missing = recording.damaged > 0 or (last and bool(recording.cut or not recording.ended))
+        if recording.damaged > self._damaged or not follows:
+            return
+        missing = last and bool(recording.cut or not recording.ended)
         for event, copy in zip_longest(self._events, self._copies):
             if event != copy:
                 if copy is not None or not missing:

@@ -10,7 +10,6 @@ from msgspec import Struct
 
 from acsard import __version__
 from acsard.core.config.settings import Config
-from acsard.core.robot import Robot
 from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.core.ros.names import TYPE_HASHES
 from acsard.core.values import NS_PER_S, Outputs
@@ -20,6 +19,7 @@ from acsard.recording.atomic_output import replacing, synced
 from acsard.recording.file import About, Recording
 from acsard.recording.file_replay import (
     PROGRESS_STEPS,
+    Gap,
     Progress,
     RecordedRun,
     no_progress,
@@ -40,17 +40,26 @@ class ExportResult(Struct, frozen=True):
 
     count: int
     """Number of messages, or of rows of a CSV table."""
-    trouble: str
-    """Why the export ends before the recording does; "" if it is complete."""
+    gaps: list[Gap]
+    """The parts of the time span that are not exported."""
 
 
 class _Writer(Protocol):
-    """A file format: takes replayed steps and writes them to a stream."""
+    """A file format: takes steps and writes them to a stream."""
 
     count: int
 
     def step(self, step: Step, outputs: Outputs) -> None:
         """Write a step and its replayed outputs."""
+
+    def skip(self, step: Step, inside: bool) -> None:
+        """Take a step that is not replayed, or that is not in the time span.
+
+        A step of the time span, for which `inside` is true, has lines of the log nevertheless.
+        """
+
+    def end(self, ending: str = "") -> None:
+        """Write the lines of the log after the last step, as `TimelineWriter.end` makes them."""
 
     def finish(self) -> None:
         """Write the end of the file."""
@@ -59,9 +68,10 @@ class _Writer(Protocol):
 class _MessageWriter:
     """Writes ROS messages to an MCAP file."""
 
-    def __init__(self, stream: BinaryIO, robot: Robot, about: About, name: str) -> None:
-        self._publisher = Publisher(robot, about.started_ns or about.wall_ns)
-        self._namespace = robot.config.ros.namespace
+    def __init__(self, stream: BinaryIO, run: RecordedRun, about: About, name: str) -> None:
+        self._run = run
+        self._publisher = Publisher(run.robot, about.started_ns or about.wall_ns)
+        self._namespace = run.robot.config.ros.namespace
         self._writer = Writer(stream)
         self._writer.start("ros2", f"acsard {__version__}")
         origin = {"robot": about.robot, "recording": name, "recorded_by": f"acsard {about.version}"}
@@ -75,7 +85,17 @@ class _MessageWriter:
         """Earliest and latest wall-clock time of a message, ns since 1970."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
+        self._publisher.robot = self._run.robot
         for message in self._publisher.step(step, outputs):
+            self._add(message)
+
+    def skip(self, step: Step, inside: bool) -> None:
+        for message in self._publisher.skip(step):
+            if inside:
+                self._add(message)
+
+    def end(self, ending: str = "") -> None:
+        for message in self._publisher.end(ending):
             self._add(message)
 
     def _add(self, published: Published) -> None:
@@ -130,6 +150,10 @@ class _TableWriter:
             self._stream.write(f"{row}\n".encode())
             self.count += 1
 
+    def skip(self, step: Step, inside: bool) -> None: ...
+
+    def end(self, ending: str = "") -> None: ...
+
     def finish(self) -> None: ...
 
 
@@ -158,7 +182,7 @@ def export(
 
     def write(writer: _Writer, stream: BinaryIO) -> None:
         with run.state_errors():
-            _write_steps(run, writer, span, progress)
+            _write_steps(run, writer, recording, span, progress)
         if not writer.count:
             raise RecordingError(
                 f"{recording.path} has nothing in that span of time; correct --from and --to"
@@ -168,7 +192,7 @@ def export(
 
     def message_writer(stream: BinaryIO) -> _MessageWriter:
         with run.state_errors():
-            return _MessageWriter(stream, run.robot, recording.about, recording.path.name)
+            return _MessageWriter(stream, run, recording.about, recording.path.name)
 
     with replacing(new, force) as part:
         if kind == "rosbag2":
@@ -179,24 +203,51 @@ def export(
             with (part / ros_bag.METADATA).open("wb") as stream:
                 stream.write(ros_bag.metadata(file.name, bag.topics, *bag.times).encode())
                 synced(stream)
-            return ExportResult(bag.count, run.trouble)
+            return ExportResult(bag.count, _gaps(run, span, recording.about))
         with part.open("wb") as stream:
             writer: _Writer = _TableWriter(stream) if kind == "csv" else message_writer(stream)
             write(writer, stream)
-        return ExportResult(writer.count, run.trouble)
+        return ExportResult(writer.count, _gaps(run, span, recording.about))
 
 
-def _write_steps(run: RecordedRun, writer: _Writer, span: Span, progress: Progress) -> None:
+def _write_steps(
+    run: RecordedRun, writer: _Writer, recording: Recording, span: Span, progress: Progress
+) -> None:
     """Replay all steps, because each changes the robot, and write those in the time span."""
-    began_ns = None
+    began_ns, over = recording.about.mono_ns, False
+
+    def is_inside(step: Step) -> bool:
+        """Return whether a step is in the time span. The first one behind it ends the log."""
+        nonlocal over
+        seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
+        if seconds > span.end and not over:
+            over = True
+            if writer.count:
+                writer.end()
+        return span.begin <= seconds <= span.end
+
+    def skip(step: Step) -> None:
+        inside = is_inside(step)
+        if not over:
+            writer.skip(step, inside)
+
+    run.skipped = skip
     for number, step in enumerate(run.steps()):
-        now = step.inputs.now
-        began_ns = now.mono_ns if began_ns is None else began_ns
         if number % PROGRESS_STEPS == 0:
-            progress(now.wall_ns)
+            progress(step.inputs.now.wall_ns)
         outputs = replay_step(run.robot, step)
-        if span.begin <= (now.mono_ns - began_ns) / NS_PER_S <= span.end:
+        if is_inside(step):
             writer.step(step, outputs)
+        elif not over:
+            writer.skip(step, inside=False)
+    if writer.count and not over:
+        writer.end(recording.ending)
+
+
+def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
+    """Return the gaps in the time span."""
+    begin_ns, end_ns = [about.mono_ns + seconds * NS_PER_S for seconds in span]
+    return [gap for gap in run.gaps if gap.begin_ns < end_ns and gap.end_ns > begin_ns]
 
 
 def measured(recording: Recording) -> bytes:
@@ -208,6 +259,9 @@ def measured(recording: Recording) -> bytes:
     lines, has_gyro = [csv_table.MEASURED_HEADER], False
     with run.state_errors():
         for step in run.steps():
+            if run.gaps:
+                # A calibration compares whole drives, and part of this drive is missing.
+                break
             lines += csv_table.measured(step, replay_step(run.robot, step))
             has_gyro = has_gyro or bool(step.inputs.gyro)
     if not has_gyro:

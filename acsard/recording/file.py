@@ -3,21 +3,28 @@
 A file has four channels:
 - `steps`: batches of steps, as `rows.py` encodes them.
 - `events`: one event per message, in JSON.
-- `state`: a robot, as `state.py` encodes it. A file that does not begin with the daemon's start has
-  this message before all others.
+- `state`: a robot, as `state.py` encodes it. Such a message has a chunk of its own: damage to steps
+  does not cost the state from which a replay goes on, and damage to the state costs no step. A file
+  that does not begin with the daemon's start has this message before all others.
 - `unfinished`: the inputs of the step in which the daemon failed.
 
 A metadata record names the robot and the version of acsard, and an attachment holds the
-`acsard.toml`. The messages are in chunks of about ten seconds, which `chunks.py` writes. A file
-that was cut off has no end record, but all data that was synced to the disk can still be read.
-`rewrite` makes a finished file of such a file.
+`acsard.toml`. A finished file has both at its beginning and before its end, because nothing can be
+replayed without them. The metadata of the channels, and a further metadata record, tell people with
+other MCAP programs how to read the file.
+
+The messages are in chunks of about ten seconds, which `chunks.py` writes. A file that was cut off
+has no end record, but all data that was synced to the disk can still be read. `rewrite` makes a
+finished file of such a file.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
@@ -43,10 +50,11 @@ from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.recording.chunks import GROWING_HEAD, GrowingChunk, Message
-from acsard.recording.end_record import END, EndRecord, Ns, as_metadata, how_it_ends
+from acsard.recording.end_record import END, EndRecord, Ns, as_metadata, end_in, how_it_ends
 from acsard.recording.mcap_records import MAGIC, walk
-from acsard.recording.recorded_steps import UnfinishedError, unfinished
-from acsard.recording.rows import FORMAT, first_of
+from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
+from acsard.recording.rows import FORMAT, Batch, Row, first_of
+from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import INCIDENTS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
@@ -67,6 +75,35 @@ The reader relies on this order, because the records that define the channels ma
 """
 
 NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
+
+HOW_TO_READ = Metadata(
+    "how to read this file",
+    {
+        "export": "`acsard recording export FILE` writes this recording as ROS 2 messages in MCAP, "
+        "for Foxglove and PlotJuggler; with --rosbag2 as a bag, with --csv as a table",
+        "show": "`acsard recording show FILE` prints the events as text",
+        "replay": "`acsard recording replay FILE` runs the steps again and compares the results",
+        "channels": "the metadata of each channel says what its messages are",
+        "acsard.toml": "the configuration of the robot, as an attachment",
+    },
+)
+"""Metadata record for people who open a recording with another MCAP program."""
+
+CONTENTS: dict[Topic, str] = {
+    "steps": "the inputs and outputs of the control steps of about a second, in MessagePack: an "
+    f"array of {', '.join(Batch.__struct_fields__)}; each of the rows is a step, an array of "
+    f"{', '.join(Row.__struct_fields__)}; the module acsard.recording.rows documents each field",
+    "state": "the robot between two steps, in MessagePack: an array of "
+    f"{', '.join(Checkpoint.__struct_fields__)}; the data is a Python pickle, which only acsard "
+    "reads safely",
+    "events": "an event, in JSON; the schema describes it",
+    "unfinished": "the inputs of the step in which the daemon failed, in MessagePack: a map of "
+    f"{', '.join(Unfinished.__struct_fields__)}",
+}
+"""Description of the messages of each channel, which its metadata holds."""
+
+UNFINISHED = "no end: cut off, or still being recorded"
+"""The ending of a file that is not finished, in words."""
 
 EVENTS_SCHEMA = 1
 """Number of the schema of the events. The other channels have no schema."""
@@ -186,6 +223,7 @@ class Writing:
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
         self._end_builder = EndRecordBuilder(about)
+        self._about = _about_records(about)
         self._index = Index()
         self._chunk: GrowingChunk | None = None
         self._chunk_at: int | None = None
@@ -202,12 +240,7 @@ class Writing:
         os.fchmod(self._file.fileno(), self._mode)
         self._file.write(MAGIC)
         self._write(Header("acsard", f"acsard {about.version}"))
-        meta = msgspec.to_builtins(about)
-        del meta["config"]
-        self._write(Metadata("acsard", {key: str(value) for key, value in meta.items()}))
-        text, at_ns = about.config.encode(), about.wall_ns
-        self._write(Attachment(at_ns, at_ns, "acsard.toml", "text/plain", text))
-        for record in _definitions():
+        for record in (HOW_TO_READ, *self._about, *_definitions()):
             self._write(record)
         self.flush()
 
@@ -228,12 +261,16 @@ class Writing:
         wall_ns = max(0, wall_ns)
         chunk = self._chunk
         if chunk is not None and (
-            chunk.size >= CHUNK_BYTES or abs(wall_ns - chunk.first_ns) >= CHUNK_NS
+            topic == "state"
+            or chunk.size >= CHUNK_BYTES
+            or abs(wall_ns - chunk.first_ns) >= CHUNK_NS
         ):
             self.end_chunk()
         self._chunk = self._chunk or GrowingChunk()
         self._chunk.add(Message(NUMBERS[topic], wall_ns, data))
         self._index.message(NUMBERS[topic], wall_ns)
+        if topic == "state":
+            self.end_chunk()
 
     def event(self, event: TimelineEntry) -> None:
         """Add an event as a message, and to the summary in the end record."""
@@ -281,6 +318,8 @@ class Writing:
         `cut` and `why` say how the daemon ended, as in `EndRecordBuilder.end_record`.
         """
         self.end_chunk()
+        for record in self._about:
+            self._write(record)
         self._write(Metadata(END, as_metadata(self._end_builder.end_record(cut, why))))
         self._write(DataEnd(0))
         summary_at = self._file.tell()
@@ -301,6 +340,26 @@ class Writing:
             pass
 
 
+def _about_records(about: About) -> list[McapRecord]:
+    """Return the metadata and the attachment that tell what made a recording."""
+    meta = {key: str(value) for key, value in msgspec.to_builtins(about).items()}
+    text, at_ns = meta.pop("config").encode(), about.wall_ns
+    return [
+        Metadata("acsard", {**meta, "checksum": str(_checksum(meta))}),
+        Attachment(at_ns, at_ns, "acsard.toml", "text/plain", text),
+    ]
+
+
+def _checksum(metadata: Mapping[str, str]) -> int:
+    """Return a checksum of the metadata, because MCAP has none."""
+    return zlib.crc32(msgspec.json.encode(metadata, order="sorted"))
+
+
+def _is_intact(metadata: Mapping[str, str]) -> bool:
+    rest = {key: value for key, value in metadata.items() if key != "checksum"}
+    return metadata.get("checksum", str(_checksum(rest))) == str(_checksum(rest))
+
+
 def _definitions() -> Iterator[McapRecord]:
     """Yield the schema and the channels. A file has them at its beginning and in its summary."""
     schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
@@ -308,7 +367,7 @@ def _definitions() -> Iterator[McapRecord]:
     for topic, number in NUMBERS.items():
         events = topic == "events"
         encoding, schema_id = ("json", EVENTS_SCHEMA) if events else (f"acsard-{topic}", 0)
-        yield Channel(number, topic, encoding, {}, schema_id)
+        yield Channel(number, topic, encoding, {"content": CONTENTS[topic]}, schema_id)
 
 
 class Recording:
@@ -327,7 +386,10 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"cannot read {path}: {error.strerror}") from None
         self.ended = False
-        """True once `messages` has read the whole file, if the file is finished."""
+        """True once `messages` has read the whole file, if the file is finished.
+
+        Damage may hide the end of a finished file. Then `damaged` counts it.
+        """
         self.damaged = 0
         """Number of damaged places, mostly chunks, that have readable data after them."""
         self.cut = ""
@@ -347,7 +409,7 @@ class Recording:
     def ending(self) -> str:
         """Why it ended other than by a normal end of the daemon, or "". Read it before."""
         if not self.ended:
-            return "no end: cut off, or still being recorded"
+            return UNFINISHED
         return how_it_ends(self.cut, self.why)
 
     @property
@@ -381,24 +443,34 @@ class Recording:
                 self.ended = True
             elif isinstance(record, Metadata) and record.name == END:
                 self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
-            self.damaged += place.damaged
             for channel, wall_ns, data in place.messages:
                 if channel in topics:
                     topic = topics[channel]
                     if topic == "unfinished":
                         self.unfinished = data
                     yield topic, wall_ns, data
+            # A damaged chunk has its readable messages before the damage.
+            self.damaged += place.damaged
+        if not self.ended and (end := end_in(self._data)) is not None:
+            # The walk took the damage for a cut, because no complete chunk follows it.
+            self.ended, self.cut, self.why = True, end.cut, end.why
+            self.damaged += 1
 
     def _about(self) -> About:
         metadata: dict[str, str] = {}
-        config = None
+        config, intact = None, False
+        # If the beginning is damaged, the copies at the end of a finished file are as good.
+        is_finished = end_in(self._data) is not None
         for place in walk(self._data):
             record = place.record
             if isinstance(record, Metadata) and record.name == "acsard":
-                metadata = record.metadata
+                if not metadata or _is_intact(record.metadata):
+                    metadata = record.metadata
+                    intact = _is_intact(metadata)
             elif isinstance(record, Attachment) and record.name == "acsard.toml":
-                config = record.data.decode(errors="replace")
-            elif place.messages:
+                if config is None:
+                    config = record.data.decode(errors="replace")
+            elif place.messages and ((intact and config is not None) or not is_finished):
                 break
         try:
             if config is None:
@@ -438,6 +510,13 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
         path.unlink()
         raise
     return count
+
+
+def is_part(part: Recording, recording: Recording) -> bool:
+    """Return whether a recording has everything that `part` has, so that it may replace `part`."""
+    if part.about != recording.about:
+        return False
+    return Counter(part.messages()) <= Counter(recording.messages())
 
 
 def event_of(recording: Recording, data: bytes) -> TimelineEntry:

@@ -1,25 +1,34 @@
-"""Replays a recording file, from its first step to its end or to the first missing step."""
+"""Replays a recording file, from its first step to its end.
+
+After a damaged place the replay goes on with the next state of the robot in the file.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from typing import NamedTuple
 
-from acsard.core.config.parsing import ConfigError, parse
+from msgspec import Struct
+
+from acsard.core.config.live import changed, flat
+from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config
-from acsard.core.formatting import many
+from acsard.core.config.writing import document
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
 from acsard.core.values import Outputs
 from acsard.host.errors import RecordingError
+from acsard.recording.end_record import read_end
 from acsard.recording.event_copies import EventCopies
 from acsard.recording.file import Recording
 from acsard.recording.merge import adopt
 from acsard.recording.recorded_steps import Step, UnfinishedError, unfinished
 from acsard.recording.replay import Comparison, Replay
 from acsard.recording.rows import BatchError, decode
-from acsard.recording.state import State, StateError, short, thaw
+from acsard.recording.state import Checkpoint, State, StateError, checkpoint, short, thaw
+from acsard.recording.unpickling import MAX_BYTES
 
 Progress = Callable[[int], None]
 """Callback that takes the wall-clock time which the replay has reached, ns since 1970."""
@@ -38,12 +47,29 @@ INCOMPLETE_STATE_ERRORS = (
 """Exceptions that a robot raises if its recorded state lacks parts that this version expects."""
 
 
+class Gap(Struct):
+    """A part of a recording that is not replayed, because steps before it cannot be read."""
+
+    begin_ns: int
+    """Monotonic time of the last replayed step before it, ns."""
+    end_ns: int
+    """Monotonic time of the first replayed step after it, or of the end of the recording, ns."""
+    unreadable: int = 0
+    """Number of steps that cannot be read, as far as it is known."""
+    skipped: int = 0
+    """Number of steps that can be read, but come before the next state of the robot."""
+    lines: int = 0
+    """Number of lines to the board in the skipped steps."""
+    end_lost: bool = False
+    """True if the last steps of the recording cannot be read."""
+
+
 class ReplayResult(NamedTuple):
     """Result of the replay of a file."""
 
     comparison: Comparison
-    trouble: str
-    """Why the replay ended before the end of the file; "" if it is complete."""
+    gaps: list[Gap]
+    """The parts of the file that are not compared."""
     failed_step: str = ""
     """Sentence that says whether the step in which the daemon failed fails in this version too.
 
@@ -71,50 +97,68 @@ def config_of(recording: Recording) -> Config:
         ) from None
 
 
-def steps(recording: Recording, copies: EventCopies | None = None) -> Iterator[Step]:
-    """Yield every step that can be read, in order. The numbers of the steps show the gaps.
+def steps(recording: Recording) -> Iterator[Step]:
+    """Yield every step that can be read, in order. The numbers of the steps show the gaps."""
+    for item in _items(recording):
+        if not isinstance(item, Checkpoint):
+            yield from item
+
+
+def _items(
+    recording: Recording, copies: EventCopies | None = None
+) -> Iterator[list[Step] | Checkpoint]:
+    """Yield the batches of steps and the states of the robot, in order.
 
     `copies` takes the same steps and the copies of their events.
     """
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
             copies.copy(data)
-        if topic == "steps":
-            try:
-                batch = decode(data)
-            except BatchError:
-                recording.damaged += 1
-                continue
-            if copies is not None:
-                copies.batch(batch)
-            yield from batch
+        try:
+            if topic == "state":
+                yield checkpoint(data)
+            elif topic == "steps":
+                batch = list(decode(data))
+                if copies is not None:
+                    copies.batch(batch)
+                yield batch
+        except (BatchError, StateError):
+            recording.damaged += 1
 
 
 class RecordedRun:
-    """The steps of a recording up to the first gap, and the robot as it was before them."""
+    """The steps of a recording that can be replayed, and the robot as it was before each of them.
+
+    If steps are missing, the run goes on with the next state of the robot in the file. The steps
+    before that state are left out, because the robot before them is not known.
+    """
 
     def __init__(self, recording: Recording, other: Config | None = None) -> None:
         """Use the configuration `other`, or the recording's own if `other` is None.
 
         Raises `RecordingError` if this version cannot read the recorded configuration or state.
         """
-        self.config = other or config_of(recording)
+        self._other, self._recorded = other, config_of(recording)
+        self.config = other or self._recorded
         """Configuration of the first step."""
-        self.trouble = ""
-        """Why `steps` ended before the end of the file; "" if it did not."""
+        self.gaps: list[Gap] = []
+        """The gaps before the present step."""
         self.number: int | None = None
         """Number of the last step that `steps` yielded."""
+        self.skipped: Callable[[Step], None] = lambda step: None
+        """Called with each step that can be read but not replayed."""
         self.copies = EventCopies(recording)
-        """The copies of the events of the steps that `steps` yielded."""
-        self._recording = recording
-        self._state, new_robot = _state(recording), Robot(self.config)
-        self.robot, self.memory = self._state or (new_robot, Memory())
+        """The copies of the events of the steps that can be read."""
+        self._recording, self._states = recording, _States(recording)
+        first = _first_state(recording)
+        self._next = first.number if first else 0
+        """Number of the step before which `robot` is known."""
+        self._state = _robot_of(recording, first) if first else None
+        self.robot, self.memory = self._state or (Robot(self.config), Memory())
+        """The robot and its guard's memory. They are other objects after a gap."""
         if self._state is not None:
-            # A state recorded by other code may lack parts that this version has. Those parts are
-            # taken from a new robot.
-            recorded_new_robot = Robot(config_of(recording))
             with self.state_errors():
-                adopt(self.robot, recorded_new_robot, new_robot)
+                adopt(self.robot, Robot(self._recorded), Robot(self.config))
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
@@ -122,30 +166,130 @@ class RecordedRun:
 
         Wrap every use of `robot` in this context.
         """
-        with _state_errors(self._recording, self._state):
+        with _state_errors(self._recording, lambda: self._state is not None):
             yield
 
     def steps(self) -> Iterator[Step]:
-        """Yield the steps until one is missing.
+        """Yield the steps that can be replayed, and count the others in `gaps`.
 
-        Raises `RecordingError` if the first steps are missing, or if no step can be read.
+        Raises `RecordingError` if there is none.
         """
-        path = self._recording.path
-        for step in steps(self._recording, self.copies):
-            number = self.number
-            if number is None and self._state is None and step.number > 0:
-                raise RecordingError(f"{path}: its first steps are missing or damaged")
-            if number is not None and step.number != number + 1:
-                missing = step.number - number - 1
-                self.trouble = (
-                    f"{many(missing, 'step is', 'steps are')} missing after step {number}"
-                )
-                return
-            self.number = step.number
-            yield step
+        recording = self._recording
+        replayed_ns = recording.about.mono_ns
+        read, damaged = self._next, 0
+        saved: Checkpoint | None = None
+        last: Step | None = None
+        gap: Gap | None = None
+        for item in _items(recording, self.copies):
+            if isinstance(item, Checkpoint):
+                saved = item
+                continue
+            damaged = recording.damaged
+            for step in item:
+                now_ns = step.inputs.now.mono_ns
+                missing, read = step.number - read, step.number + 1
+                if gap is None and (missing or (last is None and now_ns > replayed_ns)):
+                    gap = self._open_gap(replayed_ns)
+                last = step
+                known = step.number == self._next or self._resume(saved, step.number)
+                if gap is not None:
+                    gap.end_ns = max(gap.end_ns, now_ns)
+                    gap.unreadable += max(0, missing)
+                    if not known:
+                        gap.skipped += 1
+                        gap.lines += step.recorded.line is not None
+                        self.skipped(step)
+                        continue
+                    gap = None
+                self.number, self._next, replayed_ns = step.number, step.number + 1, now_ns
+                yield step
+        if last is None:
+            raise RecordingError(f"{recording.path} has no steps: it ends within its first second")
         if self.number is None:
-            raise RecordingError(f"{path} has no steps: it ends within its first second")
+            raise RecordingError(f"{recording.path}: its first steps are missing or damaged")
+        if recording.damaged > damaged:
+            end, now = read_end(recording.paths[-1]), last.inputs.now
+            lost_ns = 0 if end is None else end.last_ns - now.wall_ns
+            # If the end of the file is unreadable, it may have had more steps.
+            if end is None or lost_ns > 0:
+                gap = gap or self._open_gap(replayed_ns)
+                gap.end_ns, gap.end_lost = max(gap.end_ns, now.mono_ns) + lost_ns, True
         self.copies.end()
+
+    def _open_gap(self, begin_ns: int) -> Gap:
+        gap = Gap(begin_ns, begin_ns)
+        self.gaps.append(gap)
+        return gap
+
+    def _resume(self, saved: Checkpoint | None, number: int) -> bool:
+        """Take the robot from `saved` if it is the robot before the step `number`.
+
+        Returns whether it is.
+        """
+        other = self._other
+        tried = None if other is None else partial(_with_changes, other, self._recorded)
+        state = self._states.resumed(saved, number, tried)
+        if state is None:
+            return False
+        self._state = state
+        self.robot, self.memory = state
+        return True
+
+
+MAX_STATE_BYTES = 8
+"""Largest size of the states that are decoded behind gaps, in bytes for each byte of the file.
+
+A state takes a third of its size in a file. Without this limit a forged file of 5 kB took 4 s.
+"""
+
+
+class _States:
+    """Decodes the states from which a replay goes on behind a gap, with a limited effort."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._left = MAX_BYTES
+        for path in recording.paths:
+            # A file that is gone is reported when its steps are read.
+            with suppress(OSError):
+                self._left += MAX_STATE_BYTES * path.stat().st_size
+
+    def resumed(
+        self,
+        saved: Checkpoint | None,
+        number: int,
+        tried: Callable[[Config], Config] | None = None,
+    ) -> State | None:
+        """Return the robot of `saved` if it is the robot before the step `number`.
+
+        Returns None if it is not, or if this version cannot read it. `tried` takes the
+        configuration of that robot, and returns the one that it gets.
+        """
+        if saved is None or saved.number != number:
+            return None
+        self._left -= len(saved.data)
+        if self._left < 0:
+            return None
+        try:
+            state = thaw(saved.data)
+            # A forged configuration may have values that no robot can work with.
+            present = parse("\n".join(document(effective(state.robot.config))).encode())
+            adopt(state.robot, Robot(present), Robot(tried(present) if tried else present))
+        except (StateError, ConfigError, *INCOMPLETE_STATE_ERRORS):
+            return None
+        return state
+
+
+def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
+    """Return `other` with the settings that changed from `recorded` to `present`.
+
+    A change that `other` does not permit is refused, as the robot would have refused it.
+    """
+    before = dict(flat(effective(recorded)))
+    changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
+    try:
+        return changed(other, changes, at_rest=True)[0]
+    except ConfigError:
+        return other
 
 
 def replay_file(
@@ -161,9 +305,11 @@ def replay_file(
         for number, step in enumerate(run.steps()):
             if number % PROGRESS_STEPS == 0:
                 progress(step.inputs.now.wall_ns)
+            if replay.robot is not run.robot:
+                replay.resume(run.robot, run.memory)
             replay.step(step)
-    failed_step = "" if run.trouble else _failed_step(recording, replay.robot, run.number)
-    return ReplayResult(replay.comparison, run.trouble, failed_step, run.copies.difference)
+    failed_step = _failed_step(recording, replay.robot, run.number)
+    return ReplayResult(replay.comparison, run.gaps, failed_step, run.copies.difference)
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
@@ -193,12 +339,16 @@ class DisplayReplay:
 
     def __init__(self, recording: Recording) -> None:
         """Read the recording; raise `RecordingError` if its configuration cannot be read."""
-        self._recording = recording
+        self._recording, self._states = recording, _States(recording)
         self.notes: list[str] = []
         """Notes for the user about how this replay may differ from the recorded drive."""
         self.config = config_of(recording)
+        self._state: State | None = None
+        self._in_gap = False
+        """True from a missing step to the next state of the robot."""
         try:
-            self._state = _state(recording)
+            first = _first_state(recording)
+            self._state = _robot_of(recording, first) if first else None
             with self.state_errors():
                 if self._state is not None:
                     adopt(self._state.robot, Robot(self.config), Robot(self.config))
@@ -216,31 +366,46 @@ class DisplayReplay:
 
         Wrap every use of the robot in this context.
         """
-        with _state_errors(self._recording, self._state):
+        with _state_errors(self._recording, lambda: self._state is not None):
             yield
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
         """Yield each recorded step, its replayed outputs, and the robot after the step.
 
+        After a gap the robot does not match the recorded one until the next state of the robot.
         Raises `RecordingError` if the recorded state lacks a part that a step uses.
         """
-        first = True
-        for step in steps(self._recording):
-            if first and self._state is None and step.number > 0 and not self.notes:
-                self.notes.append("its first steps are missing: the replay begins without them")
-            first = False
-            with self.state_errors():
-                self.replay.step(step)
-            if self.replay.outputs is not None:
-                yield step, self.replay.outputs, self.replay.robot
+        saved: Checkpoint | None = None
+        number: int | None = None
+        for item in _items(self._recording):
+            if isinstance(item, Checkpoint):
+                saved = item
+                continue
+            for step in item:
+                if number is None and self._state is None and step.number > 0 and not self.notes:
+                    note = "its first steps are missing: the replay begins without them"
+                    self.notes.append(note)
+                if number is not None and step.number != number + 1:
+                    self._in_gap = True
+                number = step.number
+                if self._in_gap and (state := self._states.resumed(saved, number)) is not None:
+                    self._state, self._in_gap = state, False
+                    self.replay.resume(*state)
+                with self.state_errors():
+                    self.replay.step(step)
+                if self.replay.outputs is not None:
+                    yield step, self.replay.outputs, self.replay.robot
 
 
-def _state(recording: Recording) -> State | None:
-    """Return the robot's state before the first step, or None if the file holds no state."""
+def _first_state(recording: Recording) -> Checkpoint | None:
+    """Return the robot's state before the first step, or None if the file holds no such state.
+
+    Raises `RecordingError` if the state is damaged.
+    """
     for topic, _, data in recording.messages():
         if topic == "state":
             try:
-                return thaw(data)
+                return checkpoint(data)
             except StateError as error:
                 raise _foreign(recording, str(error)) from None
         if topic == "steps":
@@ -248,20 +413,28 @@ def _state(recording: Recording) -> State | None:
     return None
 
 
+def _robot_of(recording: Recording, saved: Checkpoint) -> State:
+    """Return the robot of a state; raise `RecordingError` if this version cannot read it."""
+    try:
+        return thaw(saved.data)
+    except StateError as error:
+        raise _foreign(recording, str(error)) from None
+
+
 @contextmanager
-def _state_errors(recording: Recording, state: State | None) -> Iterator[None]:
+def _state_errors(recording: Recording, from_file: Callable[[], bool]) -> Iterator[None]:
     """Raise `RecordingError` if the block fails because the recorded state is incomplete.
 
     The state may come from other code or a forged file, so any part of the robot may be missing or
-    of a wrong type. Without a recorded state, an error of the block is a defect of this version and
-    is raised as it is.
+    of a wrong type. If the robot does not come from the file, an error of the block is a defect of
+    this version and is raised as it is.
     """
     try:
         yield
     except RecordingError:
         raise
     except INCOMPLETE_STATE_ERRORS as error:
-        if state is None:
+        if not from_file():
             raise
         reason = f"this version cannot read the state at its start: {short(error)}"
         raise _foreign(recording, reason) from error

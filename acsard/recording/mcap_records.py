@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -75,7 +76,8 @@ def walk(data: bytes) -> Iterator[Found]:
     If the damaged chunks need more than `MAX_EFFORT`, the rest of the file is one damaged place.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
-    if not data.startswith(MAGIC):
+    # The first bytes of a finished file may be damaged too.
+    if not (data.startswith(MAGIC) or data.endswith(MAGIC)):
         return
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)
@@ -118,7 +120,17 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
     except DAMAGE:
         return None
     end = stream.tell()
+    if isinstance(record, Attachment) and not _is_intact(stream, at, end):
+        return None
     return Found(record, None, end) if end < size or end == claimed else None
+
+
+def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
+    """Return whether the checksum of the attachment between two offsets is correct or absent."""
+    stream.seek(at)
+    record = stream.read(end - at)
+    crc = int.from_bytes(record[-4:], "little")
+    return crc in (0, zlib.crc32(record[HEAD.size : -4]))
 
 
 class _Chunks:

@@ -2,8 +2,9 @@
 
 `Report`, which the daemon uses too, builds the messages as if a client had subscribed to every
 topic all the time. A recording does not hold the daemon's measurements of itself, so the rows of
-`diagnostics` with such measurements are omitted. The log also has the lines `reason` of the
-timeline, which the robot does not publish: it publishes its reason in `state` only.
+`diagnostics` with such measurements are omitted. The lines of `log` are the entries of the
+timeline, so that they tell the same as `acsard recording show` and the report. They have all events
+of the robot, and also entries that the robot does not publish, such as `drive` and `reason`.
 """
 
 from __future__ import annotations
@@ -17,14 +18,18 @@ from acsard.core.messages.report import Look, Report
 from acsard.core.messages.schema import DiagnosticArray, RobotState, TFMessage, Time
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, published_channels
-from acsard.core.ros.shapes import LEVELS, Log, asked, log
+from acsard.core.ros.shapes import LEVELS, Log, asked
 from acsard.core.ros.transports import left_out
-from acsard.core.values import Command, Instant, Outputs
+from acsard.core.values import NS_PER_S, Command, Instant, Outputs
 from acsard.recording.recorded_steps import Step
-from acsard.recording.timeline import ReasonChanges
+from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
 MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
 """Rows of `diagnostics` whose values a recording does not hold."""
+
+
+ROUNDED_NS = 1000
+"""Bound on the error of a rounded time, ns. Steps are at least 1 us apart."""
 
 
 class Published(NamedTuple):
@@ -49,10 +54,14 @@ class Publisher:
             started_ns: wall-clock time of the daemon's start, ns since 1970; the stamp of the
                 messages that never change.
         """
-        self._robot, self._config = robot, robot.config
+        self.robot = robot
+        """The robot that replays the steps. Set it to another one after a gap."""
+        self._config = robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._wanted_keys()
-        self._reasons = ReasonChanges()
+        self._timeline = TimelineWriter(robot.config)
+        self._now = Instant(0, started_ns)
+        """Time of the last step."""
         self._static: TFMessage | None = None
         self._static_due = True
         """True before the first step, and after a setting has changed."""
@@ -64,11 +73,11 @@ class Publisher:
     def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
         """Yield the messages of a step that was just replayed: commands first, log lines last.
 
-        The steps must come in order. The caller may skip steps.
+        The steps must come in order. Give a step whose messages are not wanted to `skip`.
         """
         # The step changed a setting.
-        if self._robot.config is not self._config:
-            self._config = self._robot.config
+        if self.robot.config is not self._config:
+            self._config = self.robot.config
             self._report.use(self._config)
             self._wanted = self._wanted_keys()
             self._static_due = True
@@ -79,16 +88,27 @@ class Publisher:
         snapshot = self._snapshot(now)
         for key, message in self._report.due(outputs, self._wanted, snapshot):
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
-        for event in step.recorded.events:
-            line = log(event, Time.from_ns(now.wall_ns))
-            yield Published(LOG, "", now.wall_ns, line)
-        for entry in self._reasons.step(step):
-            stamp = Time.from_ns(now.wall_ns)
-            line = Log(stamp, LEVELS[entry.level], entry.name, entry.text)
-            yield Published(LOG, "", now.wall_ns, line)
+        yield from self.skip(step)
+
+    def skip(self, step: Step) -> Iterator[Published]:
+        """Yield only the log lines of a step, which needs no replay."""
+        self._now = step.inputs.now
+        yield from map(self._line, self._timeline.step(step))
+
+    def end(self, ending: str = "") -> Iterator[Published]:
+        """Yield the log lines after the last step, as `TimelineWriter.end` does."""
+        yield from map(self._line, self._timeline.end(ending))
+
+    def _line(self, entry: TimelineEntry) -> Published:
+        wall_ns = round(entry.seconds * NS_PER_S)
+        # The time of an entry is rounded to fractions of a us, and the stamps of events are exact.
+        if abs(wall_ns - self._now.wall_ns) < ROUNDED_NS:
+            wall_ns = self._now.wall_ns
+        line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)
+        return Published(LOG, "", wall_ns, line)
 
     def _snapshot(self, now: Instant) -> Look:
-        return lambda: self._robot.snapshot(now.mono_ns)
+        return lambda: self.robot.snapshot(now.mono_ns)
 
     def _latched(self, now: Instant) -> Iterator[Published]:
         """Yield `tf_static` once, and again after a setting has changed it."""

@@ -17,7 +17,15 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
-from acsard.core.values import AcsardError, Estimate, Event, Inputs, Outputs, Recording
+from acsard.core.values import (
+    AcsardError,
+    Command,
+    Estimate,
+    Event,
+    Inputs,
+    Outputs,
+    Recording,
+)
 
 MICRO = 1e6
 
@@ -40,7 +48,10 @@ class Taken(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Request to begin a new file, with the robot as it is before step `number`."""
+    """The robot as it is before step `number`, so that a new file can begin there.
+
+    If the current file goes on, it gets the robot as a checkpoint.
+    """
 
     number: int
     state: bytes
@@ -52,7 +63,7 @@ class Start(NamedTuple):
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
     """Split the recorder's queue at each `Start`, and yield each `Start` with its steps.
 
-    The first group has None instead of a `Start`: its steps continue the current file.
+    The first group has None instead of a `Start`.
     """
     start: Start | None = None
     steps: list[Taken] = []
@@ -167,6 +178,11 @@ def input_names(inputs: Inputs, before: int) -> int:
     ]
     # Most steps have no name. JSON keeps the ends of the names apart.
     return zlib.crc32(msgspec.json.encode(names), before) if names else before
+
+
+def count_superseded(commands: Sequence[Command]) -> int:
+    """Return how many commands of a step a newer command of the same sender follows."""
+    return len(commands) - len({(command.source, command.sender) for command in commands})
 
 
 def microposes(estimates: Sequence[Estimate]) -> tuple[Micropose, ...]:

@@ -84,7 +84,9 @@ class Recorder:
         self._failed_inputs: Inputs | None = None
         """Inputs of the step in which the daemon failed."""
         self._wants_state = False
-        """The thread sets this to begin a new file. `step` queues a robot's state and clears it."""
+        """The thread sets this for a new file or a checkpoint. `step` queues a robot's state and
+        clears it.
+        """
         self._writer = StepWriter(config, self._events.append, self._request_state, started_ns)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)

@@ -26,6 +26,7 @@ from acsard.recording.recorded_steps import (
     Status,
     Step,
     checksum,
+    count_superseded,
     input_names,
     microposes,
     status_of,
@@ -124,11 +125,13 @@ class Comparison(Struct):
 def replay_step(robot: Robot, step: Step) -> Outputs:
     """Run a recorded step on the robot, and return its outputs.
 
-    The robot's counters of sent and superseded lines are increased as the daemon's control loop
-    increased them during the recorded step.
+    The robot's counters of sent and superseded lines and of superseded commands are increased as
+    the daemon's control loop increased them during the recorded step.
     """
-    outputs = robot.step(step.inputs)
     recorded, inputs = step.recorded, step.inputs
+    if superseded := count_superseded(inputs.commands):
+        robot.counters["commands_superseded"] += superseded
+    outputs = robot.step(inputs)
     if recorded.sent is not None:
         robot.counters["lines_sent"] += 1
     elif recorded.line is not None and inputs.tick and inputs.port_open:
@@ -143,15 +146,19 @@ class Replay:
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
         """Start with `robot` and the guard's `memory`, or with a new robot of `config`."""
-        self.robot = robot or Robot(config)
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step."""
         self.comparison = Comparison()
-        self._config = self.robot.config
-        self._guard = Guard(self.robot.session.codec.stop, self._config, memory)
+        self.resume(robot or Robot(config), memory)
         self._checksum = self._names = 0
         self._pose: Micropose = (0, 0, 0)
         """The last replayed pose."""
+
+    def resume(self, robot: Robot, memory: Memory | None) -> None:
+        """Go on with this robot and its guard's memory, because steps before it are missing."""
+        self.robot = robot
+        self._config = robot.config
+        self._guard = Guard(robot.session.codec.stop, robot.config, memory)
 
     def step(self, step: Step) -> Difference | None:
         """Replay a step.

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from acsard.core.config.live import flat
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
-from acsard.core.formatting import listed, printable
-from acsard.core.values import Event
+from acsard.core.formatting import listed, many, printable
+from acsard.core.values import NS_PER_S, Event
+from acsard.recording.file_replay import Gap
 from acsard.recording.recorded_steps import MICRO
 from acsard.recording.replay import Comparison, Difference, Seen, fastest
 
@@ -56,6 +57,30 @@ def explain_verdict(other: bool) -> str:
         f"{computed} from the recorded inputs, and compared with the recorded one. "
         "The names in the inputs are compared with a checksum.)"
     )
+
+
+def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
+    """Describe in a sentence what the gaps cost, or return "" if there is none.
+
+    `how` says what did not happen to the steps in the gaps, for example "not compared".
+    """
+    if not gaps:
+        return ""
+    seconds = sum(gap.end_ns - gap.begin_ns for gap in gaps) / NS_PER_S
+    unreadable, skipped = sum(gap.unreadable for gap in gaps), sum(gap.skipped for gap in gaps)
+    lines = sum(gap.lines for gap in gaps)
+    parts = []
+    if unreadable:
+        parts.append(f"{many(unreadable, 'step')} cannot be read")
+    if skipped:
+        parts.append(
+            f"{many(skipped, 'step')} with {many(lines, 'line')} can be read, but come before the "
+            "next state of the robot"
+        )
+    if any(gap.end_lost for gap in gaps):
+        parts.append("the end of the recording cannot be read and may have more steps")
+    because = f" ({'; '.join(parts)})" if parts else ""
+    return f"{how}: {seconds:.1f} s in {many(len(gaps), 'damaged place')}{because}"
 
 
 def describe_difference(difference: Difference, began_ns: int) -> list[str]:

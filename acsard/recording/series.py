@@ -40,18 +40,16 @@ class Series(Recording):
         self.paths = list(paths)
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the messages of all files as `Recording.messages` does.
-
-        Only the state at the beginning of the first file is among them.
-        """
+        """Yield the messages of all files as `Recording.messages` does."""
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
         for path in self.paths:
-            part = Recording(_present(path))
+            part, counted = Recording(_present(path)), 0
             for message in part.messages():
-                if message[0] != "state" or path == self.paths[0]:
-                    yield message
-            self.damaged += part.damaged
+                self.damaged += part.damaged - counted
+                counted = part.damaged
+                yield message
+            self.damaged += part.damaged - counted
             self.ended, self.cut, self.why = part.ended, part.cut, part.why
             self.unfinished = part.unfinished
 

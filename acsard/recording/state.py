@@ -1,4 +1,7 @@
-"""Encodes a robot between two steps as bytes, and decodes it, for files that begin during a drive.
+"""Encodes a robot between two steps as bytes, and decodes it.
+
+A file that begins during a drive begins with such a robot, and every file has one about every 20 s,
+from which a replay goes on behind a damaged place.
 
 `freeze` uses pickle, which encodes a robot in a fraction of a millisecond. `thaw` does not use
 pickle, because a forged file could run code through it. It uses `unpickling.py`, which makes only
@@ -12,7 +15,10 @@ import io
 import pickle
 import sys
 from collections import Counter, deque
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+import msgspec
+from msgspec import Meta, Struct
 
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
@@ -61,6 +67,35 @@ class State(NamedTuple):
 
     robot: Robot
     memory: Memory
+
+
+class Checkpoint(Struct, frozen=True, array_like=True):
+    """A robot between two steps, as the channel `state` of a recording holds it."""
+
+    number: Annotated[int, Meta(ge=0)]
+    """Number of the step that follows."""
+    data: bytes
+    """The robot and its guard's memory, encoded by `freeze`."""
+
+    def encode(self) -> bytes:
+        """Encode the checkpoint as a message of the channel `state`."""
+        return msgspec.msgpack.encode(self)
+
+
+_checkpoint = msgspec.msgpack.Decoder(Checkpoint)
+
+
+def checkpoint(data: bytes) -> Checkpoint:
+    """Decode a message of the channel `state`, but not the robot in it.
+
+    Raises `StateError` if the bytes are damaged.
+    """
+    try:
+        return _checkpoint.decode(data)
+    except msgspec.MsgspecError as error:
+        raise StateError(
+            f"this version cannot read the state at its start: {short(error)}"
+        ) from None
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:

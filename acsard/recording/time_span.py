@@ -16,6 +16,7 @@ from acsard.core.values import NS_PER_S, AcsardError, Instant
 from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import Step
 from acsard.recording.rows import BatchError, decode
+from acsard.recording.timeline import SET_NS
 
 
 class Span(NamedTuple):
@@ -56,8 +57,8 @@ When = Offset | TimeOfDay | Moment
 """A time that a person typed."""
 
 EXAMPLES = (
-    '14:05, 14:05:30, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21, "2 h ago", or a number of '
-    "seconds after the beginning of the recording"
+    '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21, "2 h ago", or a '
+    "number of seconds after the beginning of the recording"
 )
 
 _CLOCK = re.compile(r"(\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?")
@@ -79,7 +80,8 @@ def parse_when(text: str, now_s: float) -> When:
     if re.fullmatch(r"\d+(\.\d+)?", words):
         return Offset(float(words))
     if ago := _AGO.fullmatch(words):
-        moment = now_s - float(ago[1]) * _UNIT_S[ago[2]]
+        # No recording is older than 1970, and older times have no date everywhere.
+        moment = max(0.0, now_s - float(ago[1]) * _UNIT_S[ago[2]])
         return Moment(moment, moment)
     day, _, rest = words.partition(" ")
     if ":" in day:
@@ -166,8 +168,9 @@ def clock(seconds: float, day: bool = False) -> str:
     return time.strftime("%H:%M:%S", local) + f".{int(seconds % 1 * 1000):03}"
 
 
-SET_NS = 5 * NS_PER_S
-"""Difference between wall clock and monotonic clock that counts as a clock step, ns."""
+def date(seconds: float) -> str:
+    """Return the local date of a time in s since 1970."""
+    return time.strftime("%Y-%m-%d", time.localtime(seconds))
 
 
 class Stretch(NamedTuple):

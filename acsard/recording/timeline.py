@@ -1,7 +1,8 @@
 """Describes a recording as a timeline of short texts.
 
 The timeline has an entry for each event of the log, and one for each drive. A drive is a time in
-mode `driving`; its entry gives the distance and the duration.
+mode `driving`; its entry gives the distance and the duration. `acsard recording show`, the report
+and the exported `log` print the same entries, so a reader needs only one of them.
 """
 
 from __future__ import annotations
@@ -9,15 +10,19 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated
 
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from acsard.core.formatting import many
+from acsard.core.config.settings import Config
+from acsard.core.formatting import lasting, many, printable_bytes
 from acsard.core.link.link_diagnosis import is_ours
-from acsard.core.values import NS_PER_S, Event, Instant
+from acsard.core.link.session import IDENTITY
+from acsard.core.motion.arbiter_text import MAX_SENDER
+from acsard.core.ros.shapes import how_often
+from acsard.core.values import NS_PER_S, Command, Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
@@ -26,6 +31,27 @@ FURTHEST_S = 2**63 / 1e9
 
 REASON_NS = NS_PER_S
 """Shortest time between two entries about a reason. Two sources may alternate in every step."""
+
+POSE_NS = NS_PER_S
+"""Longest time for which the entry `continues` waits for a pose. Without a link there is none."""
+
+SET_NS = 5 * NS_PER_S
+"""Difference between wall clock and monotonic clock that counts as a clock step, ns."""
+
+WAITS_NS = NS_PER_S
+"""Time for which a sender must send speeds in vain before the timeline has an entry about it.
+
+A sender that takes over from another one overlaps with it for a shorter time.
+"""
+
+SILENT_NS = NS_PER_S
+"""Pause after which a sender begins anew to wait."""
+
+MAX_IDENTITY_BYTES = 256
+"""Largest length of a line with which a microcontroller names itself. The firmware's has 150."""
+
+MAX_WAITING = 16
+"""Largest number of senders that are watched. A stranger may send under any number of names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
 """A number, but not a digit of a name.
@@ -44,14 +70,23 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
 
     The names of the timeline are `link_late` for a `link_stale` that this computer caused,
     `link_heard` for a further event about a link that is already lost, `reason` for a change of the
-    reason without a change of the mode, and `start`, `drive`, `gap` and `end`.
+    reason without a change of the mode, `waits` for a sender that must wait while another one
+    drives, `board` for the words of a microcontroller about itself and its last reset, `clock` for
+    a clock that was set, `continues` for the first step of a recording that continues another one,
+    `cut` for a recording without an ordinary end, and `start`, `drive`, `gap` and `end`.
     """
     text: str
     level: str = "info"
     by: str = ""
-    """The client that caused the event, or the source that commanded the drive."""
+    """The client that caused the event, or the sources that commanded the drive."""
     count: int = 1
     """Number of equal events that this entry stands for."""
+
+    @property
+    def sentence(self) -> str:
+        """The text, the client and the number of events as one text, as in a line of the log."""
+        by = f" (by {self.by})" if self.by else ""
+        return f"{self.text}{by}{how_often(self.text, self.count)}"
 
 
 def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
@@ -86,61 +121,252 @@ class ReasonChanges:
         self._mode = self._reason = ""
         """Mode and reason that the timeline has, the reason without its numbers."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry."""
+        """Monotonic time of the last entry, or of the last event that the link is lost."""
+        self._sender = ("", "")
+        """Source of the last step that had one, and its last sender."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield an entry if the reason changed and the mode did not. The events come before it."""
-        mode, text, _, _ = step.recorded.status
+        mode, text, _, source = step.recorded.status
         now, reason = step.inputs.now, NUMBER.sub("#", text)
+        for command in step.inputs.commands:
+            if command.source == source:
+                self._sender = (source, command.sender)
         if reason == self._reason and mode == self._mode:
             return
         reported = mode != self._mode or any(event.text == text for event in step.recorded.events)
-        if not reported and mode != "driving":
+        if reported and mode == "waiting":
+            # A link that was lost for less than a second has one reason, which its event reports.
+            self._reported_ns = now.mono_ns
+        elif not reported and mode != "driving":
             if now.mono_ns - self._reported_ns < REASON_NS:
                 return
             self._reported_ns = now.mono_ns
-            yield TimelineEntry(now.wall_ns / 1e9, "reason", f"{mode}: {text}")
+            by = _named(*self._sender) if source and source == self._sender[0] else source
+            yield TimelineEntry(now.wall_ns / 1e9, "reason", f"{mode}: {text}", by=by)
         self._mode, self._reason = mode, reason
+
+
+_IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
+
+
+class BoardIdentity:
+    """Detects the line with which a microcontroller names itself.
+
+    The board sends it when it has started, and when the daemon asks. The robot reports it only if
+    the link was up. A board that starts slowly loses the link first, so only its own words say why
+    it was silent.
+    """
+
+    def __init__(self) -> None:
+        self._data = b""
+        """The last received bytes that may be the beginning of such a line."""
+        self._reported_ns = -REASON_NS
+        """Monotonic time of the last entry."""
+
+    def step(self, step: Step) -> Iterator[TimelineEntry]:
+        """Yield an entry with the line, at most one each second."""
+        now = step.inputs.now
+        for read in step.inputs.received:
+            data = self._data + read.data
+            begin = data.find(IDENTITY[:1])
+            if begin < 0:
+                # Most reads.
+                self._data = b""
+                continue
+            self._data = data[begin:][-MAX_IDENTITY_BYTES:]
+            found = _IDENTITY.search(self._data)
+            if found is None:
+                continue
+            self._data = self._data[found.end() :]
+            reported = any(event.name == "mcu_restarted" for event in step.recorded.events)
+            if reported or now.mono_ns - self._reported_ns < REASON_NS:
+                continue
+            self._reported_ns = now.mono_ns
+            words = printable_bytes(found[1], MAX_IDENTITY_BYTES)
+            text = f"the microcontroller names itself, as after a start or a question: {words}"
+            yield TimelineEntry(now.wall_ns / 1e9, "board", text)
+
+
+class _Waiting(Struct):
+    """A sender that sends speeds while the robot follows another one."""
+
+    since_ns: int
+    """Monotonic time of its first speed in vain, ns."""
+    last_ns: int
+    """Monotonic time of its last speed in vain, ns."""
+    reported: bool = False
+
+
+class WaitingSenders:
+    """Detects senders whose speeds do not move the robot because it follows another sender."""
+
+    def __init__(self, priorities: Mapping[str, int]) -> None:
+        self._priorities = priorities
+        self._commander = ""
+        """Source and sender that the robot follows, as in the event `commander`."""
+        self._waiting: dict[tuple[str, str], _Waiting] = {}
+        self._reported_ns = -REASON_NS
+        """Monotonic time of the last entry."""
+
+    def step(self, step: Step) -> Iterator[TimelineEntry]:
+        """Yield an entry for each sender that has waited for `WAITS_NS`, once until it ends."""
+        for event in step.recorded.events:
+            if event.name == "commander":
+                # If the log combined several changes, `by` has several names.
+                self._commander = event.by
+        mode, _, _, source = step.recorded.status
+        if mode != "driving":
+            self._waiting.clear()
+            return
+        for command in step.inputs.commands:
+            yield from self._command(command, source, step.inputs.now)
+
+    def _command(self, command: Command, source: str, now: Instant) -> Iterator[TimelineEntry]:
+        key, known = (command.source, command.sender), self._known(source)
+        shared = command.source == source
+        speed = command.twist.linear or command.twist.angular
+        why = self._why(command.source, source)
+        if not (speed and why) or (shared and (not known or self._commander == _named(*key))):
+            self._waiting.pop(key, None)
+            return
+        waiting = self._waiting.get(key)
+        if waiting is None or now.mono_ns - waiting.last_ns > SILENT_NS:
+            if waiting is None and not self._has_room(now):
+                return
+            waiting = self._waiting[key] = _Waiting(now.mono_ns, now.mono_ns)
+        waiting.last_ns = now.mono_ns
+        since_ns = max(waiting.since_ns + WAITS_NS, self._reported_ns + REASON_NS)
+        if waiting.reported or now.mono_ns < since_ns:
+            return
+        waiting.reported, self._reported_ns = True, now.mono_ns
+        followed = self._commander if known else source
+        text = f"sends speeds and must wait: the robot follows {followed}, {why}"
+        yield TimelineEntry(now.wall_ns / 1e9, "waits", text, by=_named(*key))
+
+    def _has_room(self, now: Instant) -> bool:
+        """Return whether one more sender can be watched, after forgetting the silent ones."""
+        if len(self._waiting) >= MAX_WAITING:
+            oldest_ns = now.mono_ns - SILENT_NS
+            kept = {key: one for key, one in self._waiting.items() if one.last_ns >= oldest_ns}
+            self._waiting = kept
+        return len(self._waiting) < MAX_WAITING
+
+    def _known(self, source: str) -> bool:
+        """Return whether the sender that the robot follows on this source is known."""
+        return self._commander.startswith(f"{source} (") and ", " not in self._commander
+
+    def _why(self, waiting: str, followed: str) -> str:
+        """Return why a source waits for the followed one.
+
+        Returns "" if it does not wait: the robot refuses the commands of an unknown source, and
+        those of a source with the higher priority that it does not follow.
+        """
+        one, other = self._priorities.get(waiting), self._priorities.get(followed)
+        if one is None or other is None or one > other:
+            return ""
+        return "which came first" if one == other else "which has the higher priority"
+
+
+def _named(source: str, sender: str) -> str:
+    return f"{source} ({sender[:MAX_SENDER]})"
 
 
 class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: Config | None = None) -> None:
+        """Prepare for the first step.
+
+        `config` has the priorities of the sources; without it there is no entry `waits`.
+        """
+        sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
         self._began_ns: int | None = None
         """Monotonic time at which the present drive began, ns; None between drives."""
         self._distance_m = 0.0
         """Distance of the present drive."""
-        self._source = ""
+        self._sources: list[str] = []
+        """The sources that commanded the present drive, in the order in which they began."""
         self._since = ""
         """Words for a drive that began before the first step; "" for any other drive."""
         self._now: Instant | None = None
         """Time of the last step."""
         self._shutting_down = False
+        self._continued: Step | None = None
+        """First step of a recording that continues another one, until its entry is made."""
         self._losses = LinkLosses()
+        self._board = BoardIdentity()
         self._reasons = ReasonChanges()
+        self._waiting = WaitingSenders({source.name: source.priority for source in sources})
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield the entries of a step. The steps must come in order."""
+        if self._number is None and step.number > 0:
+            self._continued = step
+        entries, first = list(self._entries(step)), self._continued
+        if first is not None:
+            waited_ns = step.inputs.now.mono_ns - first.inputs.now.mono_ns
+            if entries or step.recorded.poses or waited_ns > POSE_NS:
+                yield from self._continues()
+        yield from entries
+
+    def _continues(self) -> Iterator[TimelineEntry]:
+        """Yield the entry that says what the robot does as the recording begins."""
+        first, self._continued = self._continued, None
+        if first is None:
+            return
+        mode, reason, link, source = first.recorded.status
+        does = mode if mode == "driving" else f"{mode} ({reason})"
+        at = "the pose is not known"
+        if self._pose is not None:
+            x, y, yaw = [value / MICRO for value in self._pose]
+            at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
+        text = f"an earlier recording goes on here: {does}, link {link}, {at}"
+        yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)
+
+    def _entries(self, step: Step) -> Iterator[TimelineEntry]:
         wall_s = step.inputs.now.wall_ns / 1e9
         if self._number is None and step.number == 0:
             yield TimelineEntry(wall_s, "start", "the daemon starts")
-        elif self._number is not None and step.number != self._number + 1:
+        elif self._number is not None and self._now and step.number != self._number + 1:
             missing = step.number - self._number - 1
-            gap = f"{many(missing, 'step is', 'steps are')} missing before this one"
+            seconds = (step.inputs.now.mono_ns - self._now.mono_ns) / 1e9
+            gap = (
+                f"{many(missing, 'step is', 'steps are')} missing before this one: {seconds:.1f} s"
+            )
             yield TimelineEntry(wall_s, "gap", gap, "warning")
+        yield from self._clock(step.inputs.now)
         yield from self._drive(step, wall_s)
         self._number, self._now = step.number, step.inputs.now
         for event in step.recorded.events:
             entry = entry_of(event, step.inputs.now.wall_ns)
             repeated = self._losses.repeated(entry.name)
             yield replace(entry, name="link_heard") if repeated else entry
+        yield from self._board.step(step)
         yield from self._reasons.step(step)
+        yield from self._waiting.step(step)
         if step.inputs.shutting_down and not self._shutting_down:
             yield TimelineEntry(wall_s, "end", "the daemon received the request to end")
         self._shutting_down = step.inputs.shutting_down
+
+    def _clock(self, now: Instant) -> Iterator[TimelineEntry]:
+        """Yield an entry if the wall clock was set since the last step."""
+        last = self._now
+        if last is None:
+            return
+        ahead_ns = now.wall_ns - now.mono_ns - last.wall_ns + last.mono_ns
+        if abs(ahead_ns) < SET_NS:
+            return
+        way = "forward" if ahead_ns > 0 else "back"
+        # The monotonic clock stands while the computer is suspended.
+        slept = ", or this computer was suspended" if ahead_ns > 0 else ""
+        text = (
+            f"the clock of this computer was set {way} by {lasting(abs(ahead_ns) / NS_PER_S)}"
+            f"{slept}: the entries before this one have the time of the old clock"
+        )
+        yield TimelineEntry(now.wall_ns / 1e9, "clock", text, "warning")
 
     def _drive(self, step: Step, wall_s: float) -> Iterator[TimelineEntry]:
         for pose in step.recorded.poses:
@@ -152,19 +378,31 @@ class TimelineWriter:
         now_ns = step.inputs.now.mono_ns
         if mode == "driving":
             if self._began_ns is None:
-                self._began_ns, self._distance_m, self._source = now_ns, 0.0, source
+                self._began_ns, self._distance_m, self._sources = now_ns, 0.0, []
                 seen = self._number is not None or step.number == 0
                 self._since = "" if seen else ", counted from the beginning of this recording"
+            if source not in self._sources:
+                self._sources.append(source)
         elif self._began_ns is not None:
             text = f"drove {self._driven(now_ns)}{self._since}"
-            yield TimelineEntry(wall_s, "drive", text, by=self._source)
+            yield TimelineEntry(wall_s, "drive", text, by=", ".join(self._sources))
             self._began_ns = None
 
-    def end(self) -> Iterator[TimelineEntry]:
-        """Yield the entry of a drive that goes on at the last step, if there is one."""
-        if self._began_ns is not None and self._now is not None:
+    def end(self, ending: str = "") -> Iterator[TimelineEntry]:
+        """Yield the entries after the last step.
+
+        They are the drive that goes on there, if there is one, and `ending`, which says how the
+        recording ended other than by an ordinary end of the daemon (`Recording.ending`).
+        """
+        yield from self._continues()
+        if self._now is None:
+            return
+        wall_s = self._now.wall_ns / 1e9
+        if self._began_ns is not None:
             text = f"was driving, {self._driven(self._now.mono_ns)} so far{self._since}"
-            yield TimelineEntry(self._now.wall_ns / 1e9, "drive", text, by=self._source)
+            yield TimelineEntry(wall_s, "drive", text, by=", ".join(self._sources))
+        if ending:
+            yield TimelineEntry(wall_s, "cut", ending.removeprefix("cut: "), "warning")
 
     def _driven(self, now_ns: int) -> str:
         seconds = (now_ns - (self._began_ns or now_ns)) / 1e9
@@ -187,6 +425,16 @@ INCIDENTS = {
 
 `link_up` has no words. It is in the table because it ends the loss of a link.
 """
+
+
+SERIOUS = re.compile(r"(^|, )\d+ (stop|fault)s?\b")
+"""A stop or a fault in a summary."""
+
+
+def is_serious(text: str) -> bool:
+    """Return whether a summary has a stop or a fault."""
+    # A client may have a name that looks like a fault.
+    return SERIOUS.search(text.partition(" (stopped by ")[0]) is not None
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:

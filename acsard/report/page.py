@@ -23,9 +23,9 @@ from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
 from acsard.recording.replay_text import verdict
-from acsard.recording.time_span import WHOLE, Span, clock
+from acsard.recording.time_span import WHOLE, Span, clock, date
 from acsard.report.plot_elements import Figure
-from acsard.report.report_data import ReportData
+from acsard.report.report_data import Mark, ReportData
 from acsard.report.report_text import Clock, Origin, differences, notes, reasons, rows, summary
 from acsard.report.time_figures import TimeFigures
 
@@ -202,7 +202,7 @@ def drawn(
         raise RecordingError(
             f"{recording.path} has no step in that span of time, so there is nothing to draw"
         )
-    data.end()
+    data.end("" if data.over else recording.ending)
     remarks = [*filter(None, [recording.missing]), *replayed.notes]
     comparison = replayed.replay.comparison
     if not (comparison.same or replayed.notes or data.missing):
@@ -251,12 +251,19 @@ def _reasons(data: ReportData) -> str:
 
 
 def _events(data: ReportData, clock: Clock) -> str:
-    began, left_out, marks = data.began or 0.0, data.marks.left_out, data.marks.all()
+    left_out, marks = data.marks.left_out, data.marks.all()
+    # A recording may cross midnight, and its clock may be set.
+    dated = len({date(mark.seconds) for mark in marks}) > 1
+
+    def time_of(mark: Mark) -> str:
+        at = clock(mark.seconds, False)
+        return f"{date(mark.seconds)} {at}" if dated else at
+
     cells = [
         (
-            f'<td class="time">{escaped(clock(began + mark.t, False))}</td>',
+            f'<td class="time">{escaped(time_of(mark))}</td>',
             f'<td class="name {escaped(mark.level)}">{escaped(mark.name.replace("_", " "))}</td>',
-            f"<td>{escaped(mark.text)}</td>",
+            f"<td>{escaped(mark.words)}</td>",
             f"<td>{escaped(mark.by)}</td>",
         )
         for mark in marks

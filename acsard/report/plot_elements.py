@@ -103,7 +103,7 @@ def sentence(mark: Mark) -> str:
     """Return the text that the page shows when the user points at an event."""
     head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
     by = [label(f"by {mark.by}")] if mark.by else []
-    return "<br>".join([head, label(mark.text), *by])
+    return "<br>".join([head, label(mark.words), *by])
 
 
 def layout() -> dict[str, Any]:

@@ -14,6 +14,7 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.robot import Robot
+from acsard.core.ros.shapes import how_often
 from acsard.core.thinning import Band, Curve, Place, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist
 from acsard.recording.recorded_steps import MICRO, Step
@@ -27,6 +28,12 @@ MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "read
 
 LINKS = ("down", "stale", "booting", "up")
 """States of the link. If short spans must be merged, the first of these states wins."""
+
+MAX_EVENT_TEXT = 1000
+"""Largest length of the text of an event, because a recording may come from a stranger.
+
+The entry `continues` with the reason of a fault has 308 characters.
+"""
 
 FIRST, LAST = 30, 30
 """Number of events of each name that are kept: the first ones, and the last ones."""
@@ -46,14 +53,24 @@ class Mark(Struct, frozen=True):
     """Number of equal events that this one stands for."""
     place: Place | None
     """Place according to odometry; None before the first pose."""
+    seconds: float
+    """Wall-clock time, s since 1970, of the clock that the robot had then."""
+
+    @property
+    def words(self) -> str:
+        """The text, with the number of events if there are several."""
+        return f"{self.text}{how_often(self.text, self.count)}"
 
 
 class Marks:
     """The events of a recording. Only the first and the last events of each name are kept."""
 
     def __init__(self) -> None:
-        self._first: dict[str, list[Mark]] = {}
-        self._last: dict[str, deque[Mark]] = {}
+        self._first: dict[str, list[tuple[int, Mark]]] = {}
+        self._last: dict[str, deque[tuple[int, Mark]]] = {}
+        """The kept events of each name, with their place in the order of all events."""
+        self._count = 0
+        """Number of calls of `add`."""
         self.counts: Counter[str] = Counter()
         """Number of events of each name. A repeated event counts as often as it occurred."""
         self.left_out = 0
@@ -62,18 +79,20 @@ class Marks:
     def add(self, mark: Mark) -> None:
         """Add an event. If there are too many of its name, drop one from their middle."""
         self.counts[mark.name] += mark.count
+        self._count += 1
+        row = (self._count, mark)
         first = self._first.setdefault(mark.name, [])
         if len(first) < FIRST:
-            first.append(mark)
+            first.append(row)
             return
         last = self._last.setdefault(mark.name, deque(maxlen=LAST))
         self.left_out += len(last) == LAST
-        last.append(mark)
+        last.append(row)
 
     def all(self) -> list[Mark]:
-        """Return the kept events in the order of their times."""
-        rows = [mark for kept in (self._first, self._last) for row in kept.values() for mark in row]
-        return sorted(rows, key=lambda mark: mark.t)
+        """Return the kept events in the order in which they were added."""
+        rows = [row for kept in (self._first, self._last) for rows in kept.values() for row in rows]
+        return [mark for _, mark in sorted(rows, key=lambda row: row[0])]
 
 
 class Driven(Struct):
@@ -111,6 +130,8 @@ class ReportData:
         self.marks = Marks()
         self.began: float | None = None
         """Wall-clock time of the first collected step, s since 1970. All times `t` begin there."""
+        self.ended = 0.0
+        """Wall-clock time of the last collected step, s since 1970."""
         self.seconds = self.metres = 0.0
         """Duration of the collected steps, and distance that the robot drove in them."""
         self.driven: dict[str, Driven] = {}
@@ -119,7 +140,7 @@ class ReportData:
         """Highest measured speed of each axis, without sign."""
         self.steps = self.missing = 0
         """Number of collected steps, and of steps that are missing between them."""
-        self._timeline = TimelineWriter()
+        self._timeline = TimelineWriter(config)
         self._mono_ns = self._wall_ns = 0
         """Monotonic and wall-clock time of the first step of the recording, ns."""
         self._wall = -math.inf
@@ -161,21 +182,24 @@ class ReportData:
             self._sample(step, t, robot, refused)
             for entry in entries:
                 self.marks.add(self._mark(entry, t))
-            self.seconds = t
+            self.seconds, self.ended = t, now.wall_ns / NS_PER_S
         self._number = step.number
 
-    def end(self) -> None:
-        """Finish the data after the last step."""
+    def end(self, ending: str = "") -> None:
+        """Finish the data after the last step.
+
+        `ending` says how the recording ended other than by an ordinary end of the daemon.
+        """
         t = self.seconds
-        for entry in self._timeline.end() if self.began is not None else ():
+        for entry in self._timeline.end(ending) if self.began is not None else ():
             self.marks.add(self._mark(entry, t))
         for band in (self.modes, self.links, *self.sources.bands.values()):
             band.end(t)
         self.serial.end()
 
     def _mark(self, entry: TimelineEntry, t: float) -> Mark:
-        text, by = entry.text[:MAX_TEXT], entry.by[:MAX_TEXT]
-        return Mark(t, entry.name, text, entry.level, by, entry.count, self._place)
+        text, by = entry.text[:MAX_EVENT_TEXT], entry.by[:MAX_EVENT_TEXT]
+        return Mark(t, entry.name, text, entry.level, by, entry.count, self._place, entry.seconds)
 
     # Distance and speeds.
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.core.config.live import flat
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
 from acsard.core.formatting import lasting, listed, many
+from acsard.daemon.late_causes import cause_in
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
@@ -128,13 +130,23 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
     return sorted(found, key=lambda row: -row[3])[:MAX_REASONS]
 
 
-def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:
+def _first_of_each(marks: list[Mark], clock: Clock) -> str:
     """Return each distinct text with the time of its first occurrence."""
     first: dict[str, Mark] = {}
     for mark in marks:
         first.setdefault(mark.text, mark)
-    texts = [f"{clock(began + mark.t, False)} {mark.text}" for mark in first.values()]
+    texts = [f"{clock(mark.seconds, False)} {mark.text}" for mark in first.values()]
     return listed(texts, MAX_NAMES, "; ")
+
+
+def _late(marks: Iterable[Mark], clock: Clock) -> str:
+    """Return the causes of late periods, with the time of each, or "" if no event names one."""
+    late = [
+        replace(mark, text=cause)
+        for mark in marks
+        if mark.name == "missed_periods" and (cause := cause_in(mark.text))
+    ]
+    return f"; {_first_of_each(late, clock)}" if late else ""
 
 
 def notes(data: ReportData, origin: Origin) -> list[str]:
@@ -144,6 +156,12 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
         found.append(
             f"{many(data.missing, 'step is', 'steps are')} missing: after the missing steps, the "
             "commanded and limited speeds and the reasons of waiting sources may be wrong."
+        )
+    if data.marks.counts["clock"]:
+        found.append(
+            "The clock of the robot's computer was set during this time. The list of events has "
+            "the time of the clock at each event; the pictures go on by the clock at their "
+            "beginning."
         )
     curves = [*data.linear.values(), *data.angular.values()]
     width = max(curve.width for curve in curves)
@@ -158,7 +176,7 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
 def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, str]]:
     """Yield the label and the content of each row of the summary table."""
     began, config = data.began or 0.0, data.config
-    yield "When", f"{clock(began, True)} to {clock(began + data.seconds, True)}"
+    yield "When", f"{clock(began, True)} to {clock(data.ended, True)}"
     yield "Duration", f"{lasting(data.seconds)}, {data.steps} steps"
     yield "Distance", f"{data.metres:.2f} m, forward and backward"
     fast = data.fastest
@@ -171,7 +189,7 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     for name, title in (("fault", "Faults"), ("stop", "Stops")):
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        yield title, f"{count}: {_first_of_each(marks, began, clock)}" if count else "none"
+        yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     totals = data.serial.totals
     shares = f"{totals.sent} lines sent, {totals.good} answers, {totals.dropped} dropped"
     lost = "" if config.mcu.reply_period else f", {totals.unanswered} without an answer"
@@ -180,7 +198,7 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     yield (
         "Control loop",
         f"{config.rate_hz:g} Hz, at most {lateness.most_ms:.1f} ms late, "
-        f"{many(lateness.missed, 'period')} missed",
+        f"{many(lateness.missed, 'period')} missed{_late(data.marks.all(), clock)}",
     )
     simulated = " on the simulator" if config.mcu.simulated else f" on {config.mcu.port}"
     yield "Robot", f"{origin.robot}{simulated}"

@@ -33,7 +33,7 @@ def drive(ride: Ride) -> None:
             ride.step(typed)
             seen = ride.seen()
             if due.tell(seen, time.monotonic()):
-                width, height = _size()
+                width, height = output_size()
                 print("\n".join(page.with_help(news(seen, width), height)), flush=True)
 
 
@@ -48,13 +48,13 @@ def part(ride: Ride) -> None:
         seen, took = ride.seen(), time.monotonic() - left
         rests = seen.state is not None and seen.age < took and not moves(seen.state)
         if rests or took > PART_S:
-            print("\n".join(parting(seen, _size().columns)), flush=True)
+            print("\n".join(parting(seen, output_size().columns)), flush=True)
             return
         time.sleep(PERIOD_S)
 
 
-def _size() -> os.terminal_size:
-    """Return the size of the terminal. A file is unlimited."""
+def output_size() -> os.terminal_size:
+    """Return the size of the terminal. A file or a pipe is unlimited."""
     unlimited = os.terminal_size((NO_END, NO_END))
     return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
 

@@ -10,9 +10,9 @@ from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.top.teleop import reason
 
-HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY")
+HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "FILE", "SEEN", "WHY")
 
-ROOM = (32, 8, 6, 7, 10, 6)
+ROOM = (32, 8, 6, 7, 10, 7, 6)
 """Maximum width of each column but the last, which takes the rest. The first is as wide as its
 longest id."""
 
@@ -20,8 +20,12 @@ NAME, WHY = 12, 20
 """Minimum widths of the first and last column. A long id may not narrow the last column below its
 minimum, unless the first would fall below its own."""
 
-NARROW = (0, 1, 2, 5, 6)
+NARROW = (0, 1, 2, 6, 7)
 """Columns of a terminal that is narrower than `WIDE`."""
+
+FILE = 5
+"""Column that marks a robot whose settings differ from its configuration file. The table has this
+column only if there is such a robot."""
 
 WIDE = 72
 
@@ -48,8 +52,10 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
     There are at most `height` lines of at most `width` characters.
     """
-    shown = range(len(HEADS)) if width >= WIDE else NARROW
     cells = [HEADS, *map(told, sorted(rows, key=_order))]
+    marked = any(row[FILE] for row in cells[1:])
+    wide = [n for n in range(len(HEADS)) if n != FILE or marked]
+    shown = wide if width >= WIDE else NARROW
     widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
     rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
     rest = sum(rooms[n] + 2 for n in shown[1:])
@@ -92,8 +98,10 @@ def told(row: Row) -> tuple[str, ...]:
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
-        return (name, "-", "-", "-", printable(row.version) or "-", "never", why)
+        return (name, "-", "-", "-", printable(row.version) or "-", "", "never", why)
     state, why = row.state, reason(row.state)
+    if state.settings_differ:
+        why = f"{why}; settings: {printable(state.settings_differ)}"
     if absence := _absence(row):
         why = f"{absence}, was: {why}"
     return (
@@ -102,6 +110,7 @@ def told(row: Row) -> tuple[str, ...]:
         signed(state.linear, 2, 6),
         printable(state.link),
         printable(row.version) or "-",
+        "differs" if state.settings_differ else "",
         rough(row.age),
         why,
     )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Set as AbstractSet
 from functools import partial
 
 from aiohttp import web
@@ -107,7 +108,7 @@ class Admission:
     def __init__(
         self,
         robot: str,
-        names: frozenset[str],
+        names: AbstractSet[str],
         vault: Vault,
         acceptor: Acceptor,
         counts: Counts,

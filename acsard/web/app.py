@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Set as AbstractSet
 from gzip import decompress
 from pathlib import Path
 from typing import Annotated, Any
@@ -98,7 +99,7 @@ class Page:
         fleet: Fleet,
         counts: Counts,
         vault: Vault,
-        names: frozenset[str],
+        names: AbstractSet[str],
         acceptor: Acceptor,
         guide: Guide,
         page: Path = PAGE,

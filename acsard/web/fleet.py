@@ -123,7 +123,16 @@ class Fleet:
         if one.here is False:
             was = f"its daemon has ended; it was {state.mode}"
             return Row(robot, "gone", was, None, "", age, one.version)
-        return Row(robot, state.mode, state.reason, state.linear, state.link, age, one.version)
+        return Row(
+            robot,
+            state.mode,
+            state.reason,
+            state.linear,
+            state.link,
+            age,
+            one.version,
+            state.settings_differ,
+        )
 
     # The methods below run on Zenoh's threads.
 

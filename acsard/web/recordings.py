@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.host.threads import in_thread
-from acsard.recording.directory import PART, STAMP, listed
+from acsard.recording.directory import PART, STAMP, is_being_recorded, listed
 from acsard.recording.end_record import how_it_ends, read_end
 from acsard.web.answers import READ_S, TroubleError
 from acsard.web.callers import RefusedError, is_loopback
@@ -51,7 +51,7 @@ class BlackBox:
         place = self._place()
 
         def look() -> tuple[Path, tuple[int, int]] | None:
-            path = next((path for path in listed(place) if path.name == name), None)
+            path = next((path for path in _files(place) if path.name == name), None)
             if path is None:
                 return None
             seen = path.stat()
@@ -81,13 +81,22 @@ class BlackBox:
 
 def rows(directory: Path) -> list[Recording]:
     """Return all recordings of a directory, oldest first; raises `OSError`."""
-    return [_row(path) for path in listed(directory)]
+    return [_row(path) for path in _files(directory)]
+
+
+def _files(directory: Path) -> list[Path]:
+    """Return the recordings, or none until the recorder has made its directory."""
+    try:
+        return listed(directory)
+    except FileNotFoundError:
+        return []
 
 
 def _row(path: Path) -> Recording:
     size = path.stat().st_size
     if path.name.endswith(PART):
-        return Recording(path.name, _begun(path), None, size, "being recorded, or cut off")
+        words = "being recorded" if is_being_recorded(path, time.time()) else "no end: cut off"
+        return Recording(path.name, _begun(path), None, size, words)
     try:
         last = read_end(path)
     except RecordingError as error:

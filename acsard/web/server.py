@@ -9,7 +9,7 @@ import socket
 import ssl
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from msgspec import Struct
 from acsard.client import Client
 from acsard.core.config.settings import Config
 from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.tls import CERTIFICATE, KEY, names_in
+from acsard.daemon.bus.certificate_files import CertificateFiles
+from acsard.daemon.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import BEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
@@ -89,6 +90,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         end_with_parent(signal.SIGTERM)
         os.nice(NICE)
     counts = Counts()
+    # Take note of the files before they are read, so that no change of them is missed.
+    files = CertificateFiles(*files_in(wanted.tls))
     secure, names = _certified(wanted)
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
     hand = Hand(lambda: robots.client, counts)
@@ -116,6 +119,9 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         stack.callback(acceptor.close)
         announce([one for one, _ in places])
         stack.callback(asyncio.create_task(_tell(counts, log)).cancel)
+        if secure is not None:
+            renewing = _renew(secure, names, files, wanted.tls, log)
+            stack.callback(asyncio.create_task(renewing).cancel)
         await _until(leaving, robots, hand, page, wanted)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
@@ -198,16 +204,41 @@ def _about(wanted: Wanted) -> About:
     )
 
 
-def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, frozenset[str]]:
+def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
     """Return the TLS context and the names of this machine, apart from its loopback names.
 
     Without an HTTPS address both are empty. Raises a `MendableError` if a certificate is missing.
     """
     if not any(one.secure for one in wanted.listen):
-        return None, frozenset()
+        return None, set()
     require_certificate(wanted.listen, wanted.tls)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.load_cert_chain(f"{wanted.tls}/{CERTIFICATE}", f"{wanted.tls}/{KEY}", password="")
-    names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(wanted.tls))}
-    return context, frozenset(one for one in names if one != "localhost" and not is_loopback(one))
+    _load(context, wanted.tls)
+    return context, _names(wanted.tls)
+
+
+def _load(context: ssl.SSLContext, directory: str) -> None:
+    """Use the certificate in this directory for the next connections."""
+    context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
+
+
+def _names(directory: str) -> set[str]:
+    """Return the names of this machine and of the certificate, apart from the loopback names."""
+    names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
+    return {one for one in names if one != "localhost" and not is_loopback(one)}
+
+
+async def _renew(
+    context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
+) -> None:
+    """Use each new certificate for the connections after it, and add its names to `names`."""
+    while True:
+        await asyncio.sleep(TIDY_S)
+        if not files.renewed():
+            continue
+        # If the files have changed once more, the next look finds those.
+        with suppress(OSError, ValueError):
+            _load(context, directory)
+            names |= _names(directory)
+            log.info("configuration", text="the page has a new certificate; connections stay")

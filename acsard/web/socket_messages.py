@@ -86,6 +86,8 @@ class Row(Struct, frozen=True):
     """Seconds since the last state arrived or the daemon ended."""
     version: str
     """Version of the daemon; "" until it is reported."""
+    settings_differ: str = ""
+    """Settings in force that differ from the robot's configuration file, in words; else empty."""
 
 
 class Rows(Struct, frozen=True):

@@ -35,7 +35,7 @@ The median is reliable enough for that.
 MORE = 0.4
 """Points of a core that recording may take."""
 
-DRIVING, IDLE = 400e6, 90e6
+DRIVING, IDLE = 400e6, 115e6
 """Bytes per day that the recorder may write."""
 
 

@@ -20,7 +20,7 @@ from acsard.recording.file import About, Writing
 from acsard.recording.recorded_steps import Step, Taken
 from acsard.recording.replay import Replay
 from acsard.recording.rows import decode, encode
-from acsard.recording.state import freeze, thaw
+from acsard.recording.state import Checkpoint, freeze, thaw
 from acsard.recording.timeline import entry_of
 from tests.scenarios.world import START, World
 
@@ -34,6 +34,18 @@ WITH_ARGUMENTS: dict[str, tuple[float, ...]] = {
     "pushed": (0.2,), "stalls": (0.5, 0.12),
 }  # fmt: skip
 """An instance of every fault that needs arguments."""
+
+
+ADDED = {"start", "end", "drive", "reason", "waits", "clock", "continues", "gap", "cut", "board"}
+"""Names of the lines of the log that the export adds to the events of the robot."""
+
+LOSSES = {"link_down", "link_booting", "link_stale", "link_late", "link_heard"}
+"""Events of a lost link. The timeline gives some of them another one of these names."""
+
+
+def plain(name: str) -> str:
+    """Return the name of an event, with one name for all losses of the link."""
+    return "link" if name in LOSSES else name
 
 
 class Tape:
@@ -91,7 +103,7 @@ class Tape:
         )
         writing = Writing(path, about)
         if first:
-            writing.add("state", now.wall_ns, self.states[first])
+            writing.add("state", now.wall_ns, Checkpoint(first, self.states[first]).encode())
         taken = self.taken[:end]
         for at in range(first, len(taken), BATCH):
             batch = taken[at : at + BATCH]

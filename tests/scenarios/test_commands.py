@@ -309,6 +309,17 @@ def test_state_is_published_ten_times_a_second_and_at_once_on_change(world: Worl
     assert len(published) - before >= 1
 
 
+def test_commands_that_a_newer_one_follows_before_the_step_are_counted(world: World) -> None:
+    """The commands of another source count on their own."""
+    world.send_together([0.1, 0.2, 0.3])
+    world.send_together([0.4], source="teleop")
+    world.run(0.1)
+    assert world.state.counters["commands_superseded"] == 2
+    world.send(0.1)
+    world.run(0.1)
+    assert world.state.counters["commands_superseded"] == 2
+
+
 def test_a_zero_from_before_the_clear_does_not_count_as_neutral(world: World) -> None:
     world.call("stop")
     world.send(0.0)

@@ -13,6 +13,7 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.signature import public_name
 from acsard.core.messages.topics import SERVICES, VERBS
 from acsard.core.values import NS_PER_S, Event, EventName
+from tests.scenarios.instant_watch import InstantWatch
 from tests.scenarios.world import World
 
 LINES_A_SECOND = 6
@@ -179,6 +180,17 @@ def test_missed_periods_are_a_line_a_second_and_none_is_missing(world: World) ->
     lines = told(world, "missed_periods")
     assert len(lines) <= 4
     assert counted(lines) == world.state.counters["missed_periods"] > 60
+
+
+def test_the_cause_of_a_late_period_is_in_the_line_that_follows() -> None:
+    world = World(late_watch=InstantWatch())
+    world.run(0.2)
+    world.events.clear()
+    world.stall(0.05)
+    world.run(1.1)
+    number, cause = told(world, "missed_periods")
+    assert number.text == "4 x missed: 4 in a row"
+    assert cause.text.startswith("late: by 0.04 s, because other programs used the processor for")
 
 
 def test_a_wire_full_of_noise_is_a_line_a_second_and_none_is_missing(world: World) -> None:

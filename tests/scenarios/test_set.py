@@ -54,6 +54,15 @@ def slopes(lines: list[tuple[float, float]]) -> list[float]:
     return [(v - before) / (t - at) for (at, before), (t, v) in pairwise(lines)]
 
 
+def test_a_daemon_without_a_file_keeps_nothing_and_sets_nothing(world: World) -> None:
+    wishes = {"settings": {"limits.linear_speed": 0.4}, "keep": True}
+    reply = world.call("set", msgspec.json.encode(wishes))
+    told = "nothing is set: this daemon has no configuration file"
+    assert (reply.success, reply.message) == (False, told)
+    assert config(world).limits.linear_speed == Config().limits.linear_speed
+    assert world.call("set", msgspec.json.encode(wishes | {"keep": False})).success
+
+
 def test_a_lowered_limit_is_reached_by_the_deceleration_and_never_by_a_jump(world: World) -> None:
     world.drive(1.0, seconds=2.0)
     speeds = applied(world)

@@ -7,7 +7,7 @@ same gate as the real one. The fake MCU sets the pace of the wire.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 
 import msgspec
 
@@ -28,7 +28,9 @@ from acsard.core.simulator.true_messages import turn_rate
 from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_rules import LatchKeeper
+from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.daemon.settings_file import SettingsFile
 from acsard.recording.recorded_steps import BlackBox
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
@@ -148,7 +150,9 @@ class World:
         recorder: BlackBox | None = None,
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
+        settings_file: SettingsFile | None = None,
         wanted: Collection[str] = (),
+        late_watch: LateWatch | None = None,
     ) -> None:
         """Messages are made only for the `wanted` keys. `state` and `odom` need no key."""
         self.config = config or Config()
@@ -187,6 +191,8 @@ class World:
             recorder=recorder,
             latches=latches,
             keeper=keeper,
+            settings_file=settings_file,
+            late_watch=late_watch,
         )
         self._queries = 0
         self._moved_ns: dict[str, int] = {}
@@ -296,6 +302,16 @@ class World:
             self._moved_ns[source] = self.now_ns
         payload = msgspec.json.encode({"linear": {"x": linear}, "angular": {"z": angular}})
         self.put(f"cmd/{source}", payload, stamp_ns=stamp_ns, attachment=SIGNED)
+
+    def send_together(self, speeds: Sequence[float], source: str = "app") -> None:
+        """Send Twists that the next step of the control loop reads together."""
+        for speed in speeds:
+            payload = msgspec.json.encode({"linear": {"x": speed}, "angular": {"z": 0.0}})
+            self.bus.arrivals.append(
+                Arrival(
+                    f"cmd/{source}", True, payload, "", self.now_ns, None, "", attachment=SIGNED
+                )
+            )
 
     def put(
         self,

@@ -56,6 +56,7 @@ FIELDS = {
         "source", "sources", "refused", "counters", "certificate_expiry", "latencies",
         "gyro", "effective_track", "encoder_counts", "wheel_fault", "sender", "recording_error",
         "latch", "latch_file_error", "feedback_age",
+        "settings_differ",
     },
     "diagnostics": {"header", "status"},
     "events": {"stamp", "total", "events"},

@@ -358,7 +358,7 @@ def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) 
     assert "following acsar; not there: other" in ended.err
 
 
-@each("verb", ["top", "hz", "whoami", "set", "drive", "accuracy", "calibrate"])
+@each("verb", ["top", "hz", "whoami", "drive", "accuracy", "calibrate"])
 @each("ids", ["*", "robot1,robot2"])
 def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str, ids: str) -> None:
     words = {"hz": ["odom"]}.get(verb, [])

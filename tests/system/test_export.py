@@ -13,6 +13,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from tests.scenarios.taped import ADDED, plain
 from tests.system.harness import ROOT, Bus, Daemon, acsard, finish, until
 
 OFTEN = {"rates": {"state": 100.0, "diagnostics": 100.0}}
@@ -193,11 +194,10 @@ def test_every_state_has_the_values_of_then(both: Any) -> None:
 def test_every_event_of_then_is_in_the_log(both: Any) -> None:
     seen, _, told = both
     lines = [told.decode("/log", raw) for raw in told.data["/log"]]
-    # The export adds the lines `reason`, which the robot does not publish.
-    lines = [one for one in lines if one.name != "reason"]
-    written = [(one.stamp.sec, one.stamp.nanosec, one.name) for one in lines]
+    lines = [one for one in lines if one.name not in ADDED]
+    written = [(one.stamp.sec, one.stamp.nanosec, plain(one.name)) for one in lines]
     last = msgspec.msgpack.decode(seen["events"][-1])
-    live = [(*one["stamp"].values(), one["name"]) for one in last["events"]]
+    live = [(*one["stamp"].values(), plain(one["name"])) for one in last["events"]]
     assert "stop" in {name for *_, name in live}
     assert_among(live, written, "log")
 

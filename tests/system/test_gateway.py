@@ -14,7 +14,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.certificate_files import LOOK_NS
+from acsard.daemon.bus.tls import KEY, peer_ends_ns
 from acsard.daemon.gateway.session_health import MAX_UNANSWERED
+from acsard.machine.authority import Authority
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -87,6 +91,33 @@ def test_a_gateway_that_is_killed_is_opened_anew_and_counted(robot: Open) -> Non
     assert "ended by signal 9" in line["text"]
     with Bus(robot.daemon.endpoint) as bus:
         until(lambda: bus.count("gateway_opened") == 2, 5.0, "it is counted")
+
+
+def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> None:
+    certificates = Certificates(tmp_path / "own")
+    robot, own = Open(tmp_path, certificates), certificates.robot
+    with robot.daemon:
+        assert robot.lets_in()
+        before_ns = peer_ends_ns(robot.tls, str(own))
+        key = (own / KEY).read_bytes()
+        Authority.load(own, str).issue(own, "robot", ["127.0.0.1"], 0.5)
+        new = (own / KEY).read_bytes()
+        (own / KEY).write_bytes(key)  # as long as a person has copied only a part of the files
+        time.sleep(3 * LOOK_NS / NS_PER_S)
+        assert len(robot.daemon.events("gateway_open")) == 1
+        (own / KEY).write_bytes(new)
+        robot.daemon.gateway_opens(times=3)  # the second line says that it opens again
+        assert "opens again" in robot.daemon.events("gateway_open")[1]["text"]
+        assert robot.lets_in()
+        after_ns = peer_ends_ns(robot.tls, str(own))
+        assert before_ns is not None
+        assert after_ns is not None
+        assert after_ns < before_ns
+        with Bus(robot.daemon.endpoint) as bus:
+            until(lambda: bus.count("gateway_opened") == 2, 5.0, "it is counted")
+            # The new certificate of this test ends after half a day.
+            told = "valid for 0 days"
+            until(lambda: bus.state()["certificate_expiry"] == told, 5.0, told)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])

@@ -161,7 +161,7 @@ def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots
         f"acsard: all robots visible at {robots.endpoint}: 2 robots",
     )
     head, *rows = ended.out.splitlines()
-    assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY"]
+    assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "VERSION", "SEEN", "WHY"]
     assert [row.split()[0] for row in rows] == [ONE, TWO]
     for row in rows:
         waits = "waiting for a command"
@@ -228,6 +228,23 @@ def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> No
         assert "Traceback" not in terminal.screen + program.stderr
 
 
+def test_fleet_marks_the_robot_whose_settings_differ_from_its_file(robots: Robots) -> None:
+    def table() -> dict[str, str]:
+        out = robots.tool("fleet", "--once", who=f"{ONE},{TWO}").out.splitlines()
+        return {line.split()[0]: line for line in out}
+
+    differ = "rates.odom = 50.0, not 0.0, rates.state = 7.5, not 10.0"
+    assert robots.tool("set", "rates.state", "7.5", "rates.odom", "50", who=ONE).code == 0
+    until(lambda: "differs" in table()[ONE], 10.0, "the mark")
+    assert differ in table()[ONE]
+    assert "differs" not in table()[TWO]
+    ended = robots.tool("fleet", "--json", who=f"{ONE},{TWO}")
+    told = {one["robot_id"]: one["state"]["settings_differ"] for one in json.loads(ended.out)}
+    assert (ended.code, told) == (0, {ONE: differ, TWO: ""})
+    assert robots.tool("set", "rates.state", "10.0", "rates.odom", "0", who=ONE).code == 0
+    until(lambda: "FILE" not in table()["ROBOT"], 10.0, "no mark")
+
+
 @pytest.mark.slow
 def test_a_named_robot_that_is_absent_is_reported(robots: Robots) -> None:
     ended = robots.tool("fleet", "--once", who=f"{ONE},robot9")
@@ -256,6 +273,33 @@ def test_stop_of_several_says_who_gave_no_answer_and_ends_with_69(robots: Robots
     assert re.search(rf"^{ONE}: stopped", ended.out, re.M)
     assert "robot9: NO ANSWER" in ended.out
     assert robots.tool("call", "clear", who=ONE).code == 0
+
+
+def test_set_changes_named_robots_and_prints_a_line_for_each(robots: Robots) -> None:
+    for value in ("7.5", "10.0"):
+        ended = robots.tool("set", "rates.state", value, who=f"{TWO},{ONE}")
+        assert (ended.code, ended.err) == (0, "")
+        told = dict(line.split(": ", 1) for line in ended.out.splitlines())
+        assert list(told) == [TWO, ONE]
+        assert all(one.startswith(f"rates.state = {value} (was ") for one in told.values())
+        assert all(one.endswith("; until the next start") for one in told.values())
+    ended = robots.tool("set", "rates.state", "10.0", "--json")
+    assert [json.loads(line)["robot"] for line in ended.out.splitlines()] == [ONE, TWO]
+
+
+def test_set_ends_with_1_if_one_robot_refuses_and_with_69_if_one_does_not_answer(
+    robots: Robots,
+) -> None:
+    refusal = json.dumps({"success": False, "message": "not now"})
+    with fake(robots, refusal.encode()):
+        ended = robots.tool("set", "rates.state", "10.0", who=f"{ONE},fake")
+    assert ended.code == 1
+    assert re.search(rf"^{ONE}: nothing changes", ended.out, re.M)
+    assert re.search(r"^fake: not now$", ended.out, re.M)
+    ended = robots.tool("set", "rates.state", "10.0", who=f"{ONE},robot9")
+    assert ended.code == 69
+    assert re.search(rf"^{ONE}: nothing changes", ended.out, re.M)
+    assert re.search(r"^robot9: NO ANSWER: ", ended.out, re.M)
 
 
 def test_nothing_but_stop_goes_to_many(robots: Robots) -> None:

@@ -6,11 +6,25 @@ import os
 import signal
 import socket
 from pathlib import Path
+from unittest import mock
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 
+from acsard.daemon.bus.tls import peer_ends_ns
+from acsard.machine.authority import Authority
 from tests.system.fleet_router import ITS_NAME, certified, watched_router
-from tests.system.harness import Program, acsard, children, finish, until
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Program,
+    Tables,
+    acsard,
+    children,
+    finish,
+    free_endpoint,
+    until,
+)
 from tests.system.identities import free_tls_endpoint
 
 pytestmark = [pytest.mark.network, pytest.mark.timeout(60)]
@@ -58,6 +72,52 @@ def test_one_that_is_stopped_is_ended_and_there_again(where: Path) -> None:
         listens(router, 2)
         assert gone(first)
         assert "stopped or hung" in router.stderr
+
+
+def test_it_opens_again_with_a_new_certificate(where: Path) -> None:
+    endpoint = free_tls_endpoint()
+    with watched_router(where, endpoint) as router:
+        listens(router)
+        before_ns = peer_ends_ns(endpoint, str(where / ITS_NAME))
+        Authority.load(where, lambda: "").issue(where / ITS_NAME, ITS_NAME, ["127.0.0.1"], 0.5)
+        listens(router, 3)
+        assert "opens again with its new certificate" in router.stderr
+        after_ns = peer_ends_ns(endpoint, str(where / ITS_NAME))
+        assert before_ns is not None
+        assert after_ns is not None
+        assert after_ns < before_ns
+
+
+def test_it_stays_open_if_zenoh_refuses_a_new_certificate(where: Path) -> None:
+    endpoint, own = free_tls_endpoint(), where / ITS_NAME
+    with watched_router(where, endpoint) as router:
+        listens(router)
+        before_ns = peer_ends_ns(endpoint, str(own))
+        assert before_ns is not None
+        # OpenSSL accepts a key of this curve, and Zenoh does not.
+        authority = Authority.load(where, lambda: "")
+        with mock.patch.object(ec, "SECP256R1", ec.SECP521R1):
+            authority.issue(own, ITS_NAME, ["127.0.0.1"], 0.5)
+        until(lambda: "goes on with its old certificate" in router.stderr, 10.0, "it says so")
+        client = where / "client"
+        authority.issue(client, "client", [], 5)
+        assert peer_ends_ns(endpoint, str(client)) == before_ns
+        assert "restarted" not in router.stderr
+        authority.issue(own, ITS_NAME, ["127.0.0.1"], 0.5)
+        until(lambda: "opens again with its new certificate" in router.stderr, 10.0, "it opens")
+
+
+def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None:
+    endpoint, plain = free_tls_endpoint(), free_endpoint()
+    robot = where / "robot1"
+    Authority.load(where, str).issue(robot, "robot1", [], 5)
+    bus = {"listen": [plain], "connect": [endpoint], "tls": str(robot)}
+    with watched_router(where, endpoint) as router:
+        listens(router)
+        tables: Tables = {"robot": {"id": "robot1"}, "bus": bus}
+        with Daemon(where, config=tables, endpoint=plain), Bus(plain, robot_id="robot1") as client:
+            told = f"valid for 1 days (that of the router {endpoint})"
+            until(lambda: client.state()["certificate_expiry"] == told, 10.0, told)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])

@@ -195,13 +195,24 @@ TYPED = ("/api/state", "/api/whoami", "/api/settings", "/api/guide", "/api/recor
 """Some paths with a type of their own, which not any JSON fits."""
 
 
+async def first_recording(session: aiohttp.ClientSession) -> str:
+    """Wait until the daemon has begun its first recording, and return its name."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            async with session.get("/api/recordings") as answer:
+                assert answer.status == 200
+                rows = await answer.json()
+            if rows:
+                return str(rows[0]["name"])
+            await asyncio.sleep(0.1)
+
+
 def test_each_answer_to_a_program_is_as_it_is_described(page: Page, bus: Bus) -> None:
     seen: dict[tuple[str, str], int] = {}
 
     async def story() -> None:
         async with aiohttp.ClientSession(page.here) as session:
-            async with session.get("/api/recordings") as answer:
-                name = (await answer.json())[0]["name"]
+            name = await first_recording(session)
             for path, operations in described.DOCUMENT["paths"].items():
                 asked = path.replace("{name}", name).replace("{type}", "Twist")
                 for method in operations:
@@ -249,9 +260,7 @@ def test_no_other_page_holds_ours_in_a_frame_or_lends_it_scripts(page: Page) -> 
 def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemon) -> None:
     async def story() -> None:
         async with aiohttp.ClientSession(page.here) as session:
-            async with session.get("/api/recordings") as answer:
-                rows = await answer.json()
-            (name,) = [row["name"] for row in rows]
+            name = await first_recording(session)
             async with session.get(f"/api/recordings/{name}") as answer:
                 assert (await answer.read()).startswith(b"\x89MCAP")
 
@@ -260,8 +269,7 @@ def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemo
 
 async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
     """Request the report of the first recording; return the name and the result."""
-    async with session.get("/api/recordings") as answer:
-        name = (await answer.json())[0]["name"]
+    name = await first_recording(session)
     async with asyncio.timeout(2 * PATIENCE_S):
         while True:
             async with session.post(f"/api/recordings/{name}/report") as answer:

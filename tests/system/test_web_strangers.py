@@ -20,6 +20,8 @@ import pytest
 import websockets
 
 from acsard.core.values import ROLES, Role
+from acsard.daemon.bus.tls import peer_ends_ns
+from acsard.machine.authority import Authority
 from acsard.web.limits import (
     CONNECTIONS_ALIKE,
     CONNECTIONS_HERE,
@@ -92,6 +94,30 @@ def test_an_invitation_is_a_link_and_a_code_and_lets_in(page: Page) -> None:
 
     run(story)
     assert re.search(r"^guest +operator ", page.tokens("--tokens"), re.M)
+
+
+def test_a_new_certificate_is_used_and_open_connections_stay(page: Page, operator: str) -> None:
+    endpoint = page.away.replace("https://", "tls/").replace(NAME, "127.0.0.1")
+    before_ns = peer_ends_ns(endpoint, str(page.tls))
+    assert before_ns is not None
+
+    async def story() -> None:
+        async with hands(page, operator) as ours:
+            await ours.find(lambda said: "hello" in said)
+            names = [NAME, "renamed.local"]
+            Authority.load(page.tls, str).issue(page.tls, "robot", names, 0.5)
+            while (peer_ends_ns(endpoint, str(page.tls)) or 0) >= before_ns:
+                await asyncio.sleep(0.2)
+            await ours.say(subscribe="state", rate=50)
+            await ours.state(lambda state: True)
+        async with page.client() as session:
+            for host, status in (("renamed.local", 401), ("another.local", 403)):
+                header = {"Host": host}
+                async with session.get(f"{page.away}/api/whoami", headers=header) as answer:
+                    # The page knows the new name, and asks only there for a token.
+                    assert answer.status == status
+
+    run(story)
 
 
 def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(page: Page) -> None:

@@ -113,6 +113,31 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
         yield name, value
 
 
+class Difference(Struct, frozen=True):
+    """The values of a key in force and in the configuration file."""
+
+    its: object
+    """Value in force."""
+    ours: object
+    """Value in the file."""
+
+    def words(self, key: str) -> str:
+        """Return both values in words."""
+        # A command source that only one of them has lacks a value in the other.
+        its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
+        return f"{key} = {its}, not {ours}"
+
+
+def differences(runs: Config, file: Config) -> dict[str, Difference]:
+    """Return each dotted key whose value in force differs from the file, with both values."""
+    its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
+    return {
+        key: Difference(its.get(key), ours.get(key))
+        for key in its | ours
+        if its.get(key) != ours.get(key)
+    }
+
+
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
     """Return the configuration with these settings, and a description of the changes.
 

@@ -1,6 +1,8 @@
-"""Describes the validity of the bus's TLS certificate, for `state`, `diagnostics` and `doctor`."""
+"""Describes the validity of the bus's TLS certificates, for `state`, `diagnostics` and `doctor`."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 from acsard.core.values import NS_PER_S
 
@@ -10,20 +12,32 @@ EXPIRY_DAYS = 30
 DAY_NS = 86400 * NS_PER_S
 
 
-def expiry(ends_ns: int | None, now_ns: int) -> tuple[int, str]:
-    """Return the level (0 ok, 1 warning, 2 error) and a description of the certificate's validity.
+def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
+    """Return the level (0 ok, 1 warning, 2 error) and a description of the validity.
 
     Args:
-        ends_ns: the end of the certificate, wall-clock ns since 1970; None if it is unknown.
+        ends: the end of each certificate that TLS needs, wall-clock ns since 1970, by the name of
+            its owner. The name of the robot's own is "". It is empty if the ends are unknown.
         now_ns: the present time, wall-clock ns since 1970.
     """
-    if ends_ns is None:
+    if not ends:
         return (
             1,
             "unknown: the TLS gateway does not run, or the library that reads "
             "certificates is missing (`acsard doctor` says which)",
         )
+    whose, ends_ns = first(ends)
+    of = f" (that of {whose})" if whose else ""
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
-        return 2, f"expired {-days:.0f} days ago: TLS refuses every client"
-    return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days"
+        return 2, f"expired {-days:.0f} days ago{of}: TLS refuses every client"
+    return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days{of}"
+
+
+def first(ends: Mapping[str, int]) -> tuple[str, int]:
+    """Return the owner and the end of the certificate that ends first.
+
+    Of two that end together the named one counts, because the ends of a TLS gateway's certificates
+    arrive as one number without a name.
+    """
+    return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

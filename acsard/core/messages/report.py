@@ -6,7 +6,7 @@ Only messages with a subscriber are built. All messages of one feedback line car
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 
 from msgspec.structs import asdict
 
@@ -74,13 +74,15 @@ class Report:
     """Builds messages. It keeps only the last outputs, the last estimate and the last events."""
 
     def __init__(
-        self, config: Config, start: Instant, certificate_ends_ns: int | None = None
+        self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
     ) -> None:
-        self.certificate_ends_ns = certificate_ends_ns
-        """End of the TLS certificate by the wall clock, ns since 1970; None if it is unknown.
+        self.certificate_ends = dict(certificate_ends or {})
+        """Ends of the TLS certificates, as `expiry` takes them.
 
-        The TLS gateway reports it if the daemon may not read the certificate.
+        The TLS gateway reports the robot's own if the daemon may not read it.
         """
+        self.settings_differ = ""
+        """How the settings in force differ from the configuration file, in words; else empty."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
@@ -250,6 +252,7 @@ class Report:
             latch=0 if outputs.latches.in_force is None else outputs.latches.in_force.number,
             latch_file_error=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
+            settings_differ=self.settings_differ,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -259,7 +262,7 @@ class Report:
         """
         if not self._config.bus.tls:
             return 0, ""
-        return expiry(self.certificate_ends_ns, now.wall_ns)
+        return expiry(self.certificate_ends, now.wall_ns)
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         return diagnostics(self._config, outputs, snapshot, self._certificate(outputs.now))

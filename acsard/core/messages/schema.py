@@ -267,6 +267,11 @@ class RobotState(Message, frozen=True):
     """
     feedback_age: float | None = None
     """Seconds since the last valid feedback line; null before the first one."""
+    settings_differ: str = ""
+    """Settings in force that differ from the daemon's configuration file, in words; else empty.
+
+    If the daemon could not start again with that file, the text has the reason.
+    """
 
 
 class GatewayState(Message, frozen=True):
@@ -368,6 +373,8 @@ class Settings(Message, frozen=True):
     """New values of settings, by their dotted keys in `acsard.toml`."""
 
     settings: Annotated[dict[str, Plain], FEW]
+    keep: bool = False
+    """Whether the daemon also writes them into its configuration file."""
 
 
 class Info(Message, frozen=True):

@@ -104,7 +104,7 @@ SERVICES: dict[Verb, Service] = {
     ),
     "set": Service(
         "maintainer",
-        "change settings; the payload is {settings: {key: value}}",
+        "change settings; the payload is {settings: {key: value}}; {keep: true} writes the file",
         "Settings",
         '{"settings": {"limits.linear_speed": 0.8}}',
     ),

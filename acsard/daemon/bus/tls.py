@@ -1,8 +1,8 @@
 """Checks and reads the certificate files, and explains why a TLS endpoint cannot be reached.
 
 Zenoh has one error for all causes. `trouble` therefore repeats the connection step by step with
-Python's own TLS, and has a message for each cause. Only `ends_ns` needs a library of the optional
-extra `tls`.
+Python's own TLS, and has a message for each cause. Only the ends of certificates need a library of
+the optional extra `tls`.
 """
 
 from __future__ import annotations
@@ -50,18 +50,32 @@ def require_usable(directory: str) -> None:
                 f"cannot read {file}: {error.strerror}; make it with `acsard tls init` or "
                 "`acsard tls add`"
             ) from None
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    try:
-        context.load_verify_locations(f"{directory}/{CA}")
-        # Without a password OpenSSL would ask for the password of an encrypted key on the terminal.
-        # With an empty one it fails, which is right, because Zenoh accepts no encrypted key.
-        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
-    except (ssl.SSLError, ValueError) as error:
+    why = unusable(*files_in(directory))
+    if why:
         raise CertificateError(
-            f"the certificates in {directory} cannot be used ({error}): they are not PEM, or the "
+            f"the certificates in {directory} cannot be used ({why}): they are not PEM, or the "
             "key belongs to another certificate or has a password; make new ones with `acsard tls "
             "init` or `acsard tls add`",
-        ) from None
+        )
+
+
+def files_in(directory: str) -> tuple[Path, Path, Path]:
+    """Return the authority, the certificate and the key in a TLS directory."""
+    return Path(directory, CA), Path(directory, CERTIFICATE), Path(directory, KEY)
+
+
+def unusable(authority: Path, certificate: Path, key: Path) -> str:
+    """Return why OpenSSL cannot use these files together, or "" if it can."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_verify_locations(authority)
+        # Without a password OpenSSL would ask for the password of an encrypted key on the terminal.
+        # With an empty one it fails, which is right, because Zenoh accepts no encrypted key.
+        context.load_cert_chain(certificate, key, password="")
+    except (OSError, ValueError) as error:
+        # This includes SSLError, which is an OSError.
+        return str(error)
+    return ""
 
 
 def common_name(directory: str) -> str:
@@ -105,6 +119,8 @@ def _decoded(directory: str) -> dict[str, Any]:
     """
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_context.verify_mode = ssl.CERT_REQUIRED
+    # The name of an expired certificate is needed to say how to replace it.
+    server_context.verify_flags |= NO_CHECK_TIME
     client_context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client_context.check_hostname, client_context.verify_mode = False, ssl.CERT_NONE
     to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -123,21 +139,75 @@ def _decoded(directory: str) -> dict[str, Any]:
     return dict(server.getpeercert() or {})
 
 
-def ends_ns(directory: str) -> int | None:
-    """Return when the certificate in `directory` or that of its authority expires, ns since 1970.
+NO_CHECK_TIME = 0x200000
+"""OpenSSL's flag X509_V_FLAG_NO_CHECK_TIME, which Python's `ssl` does not name."""
 
-    The earlier of the two times counts. Returns None if a file or the optional library is missing.
+AUTHORITY = "the authority"
+"""Name of the authority's certificate in `ends`. The name of the directory's own is ""."""
+
+
+def ends(directory: str) -> dict[str, int]:
+    """Return when the certificates in `directory` expire, ns since 1970, by their names.
+
+    These are the directory's own and that of its authority. Returns {} if a file or the optional
+    library is missing.
+    """
+    try:
+        from cryptography import x509
+    except ImportError:
+        return {}
+    files = {"": CERTIFICATE, AUTHORITY: CA}
+    try:
+        found = {
+            whose: x509.load_pem_x509_certificate((Path(directory) / name).read_bytes())
+            for whose, name in files.items()
+        }
+    except (OSError, ValueError, x509.InvalidVersion):
+        return {}
+    return {whose: _ends_ns(one) for whose, one in found.items()}
+
+
+def peer_ends_ns(endpoint: str, directory: str) -> int | None:
+    """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
+
+    `directory` has the certificate of this machine. Nothing is verified, so that the end of an
+    expired certificate is known too. Returns None if the program cannot be reached or the optional
+    library is missing. It takes `PATIENCE_S` twice at most.
     """
     try:
         from cryptography import x509
     except ImportError:
         return None
+    host, port = _place(endpoint)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
-        files = [(Path(directory) / name).read_bytes() for name in (CERTIFICATE, CA)]
-        ends = [x509.load_pem_x509_certificate(data).not_valid_after_utc for data in files]
-    except (OSError, ValueError):
+        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
+        with (
+            socket.create_connection((host, int(port)), PATIENCE_S) as plain,
+            context.wrap_socket(plain) as link,
+        ):
+            return _ends_ns(x509.load_der_x509_certificate(link.getpeercert(True) or b""))
+    except (OSError, ValueError, x509.InvalidVersion):
         return None
-    return int(min(ends).timestamp()) * NS_PER_S
+
+
+def _ends_ns(certificate: Any) -> int:
+    """Return the end of a certificate of the library cryptography, ns since 1970."""
+    return int(certificate.not_valid_after_utc.timestamp()) * NS_PER_S
+
+
+def host_of(endpoint: str) -> str:
+    """Return the host in the text of an endpoint."""
+    return _place(endpoint)[0]
+
+
+def _place(endpoint: str) -> tuple[str, str]:
+    """Return the host and the port in the text of an endpoint."""
+    # An endpoint may end with options for Zenoh: `?metadata` and `#configuration`.
+    bare = endpoint.partition("?")[0].partition("#")[0]
+    host, _, port = bare.partition("/")[2].rpartition(":")
+    return host.strip("[]"), port
 
 
 PATIENCE_S = 2.0
@@ -162,10 +232,7 @@ def trouble(endpoint: str, directory: str) -> str:
     `directory` has the client's certificate. Returns "" if this function finds no fault. It takes a
     few seconds at most.
     """
-    # An endpoint may end with options for Zenoh: `?metadata` and `#configuration`.
-    bare = endpoint.partition("?")[0].partition("#")[0]
-    host, _, port = bare.partition("/")[2].rpartition(":")
-    host = host.strip("[]")
+    host, port = _place(endpoint)
     try:
         plain = socket.create_connection((host, int(port)), PATIENCE_S)
     except socket.gaierror:
@@ -221,7 +288,7 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
                 f"({now}); if the clock is right, run `acsard tls renew` on the machine that has "
-                "ca-key.pem, and restart the daemon"
+                "ca-key.pem (`--name NAME` for one of a fleet), which says what to do next"
             )
         case code if code == NOT_YET:
             return (
@@ -233,7 +300,7 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
             return (
                 f"the certificate of the server is not for {host}; connect to a name or address "
                 f"that the certificate contains, or run `acsard tls renew --address {host}` on the "
-                "robot and restart the daemon"
+                "robot, which says what to do next"
             )
     return (
         f"the certificate of {host} comes from another authority than {directory}/{CA} "

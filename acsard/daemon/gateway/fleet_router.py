@@ -20,6 +20,7 @@ from pathlib import Path
 import zenoh
 
 from acsard.core.values import ROLES, Role
+from acsard.daemon.bus.certificate_files import CertificateFiles
 from acsard.daemon.bus.zenoh_sessions import first_line
 from acsard.daemon.gateway.session_health import Events, Observation, SessionHealth
 from acsard.host import clock
@@ -94,6 +95,9 @@ ROUTER_EVENTS: Events = {
     # "alone" is absent because the router does not wait for a daemon.
 }
 
+CERTIFICATE_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
+"""Keys of Zenoh's `transport/link/tls` with the files of a listening endpoint."""
+
 AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
 """Protocol and address of an endpoint, without its settings."""
 
@@ -151,6 +155,7 @@ class Router:
                 'listen: { endpoints: ["tls/..."] }'
             )
         self._endpoints: list[str] = endpoints
+        self._files = self._certificate_files()
         self.where = ", ".join(endpoints)
 
     def ready(self) -> bool:
@@ -192,6 +197,20 @@ class Router:
         except zenoh.ZError:
             return False
         return True
+
+    def _certificate_files(self) -> CertificateFiles | None:
+        """Return the files for which this router listens, or None if it names none."""
+        tls = json.loads(self._config.get_json("transport/link/tls")) or {}
+        named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]
+        return CertificateFiles(*named) if len(named) == len(CERTIFICATE_FILES) else None
+
+    def renewed(self) -> bool:
+        """Return whether new certificates are in the files that the configuration names."""
+        return self._files is not None and self._files.renewed()
+
+    def refused(self) -> str:
+        """Return why the new certificates cannot be used, or "" if they can."""
+        return "" if self._files is None else self._files.refused()
 
     def observe(self, session: zenoh.Session) -> Observation:
         """Return the connections of the router."""

@@ -18,6 +18,7 @@ from typing import Protocol
 
 import zenoh
 
+from acsard.core.values import Event
 from acsard.daemon.gateway.session_health import Events, Observation, SessionHealth
 from acsard.host import clock
 from acsard.host.child import Parent, end_with_parent
@@ -57,6 +58,12 @@ class Listener(Protocol):
 
     def observe(self, session: zenoh.Session) -> Observation:
         """Return the state of the session. This call may never return."""
+
+    def renewed(self) -> bool:
+        """Return whether the session must be opened again, because it has a new certificate."""
+
+    def refused(self) -> str:
+        """Return why a session cannot be opened with the new certificate, or "" if it can."""
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
         """Publish the state for the daemon, if there is one. This call may never return."""
@@ -106,8 +113,20 @@ class ListenerProcess:
             if event is not None:
                 self._log.event(event)
                 return Exit.FAILURE
+            if self._listener.renewed() and not self._refused():
+                text = "opens again with its new certificate; all clients are disconnected"
+                self._log.info(self._listener.events["open"], text=text)
+                return Exit.FAILURE
             before_ns = now_ns
         return Exit.OK
+
+    def _refused(self) -> bool:
+        """Return whether the new certificate cannot be used, and log why."""
+        why = self._listener.refused()
+        if why:
+            text = f"goes on with its old certificate, because it cannot use the new one: {why}"
+            self._log.event(Event(self._listener.events["open"], text, "warning"))
+        return bool(why)
 
     def _leave(self, *_: object) -> None:
         self._leaving = True

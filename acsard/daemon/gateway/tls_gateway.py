@@ -21,7 +21,8 @@ from acsard.core.messages.topics import full_key
 from acsard.core.ros.transports import command_keys
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.access import gateway_access
-from acsard.daemon.bus.tls import ends_ns, require_usable
+from acsard.daemon.bus.certificate_files import CertificateFiles
+from acsard.daemon.bus.tls import ends, files_in, require_usable
 from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
 from acsard.daemon.gateway.session_health import GATEWAY_EVENTS, Observation, SessionHealth
 from acsard.host import clock
@@ -53,6 +54,7 @@ class Gateway:
         """
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
+        self._files = CertificateFiles(*files_in(config.bus.tls))
         self._opened_ns = 0
         self._publisher: Any = None
         self._ends_ns = 0
@@ -88,10 +90,18 @@ class Gateway:
         unanswered = self._probe.unanswered(session, clock.mono_ns()) if local else 0
         return Observation(clock.mono_ns(), holders, bool(local), unanswered)
 
+    def renewed(self) -> bool:
+        """Return whether new certificates are in `bus.tls`. Zenoh cannot use them in a session."""
+        return self._files.renewed()
+
+    def refused(self) -> str:
+        """Return why the new certificates cannot be used, or "" if they can."""
+        return self._files.refused()
+
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
         """Publish the number of connections. The daemon shows it in `state`."""
         if self._publisher is None:
-            self._ends_ns = ends_ns(self._config.bus.tls) or 0
+            self._ends_ns = min(ends(self._config.bus.tls).values(), default=0)
             key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
             encoding = encoding_name("msgpack", kind)
             self._publisher = session.declare_publisher(key, encoding=encoding)

@@ -75,6 +75,7 @@ export function cards(list, robots, own, here) {
       one.link ? `link ${one.link}` : "",
       one.version ? `version ${one.version}` : "",
       typeof one.age === "number" ? `seen ${ago(one.age)}` : "",
+      one.settings_differ ? `settings: ${one.settings_differ}` : "",
     ];
     const card = before.get(one.robot) ?? empty(one.robot, own);
     const [, mode, why, what] = card.children;

@@ -61,3 +61,13 @@ def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
 @each("code", list(Exit))
 def test_a_verb_may_end_with_any_code(code: Exit) -> None:
     assert ExitError(code, "so").code is code
+
+
+def test_an_unknown_option_names_the_help_that_lists_the_known_ones(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["recording", "show", "--stops"])
+    assert ended.value.code == Exit.USAGE
+    told = "unrecognized arguments: --stops; `acsard recording --help` lists the options"
+    assert told in capsys.readouterr().err

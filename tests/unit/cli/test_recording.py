@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import shutil
@@ -16,12 +17,13 @@ from msgspec.structs import replace
 from acsard.cli import main
 from acsard.cli.recording import SERVICE
 from acsard.core.config.settings import Config, RecordConfig
-from acsard.core.values import Event
+from acsard.core.values import NS_PER_S, Event
 from acsard.host.errors import Exit
 from acsard.recording.directory import Ring
-from acsard.recording.file import Recording, Writing
+from acsard.recording.file import About, Recording, Writing
 from acsard.recording.recorded_steps import Taken, Unfinished
 from acsard.recording.recovery import recover
+from acsard.recording.timeline import is_serious
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 
@@ -46,7 +48,8 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tape.write(path, Config())
     path.rename(path.with_name(path.name + ".part"))
     path = path.with_name(path.name + ".part")
-    path.write_bytes(path.read_bytes()[:-2000])
+    # The end of the file takes 5600 bytes.
+    path.write_bytes(path.read_bytes()[:-6400])
     return where
 
 
@@ -59,14 +62,78 @@ def log(capsys: pytest.CaptureFixture[str], where: Path, *words: str) -> tuple[i
 def test_the_list_has_a_line_for_each_recording_with_its_events(
     where: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    set_age(where, 60.0)
     code, out, _ = log(capsys, where)
     first, second = out.splitlines()
     assert code == 0
     assert "000001-20270115T080000Z.mcap" in first
-    assert first.endswith("start, 1 change of commander, 1 stop (stopped by unnamed (native))")
+    assert first.endswith("  ! start, 1 change of commander, 1 stop (stopped by unnamed (native))")
     assert second.endswith(
-        "start, 1 change of commander  [no end: cut off, or still being recorded]"
+        "    start, 1 change of commander  [no end: cut off, or still being recorded]"
     )
+    set_age(where, 2.0)
+    assert log(capsys, where)[1].endswith("start, 1 change of commander  [being recorded]\n")
+
+
+def set_age(where: Path, seconds: float) -> None:
+    """Make the unfinished recording look as if it was written this long ago."""
+    (part,) = where.glob("*.part")
+    os.utime(part, (time.time() - seconds,) * 2)
+
+
+@pytest.mark.parametrize("cut", ["crash", "bug", "disk"])
+def test_the_list_marks_a_crash(
+    cut: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A full disk leaves the robot with its daemon."""
+    writing = Writing(tmp_path / "000001-20270115T080000Z.mcap", About("acsar", "1", "3", 1, 2))
+    writing.finish(cut, "why")
+    (row,) = log(capsys, tmp_path)[1].splitlines()
+    assert ("  ! [cut" in row) is (cut != "disk")
+
+
+def test_a_client_with_the_name_of_a_fault_marks_no_recording() -> None:
+    assert is_serious("start, 1 stop (stopped by anna)")
+    assert is_serious("2 faults")
+    assert not is_serious("start, 1 wheel fault (stopped by x, 1 fault)")
+
+
+def test_the_list_takes_only_the_recordings_of_a_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The three recordings are a day apart, and the last one is not finished."""
+    for number in (1, 2, 3):
+        noon_ns = int(time.mktime((2027, 1, 14 + number, 12, 0, 0, 0, 0, -1))) * NS_PER_S
+        name = f"00000{number}-20270115T080000Z.mcap{'.part' if number == 3 else ''}"
+        path, about = tmp_path / name, About("acsar", "1", "3", 1, noon_ns)
+        writing = Writing(path, about)
+        writing.add("events", noon_ns, b"")
+        if number == 3:
+            writing.flush()
+            writing.close()
+        else:
+            writing.finish()
+    for words, numbers in (
+        ("--from 2027-01-15", "123"),
+        ("--to 2027-01-15", "1"),
+        ("--from 2027-01-16 --to 2027-01-17", "23"),
+        ("--from 2027-01-18", ""),
+        ("--from 2027-01-15 --to 2027-01-15", "1"),
+    ):
+        code, out, _ = log(capsys, tmp_path, *words.split())
+        assert code == 0
+        assert [row[5] for row in out.splitlines() if row.startswith("00000")] == [*numbers]
+        assert numbers or "no recordings from 2027-01-18 00:00:00 in" in out
+
+
+def test_the_list_takes_no_seconds_and_a_replay_no_time(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = log(capsys, where, "--from", "5")
+    assert (code, "counts from the beginning of one recording" in err) == (Exit.USAGE, True)
+    for words in (["replay", "1"], ["recover", "1", "new.mcap"]):
+        code = main(["recording", "--from", "14:05", "--directory", str(where), *words])
+        assert (code, "leave out --from and --to" in capsys.readouterr().err) == (Exit.USAGE, True)
 
 
 def test_the_configuration_names_the_directory_of_the_recordings(
@@ -108,7 +175,7 @@ def test_the_list_tells_a_start_from_a_file_that_goes_on(
     assert len(rows) == 8
     for row in rows:
         starts = row.partition("-")[0].endswith("0")
-        assert ("  start, 1 change of commander" in row) is starts
+        assert (re.search("  (! )?start, 1 change of commander", row) is not None) is starts
         assert ("start" in row) is starts
 
 
@@ -144,7 +211,7 @@ def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
 
     assert "start" in names("--to", "1")
     assert names("--from", "1.5", "--to", "2.5") == {"stop", "drive", "mode"}
-    first = log(capsys, where, "show", "1")[1].split(" ")[0]
+    _, first = log(capsys, where, "show", "1")[1].partition("  ")[0].split(" ")
     hours, minutes, seconds = first.split(":")
     after = f"{hours}:{minutes}:{float(seconds) + 1.5:09.6f}"
     assert names("--from", after) == names("--from", "1.5")
@@ -384,13 +451,39 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     monkeypatch.setattr(Writing, "finish", looked)
     assert log(capsys, where, "recover", str(cut), str(new))[0] == 0
     assert seen == [False]
-    code, _, err = log(capsys, where, "recover", str(cut), str(new), "--force")
+    (other,) = where.glob("*.mcap")
+    (held := tmp_path / "held.mcap").write_bytes(other.read_bytes())
+    code, _, err = log(capsys, where, "recover", str(cut), str(held), "--force")
     assert (code, "it is a recording; name another file" in err) == (1, True)
+    assert held.read_bytes() == other.read_bytes()
+    held.unlink()
     (mine := tmp_path / "mine").write_text("mine")
     code, _, err = log(capsys, where, "recover", str(cut), str(mine))
     assert (code, "--force" in err, mine.read_text()) == (1, True, "mine")
     assert log(capsys, where, "recover", str(cut), str(mine), "--force")[0] == 0
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
+
+
+def test_recover_replaces_its_own_earlier_result_only_on_request_and_says_so(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "new.mcap"
+    (cut,) = where.glob("*.part")
+    (earlier := tmp_path / "earlier.mcap.part").write_bytes(cut.read_bytes()[:-2000])
+    assert log(capsys, where, "recover", str(earlier), str(new))[0] == 0
+    code, _, err = log(capsys, where, "recover", str(cut), str(new))
+    assert (code, "it exists; --force overwrites it" in err) == (1, True)
+    code, out, _ = log(capsys, where, "recover", str(cut), str(new), "--force")
+    assert (code, f"{new}, which replaces an earlier copy of the same recording" in out) == (
+        0,
+        True,
+    )
+    longer = new.read_bytes()
+    code, _, err = log(capsys, where, "recover", str(earlier), str(new), "--force")
+    assert (code, "it is a recording; name another file" in err) == (1, True)
+    assert new.read_bytes() == longer, "the shorter copy lacks messages of the longer one"
+    code, _, err = log(capsys, where, "recover", str(cut), str(cut), "--force")
+    assert (code, "it is a recording; name another file" in err) == (1, True)
 
 
 def harmed(data: bytes, dice: random.Random) -> bytes:
@@ -435,7 +528,7 @@ def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
         for verb, new in NEW.items():
             words = [verb, str(path), *([str(tmp_path / f"{number}{new}")] if new else [])]
             code, out, err = log(capsys, where, *words)
-            assert code in (Exit.OK, Exit.FAILURE), (words, out, err)
+            assert code in (Exit.OK, Exit.FAILURE, Exit.INCOMPLETE), (words, out, err)
             assert (bool(out or err), bool(err) or code == Exit.OK) == (True, True), words
             assert "Traceback" not in err
             ends[code] += 1

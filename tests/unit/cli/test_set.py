@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from acsard.cli import parser
+from acsard.cli import main, parser
 from acsard.cli.set import pairs
 from acsard.core.messages.schema import ServiceReply
-from acsard.host.errors import UsageError
+from acsard.host.errors import Exit, UsageError
 from tests.each import each
 
 
@@ -65,9 +65,26 @@ def test_the_help_and_the_ros_page_say_what_write_does_not_write(
 
 
 @pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ([], "name one robot in --id to list its settings"),
+        (["rates.state", "5", "--write"], "--write changes the file of this machine"),
+    ],
+)
+def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
+    words: list[str], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["set", *words, "--id", "a,b"]) == Exit.USAGE
+    assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("key", "until"),
     [
-        ("limits.linear_speed", "; until the next start; a lowered limit survives the restart"),
+        (
+            "limits.linear_speed",
+            "; until the next start; a lowered limit survives the restart, except on the simulator",
+        ),
         ("limits.linear_deceleration", "; until the next start"),
         ("rates.state", "; until the next start"),
     ],
@@ -81,10 +98,16 @@ def test_the_answer_says_how_long_the_setting_lasts(
 
         def __exit__(self, *words: object) -> None: ...
 
-        def set(self, settings: dict[str, object]) -> ServiceReply:
-            return ServiceReply(True, "done")
+        def set(self, settings: dict[str, object], *, keep: bool) -> ServiceReply:
+            return ServiceReply(True, "done; written to robot.toml" if keep else "done")
 
     monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
-    args = parser().parse_args(["set", key, "0.5"])
-    assert args.main(args) == 0
-    assert capsys.readouterr().out == f"done{until}\n"
+    for words, told in (([], f"done{until}"), (["--keep"], "done; written to robot.toml")):
+        args = parser().parse_args(["set", key, "0.5", *words])
+        assert args.main(args) == 0
+        assert capsys.readouterr().out == f"{told}\n"
+
+
+def test_keep_needs_a_setting(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["set", "--keep"]) == Exit.USAGE
+    assert "acsard set limits.linear_speed 0.8 --keep" in capsys.readouterr().err

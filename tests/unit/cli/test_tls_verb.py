@@ -176,14 +176,15 @@ WATCHED = """\
 import os, sys
 from acsard.cli import main
 def hook(event, arguments):
-    compiled = ".pyc" in str(arguments[:1])  # what Python keeps for itself
-    if event in ("os.chmod", "os.rename", "os.link") and not compiled:
-        print(event, arguments[0], file=sys.stderr)
+    if event == "os.chmod" and isinstance(arguments[0], int):
+        file = os.path.basename(os.readlink(f"/proc/self/fd/{arguments[0]}"))
+        before = os.fstat(arguments[0]).st_mode & 0o777
+        print(file.split(".pem")[0], oct(before), oct(arguments[1]), file=sys.stderr)
 sys.addaudithook(hook)
 os.umask(0)
 sys.exit(main(["tls", *sys.argv[1:]]))
 """
-"""A program without umask that reports every later change of a file's mode."""
+"""A program without umask that reports every change of a new file's mode, before and after."""
 
 
 def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Path) -> None:
@@ -193,7 +194,11 @@ def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Pat
     done = subprocess.run(
         [sys.executable, "-c", WATCHED, *words], capture_output=True, text=True, timeout=30.0
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    changes = [line.split() for line in done.stderr.splitlines()]
+    assert (done.returncode, len(changes)) == (0, 14)  # two files of the authority, three of each
+    for name, before, after in changes:
+        assert before == "0o600"
+        assert after == ("0o600" if "key" in name else "0o644")
     for name in files(own):
         if "key" in name:
             assert stat.S_IMODE((own / name).stat().st_mode) == 0o600, name
@@ -499,11 +504,44 @@ def test_renew_makes_the_robot_s_certificate_anew_and_leaves_all_others(tmp_path
     assert ipaddress.ip_address("10.0.0.9") in names.get_values_for_type(x509.IPAddress)
 
 
+def test_renew_by_name_replaces_that_certificate_alone_and_keeps_its_addresses(
+    own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--directory", str(own))
+    assert tls("add", "robot4", *words, "--address", "10.0.0.4", "--days", "5") == 0
+    place, before = own / "clients" / "robot4", files(own)
+    old, names = certificate(place), names_of(place)
+    assert tls("renew", "--name", "robot4", *words, "--days", "9", "--address", "10.0.0.5") == 0
+    after = files(own)
+    changed = {name for name in after if after[name] != before[name]}
+    assert changed == {"clients/robot4/certificate.pem", "clients/robot4/key.pem"}
+    new = certificate(place)
+    assert common_name(new.subject) == "robot4"
+    assert new.not_valid_after_utc > old.not_valid_after_utc
+    assert names_of(place) == {*names, "10.0.0.5"} >= {"robot4.local", "10.0.0.4"}
+    said = capsys.readouterr().out
+    assert f"{place} has a new certificate. Copy ca.pem, certificate.pem, key.pem" in said
+    assert "sudo systemctl try-restart acsard-gateway acsard-web" in said
+
+
+def test_a_name_without_a_certificate_is_not_renewed(
+    own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files(own)
+    assert tls("renew", "--name", "robot9", "--directory", str(own)) == Exit.FAILURE
+    told = capsys.readouterr().err
+    assert "has no certificate for robot9, only for: maintainer, operator, viewer" in told
+    assert f"`acsard tls add robot9 --directory {own}` makes a first one" in told
+    assert files(own) == before
+
+
 def test_without_an_authority_nothing_is_renewed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert tls("renew", "--directory", str(tmp_path)) == Exit.FAILURE
-    assert "acsard tls init" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "name the directory of ca-key.pem with --directory" in said
+    assert "if there is none yet, run `acsard tls init`" in said
 
 
 # files that the operator would lose

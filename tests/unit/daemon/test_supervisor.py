@@ -69,6 +69,27 @@ def test_a_router_that_cannot_be_one_is_not_tried_again(
     assert said == []
 
 
+@pytest.mark.parametrize("code", [2, 78])
+def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
+) -> None:
+    monkeypatch.setattr("acsard.daemon.supervisor.LATER_S", 0.01)
+    began = tmp_path / "began"
+    ends = f"import os; p = {str(began)!r}; new = not os.path.exists(p); open(p, 'a').close(); "
+    program(monkeypatch, tmp_path, ends + f"raise SystemExit(1 if new else {code})")
+    said: list[Event] = []
+
+    async def runs() -> None:
+        keeper = asyncio.create_task(keep_running(["router"], said.append, ROUTER))
+        while len(said) < 3 and not keeper.done():
+            await asyncio.sleep(0.01)
+        keeper.cancel()
+
+    asyncio.run(asyncio.wait_for(runs(), 10.0))
+    codes = [event.text.partition(";")[0] for event in said[:3]]
+    assert codes == [f"the router ended with {number}" for number in (1, code, code)]
+
+
 @pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (ROUTER, 75), (ROUTER, 1)])
 def test_one_that_may_be_opened_later_is_tried_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int

@@ -75,6 +75,23 @@ def test_a_file_of_another_user_becomes_ours(file: Path, monkeypatch: pytest.Mon
     assert file.read_bytes() == NEW
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to another group")
+def test_a_file_of_another_user_stays_in_its_group(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.chown(file, 7, 8)
+    fchown = os.fchown
+
+    def as_user(handle: int, user: int, group: int) -> None:
+        if user != -1:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+        fchown(handle, user, group)
+
+    monkeypatch.setattr(os, "fchown", as_user)
+    replace(file, NEW)
+    assert (file.stat().st_uid, file.stat().st_gid) == (os.geteuid(), 8)
+
+
 @pytest.mark.parametrize("call", ["fchmod", "fsync", "replace"])
 def test_after_an_error_the_old_file_is_there_and_no_other(
     file: Path, monkeypatch: pytest.MonkeyPatch, call: str

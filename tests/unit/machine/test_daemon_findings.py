@@ -8,9 +8,11 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import BusConfig, Config, McuConfig
-from acsard.core.messages.schema import DiagnosticStatus, Time
+from acsard.core.messages.schema import DiagnosticStatus, LogEvent, Time
 from acsard.machine.daemon_findings import (
+    certificate,
     clocks,
+    daemon,
     gateway,
     gone,
     gyro,
@@ -112,6 +114,34 @@ def test_a_stop_that_would_be_lost_at_a_restart_is_a_warning_with_its_mend() -> 
 CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
 
 
+@pytest.mark.parametrize(
+    ("here", "mend"),
+    [
+        (True, "try-restart acsard-gateway acsard-web"),
+        (True, "uses them for its next connection: restart its daemon, which stops it"),
+        (False, "`acsard doctor` on that machine"),
+    ],
+)
+def test_a_certificate_in_use_that_ends_is_a_warning_with_its_mend(here: bool, mend: str) -> None:
+    words = "valid for 9 days (that of the router tls/router.local:7447)"
+    row = DiagnosticStatus(1, "acsard: certificate", words, "acsar", [])
+    (told,) = certificate(row, here)
+    assert (told.subject, told.level) == ("certificates", "warning")
+    assert told.text.endswith(words)
+    assert mend in told.mend
+    assert list(certificate(replace(row, level=0), here)) == list(certificate(None, here)) == []
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_settings_that_differ_from_the_file_of_another_machine_are_a_warning(here: bool) -> None:
+    running = seen(0.0, here=here)
+    running = replace(running, state=replace(running.state, settings_differ="rates.state = 7.5"))
+    told = [one.text for one in daemon(running) if one.subject == "configuration"]
+    words = "the settings in force differ from the robot's file: rates.state = 7.5"
+    # On the daemon's own machine the doctor compares with the file itself.
+    assert told == ([] if here else [words])
+
+
 def found(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
     one, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
     return list(link(Running(INFO, CONFIG, one, two, 0)))
@@ -203,3 +233,23 @@ def test_a_lost_link_is_reported_with_the_number_of_losses() -> None:
     (finding,) = found({}, {"link_lost": 4})
     assert finding.level == "warning"
     assert "lost 4 times" in finding.text
+
+
+def test_the_last_causes_of_lateness_are_shown_and_warn_only_if_periods_are_missed_now() -> None:
+    texts = [
+        "11 x missed: 11 in a row",
+        *(f"late: by 0.1{n} s, because it is {n}" for n in range(5)),
+    ]
+    events = tuple(
+        LogEvent(Time.from_ns(NOW + n * S), "missed_periods", "warning", text, "", 1)
+        for n, text in enumerate(texts)
+    )
+    calm = replace(seen(0.0, lines_sent=345_600_000, missed_periods=600), events=events)
+    findings = list(late(calm))
+    assert [one.level for one in findings] == ["ok", "ok", "ok"]
+    assert [one.text.rpartition("because ")[2] for one in findings] == [
+        "it is 2", "it is 3", "it is 4",
+    ]  # fmt: skip
+    assert "was late before 2027-01-15 08:00:05 UTC: by 0.14 s, because" in findings[-1].text
+    row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
+    assert {one.level for one in late(replace(calm, rows=(row,)))} == {"warning"}

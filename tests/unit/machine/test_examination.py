@@ -1,14 +1,17 @@
-"""The doctor's finding about real-time scheduling matches the scheduling that a daemon gets."""
+"""The doctor's findings about this computer: real-time scheduling, and causes of lateness."""
 
 from __future__ import annotations
 
 import os
 import resource
+from pathlib import Path
 
 import pytest
 
 from acsard.host import real_time
-from acsard.machine.examination import scheduling
+from acsard.host.kernel_counters import Kernel
+from acsard.machine.examination import scheduling, slowness
+from tests.unit.host.kernel_files import HWMON, POLICY, QUIET, write
 
 WANTED = True
 
@@ -44,3 +47,18 @@ def test_of_a_daemon_that_runs_what_it_has_is_reported(
 def test_who_does_not_want_it_is_not_warned() -> None:
     (finding,) = scheduling(False, 77)
     assert finding.level == "ok"
+
+
+def test_a_computer_that_nothing_slows_is_ok(tmp_path: Path) -> None:
+    (finding,) = slowness(Kernel(write(tmp_path, QUIET)))
+    assert (finding.subject, finding.level) == ("computer", "ok")
+
+
+def test_each_cause_of_lateness_that_is_present_is_a_warning_with_its_mend(tmp_path: Path) -> None:
+    files = {HWMON + "in0_lcrit_alarm": "1\n", POLICY + "scaling_governor": "powersave\n"}
+    findings = list(slowness(Kernel(write(tmp_path, QUIET | files))))
+    assert [one.level for one in findings] == ["warning", "warning"]
+    assert "supply voltage is too low" in findings[0].text
+    assert "power supply" in findings[0].mend
+    assert "powersave keeps the processor at 600 of 1500 MHz" in findings[1].text
+    assert "schedutil" in findings[1].mend

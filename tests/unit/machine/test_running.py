@@ -6,10 +6,11 @@ import re
 
 from msgspec.structs import replace
 
+from acsard.core.config.live import differences
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import BusConfig, Config, DriveConfig, McuConfig, RobotConfig
 from acsard.core.messages.schema import Info, RobotState, Time
-from acsard.machine.running import SHOWN, Running, compared, differences
+from acsard.machine.running import SHOWN, Running, compared
 
 INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
 STATE = RobotState(
@@ -52,6 +53,7 @@ def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> Non
 def test_what_is_no_option_of_run_is_a_warning() -> None:
     (finding,) = compared(running(replace(FILE, odometry=replace(FILE.odometry, gyro=True))), FILE)
     assert (finding.level, "odometry.gyro = true, not false" in finding.text) == ("warning", True)
+    assert "if it runs with another file, name that with --config" in finding.mend
 
 
 def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:

@@ -19,7 +19,7 @@ from acsard.core.config.writing import document
 from acsard.core.values import NS_PER_S, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import EndRecord, read_end
-from acsard.recording.file import CHUNK_BYTES, MODE, About, Recording, Writing, rewrite
+from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, MODE, About, Recording, Writing, rewrite
 from acsard.recording.file_replay import config_of, replay_file, steps
 from acsard.recording.recorded_steps import status_of
 from acsard.recording.rows import encode
@@ -64,10 +64,17 @@ def test_the_mcap_library_reads_a_recording(tape: Tape, whole: Path) -> None:
         assert summary is not None
         assert summary.statistics is not None
         got = [channel.topic for _, channel, _ in reader.iter_messages()]
-        (config,) = list(reader.iter_attachments())
+        config, copy = list(reader.iter_attachments())
+        (about, about_copy) = [r for r in reader.iter_metadata() if r.name == "acsard"]
+        (how_to_read,) = [r for r in reader.iter_metadata() if r.name == HOW_TO_READ.name]
+        contents = {c.topic: c.metadata["content"] for c in summary.channels.values()}
     assert got.count("steps") == -(-len(tape.taken) // BATCH)
     assert summary.statistics.message_count == len(got)
     assert config.name == "acsard.toml"
+    assert (config, about) == (copy, about_copy)
+    assert "acsard recording export" in how_to_read.metadata["export"]
+    assert "an array of first, mono_ns, " in contents["steps"]
+    assert contents.keys() == {"steps", "state", "events", "unfinished"}
 
 
 def on_a_machine(tape: Tape) -> None:
@@ -360,14 +367,19 @@ def test_a_cut_file_is_rewritten_as_a_finished_file(whole: Path, tmp_path: Path)
         assert len(list(make_reader(stream).iter_messages())) > 0
 
 
-def test_a_replay_ends_at_missing_steps_and_reports_them(whole: Path, tmp_path: Path) -> None:
+def test_a_replay_without_a_later_state_ends_at_missing_steps_and_reports_them(
+    whole: Path, tmp_path: Path
+) -> None:
     data, path = whole.read_bytes(), tmp_path / "gap.mcap"
     start, _ = chunks(data)[2]
     path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
     result = replay_file(Recording(path))
     assert result.comparison.steps == 2 * BATCH
     assert result.same
-    assert result.trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
+    (gap,) = result.gaps
+    later = [step for step in steps(Recording(path)) if step.number >= 3 * BATCH]
+    assert (gap.unreadable, gap.skipped) == (BATCH, len(later))
+    assert gap.lines == sum(step.recorded.line is not None for step in later) > 0
 
 
 def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_path: Path) -> None:

@@ -8,9 +8,12 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
+from acsard.core.messages.schema import Time
+from acsard.core.messages.signature import public_name
 from acsard.core.robot import Robot
 from acsard.recording.published import MEASURED, Published, Publisher
 from acsard.recording.replay import replay_step
+from acsard.recording.timeline import TimelineWriter
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -85,4 +88,26 @@ def test_the_log_says_that_a_sender_must_send_a_zero_first() -> None:
     world.hold(0.5, seconds=2.5)
     lines = [m.message for m in said(tape, Config()) if m.channel.name == "log"]
     (reason,) = [line.msg for line in lines if line.name == "reason"]
-    assert reason == "ready: send a zero first: app must send a zero before it can drive"
+    by = f"app ({public_name('somebody')})"
+    assert reason == f"ready: send a zero first: app must send a zero before it can drive (by {by})"
+
+
+def test_the_log_has_the_same_lines_as_the_timeline() -> None:
+    tape = driven()
+    timeline, steps = TimelineWriter(Config()), tape.steps()
+    entries = [entry for step in steps for entry in timeline.step(step)]
+    lines = [m for m in said(tape, Config()) if m.channel.name == "log"]
+    assert [line.message.name for line in lines] == [entry.name for entry in entries]
+    assert [line.message.msg for line in lines] == [entry.sentence for entry in entries]
+    assert "start" in [line.message.name for line in lines]
+
+
+def test_the_lines_after_the_last_step_have_the_drive_and_the_ending() -> None:
+    tape, robot = driven(), Robot(Config())
+    publisher = Publisher(robot, START.wall_ns)
+    for step in tape.steps():
+        list(publisher.step(step, replay_step(robot, step)))
+    drive, cut = [line.message for line in publisher.end("cut: the disk accepted no more data")]
+    assert (drive.name, drive.msg[:13]) == ("drive", "was driving, ")
+    assert (cut.name, cut.msg, cut.level) == ("cut", "the disk accepted no more data", 30)
+    assert drive.stamp == cut.stamp == Time.from_ns(tape.taken[-1].inputs.now.wall_ns)

@@ -16,14 +16,18 @@ from acsard.core.motion.freshness import Freshness
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
+from acsard.recording import file_replay
 from acsard.recording.export import export
-from acsard.recording.file import Recording
+from acsard.recording.file import Recording, Writing
 from acsard.recording.file_replay import DisplayReplay, replay_file
-from acsard.recording.state import StateError, freeze, thaw
+from acsard.recording.rows import encode
+from acsard.recording.state import Checkpoint, State, StateError, freeze, thaw
+from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
 from acsard.report.report_data import ReportData
 from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
+from tests.unit.recording.attacks import whole
 
 MEMORY = Memory(b"line", 5, None, 7, 8)
 
@@ -175,3 +179,29 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
     with pytest.raises(RecordingError, match=words):
         export(recording, tmp_path / "new.mcap", "mcap")
     assert [*tmp_path.iterdir()] == [recording.path]
+
+
+def test_forged_states_behind_gaps_take_time_in_proportion_to_the_file(
+    taped: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each state compresses to a few bytes and takes 0.2 s. A gap comes before each."""
+    thawed: list[bytes] = []
+
+    def counted(data: bytes) -> State:
+        thawed.append(data)
+        return thaw(data)
+
+    monkeypatch.setattr(file_replay, "thaw", counted)
+    taped.write(tmp_path / "whole.mcap", Config())
+    about = Recording(tmp_path / "whole.mcap").about
+    writing = Writing(path := tmp_path / "forged.mcap", about)
+    writing.add("steps", about.wall_ns, encode(0, taped.taken[:1]))
+    for number in range(10, 210, 10):
+        forged = Checkpoint(number, whole(b"(" + b"K\x01" * (MAX_OPCODES - 5) + b"t"))
+        writing.add("state", about.wall_ns, forged.encode())
+        writing.add("steps", about.wall_ns, encode(number, taped.taken[1:2]))
+    writing.finish()
+    (gap,) = replay_file(Recording(path)).gaps
+    assert gap.skipped == 20
+    drawn(Recording(path))
+    assert len(thawed) <= 2 * (MAX_BYTES + 8 * path.stat().st_size) // len(forged.data)

@@ -36,6 +36,8 @@ def moment(seconds: float) -> Moment:
         ("2 hours ago", moment(at(23, 13, 30))),
         ("90min ago", moment(at(23, 14, 0))),
         ("1 d ago", moment(at(22, 15, 30))),
+        ("99999999999999 h ago", moment(0.0)),
+        ("9" * 400 + " h ago", moment(0.0)),
     ],
 )
 def test_a_time_is_read_as_a_person_writes_it(text: str, when: object) -> None:

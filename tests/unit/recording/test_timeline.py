@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig
+from acsard.core.messages.signature import Signature, public_name
+from acsard.core.values import NS_PER_S, Received
 from acsard.recording.rows import decode, encode
 from acsard.recording.timeline import (
     ReasonChanges,
@@ -45,6 +49,39 @@ def test_the_timeline_has_the_start_each_drive_and_the_end() -> None:
     assert drive.text == "drove 0.85 m in 2.0 s"
     assert "stop" in [one.name for one in told]
     assert [one.seconds for one in told] == sorted(one.seconds for one in told)
+
+
+def test_a_recording_that_continues_another_begins_with_what_the_robot_does() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, 0.2, seconds=2.0)
+    number = len(tape.taken) - 100
+    writer, steps = TimelineWriter(), decode(encode(number, tape.taken[number:]))
+    entry, *others = [entry for step in steps for entry in writer.step(step)]
+    x, y, yaw = next(pose for step in steps for pose in step.recorded.poses)
+    assert entry.name == "continues"
+    assert entry.seconds == steps[0].inputs.now.wall_ns / 1e9
+    assert entry.by == "app"
+    assert entry.text == (
+        "an earlier recording goes on here: driving, link up, "
+        f"at x {x / 1e6:.2f} m, y {y / 1e6:.2f} m, yaw {math.degrees(yaw / 1e6):.1f} deg"
+    )
+    assert "continues" not in [other.name for other in others]
+    assert "continues" not in [entry.name for entry in story(tape)]
+
+
+def test_without_a_link_a_recording_that_continues_another_begins_without_a_pose() -> None:
+    tape = Tape()
+    world = World(BOARD, recorder=tape, plugged=False)
+    world.run(4.0)
+    first, writer = 50, TimelineWriter()
+    entries = [
+        entry for step in decode(encode(first, tape.taken[first:])) for entry in writer.step(step)
+    ]
+    (entry,) = [entry for entry in [*entries, *writer.end()] if entry.name == "continues"]
+    assert entry is entries[0]
+    assert "an earlier recording goes on here: waiting (" in entry.text
+    assert entry.text.endswith(", the pose is not known")
 
 
 def test_a_drive_that_goes_on_at_the_last_step_has_an_entry() -> None:
@@ -88,8 +125,152 @@ def test_a_reason_that_changes_without_the_mode_has_an_entry() -> None:
     held, silent = [one for one in story(tape) if one.name == "reason"]
     sentence = "ready: send a zero first: app must send a zero before it can drive"
     assert (held.text, held.seconds - began < 0.1) == (sentence, True)
+    assert held.by == f"app ({public_name('somebody')})"
     assert silent.text.startswith("ready: waiting for a command: no source has sent one")
     assert 2.4 < silent.seconds - held.seconds < 2.9
+
+
+def two_senders(world: World, first: str, second: str, seconds: float = 3.0) -> None:
+    """Drive with the source `first`, and let the source `second` send speeds meanwhile."""
+    world.drive(0.5, seconds=1.0, source=first)
+    for _ in range(round(seconds * 20)):
+        world.send(0.5, source=first)
+        payload, sender = b'{"linear": {"x": 0.3}, "angular": {}}', Signature("eve").pack()
+        world.put(f"cmd/{second}", payload, attachment=sender)
+        world.run(0.05)
+
+
+def waits(first: str, second: str, seconds: float = 3.0) -> list[tuple[str, str]]:
+    """Return the text and the name of each entry about a sender that must wait."""
+    tape = Tape()
+    two_senders(World(recorder=tape), first, second, seconds)
+    timeline = TimelineWriter(Config())
+    entries = [entry for step in tape.steps() for entry in timeline.step(step)]
+    return [(entry.text, entry.by) for entry in entries if entry.name == "waits"]
+
+
+def test_a_sender_that_waits_for_another_source_or_sender_has_one_entry_with_both_names() -> None:
+    somebody, eve = public_name("somebody"), public_name("eve")
+    text = "sends speeds and must wait: the robot follows"
+    higher = f"{text} teleop ({somebody}), which has the higher priority"
+    assert waits("teleop", "app") == [(higher, f"app ({eve})")]
+    assert waits("app", "app") == [(f"{text} app ({somebody}), which came first", f"app ({eve})")]
+
+
+def test_a_sender_of_an_unknown_source_has_no_entry() -> None:
+    """The robot refuses its commands, and the log has an event about that."""
+    assert waits("nav", "stranger") == []
+
+
+def test_senders_under_many_names_make_an_entry_a_second() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=1.0, source="teleop")
+    for number in range(60):
+        world.send(0.5, source="teleop")
+        for name in range(8):
+            payload = b'{"linear": {"x": 0.3}, "angular": {}}'
+            world.put("cmd/app", payload, attachment=Signature(f"{name}").pack())
+            world.put("cmd/app", payload, attachment=Signature(f"{number} {name}").pack())
+        world.run(0.05)
+    timeline = TimelineWriter(Config())
+    entries = [entry for step in tape.steps() for entry in timeline.step(step)]
+    assert 1 <= len([entry for entry in entries if entry.name == "waits"]) <= 3
+
+
+def test_a_sender_that_waits_for_less_than_a_second_has_no_entry() -> None:
+    assert waits("teleop", "app", 0.8) == []
+
+
+def test_a_sender_that_alone_sends_speeds_has_no_entry() -> None:
+    assert "waits" not in [entry.name for entry in story(driven())]
+
+
+def test_a_drive_of_several_sources_names_all_of_them() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=1.0, source="nav")
+    world.send(0.0, source="teleop")
+    world.hold(0.5, seconds=1.0, source="teleop")
+    world.run(1.0)
+    (drive,) = [entry for entry in story(tape) if entry.name == "drive"]
+    assert drive.by == "nav, teleop"
+
+
+def test_a_clock_that_was_set_has_an_entry_with_the_time_of_the_new_clock() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.run(1.0)
+    world.wall_offset_ns += 36_000 * NS_PER_S
+    world.run(1.0)
+    new_s = world.instant.wall_ns / NS_PER_S
+    world.wall_offset_ns -= 7_200 * NS_PER_S
+    world.run(1.0)
+    forward, back = [entry for entry in story(tape) if entry.name == "clock"]
+    assert new_s - 1.1 < forward.seconds < new_s
+    assert "was set forward by 10 h, or this computer was suspended:" in forward.text
+    assert "was set back by 2 h:" in back.text
+
+
+def test_a_recording_that_was_cut_ends_with_the_reason() -> None:
+    tape, writer = driven(), TimelineWriter()
+    for step in decode(encode(0, tape.taken)):
+        list(writer.step(step))
+    (cut,) = writer.end("cut: the disk accepted no more data")
+    assert (cut.name, cut.text) == ("cut", "the disk accepted no more data")
+    assert cut.seconds == tape.taken[-1].inputs.now.wall_ns / 1e9
+
+
+def test_a_link_that_is_lost_briefly_has_the_reason_of_its_event_only() -> None:
+    tape = Tape()
+    checked = McuConfig(port="/dev/ttyACM0", link_check="auto", encoder_counts=3200)
+    world = World(Config(mcu=checked), recorder=tape)
+    world.run(0.5)
+    world.drive(0.5, seconds=1.0)
+    world.stall(0.6)
+    world.run(1.0)
+    entries = [entry for entry in story(tape) if entry.name in ("reason", "link_late", "mode")]
+    late = next(n for n, entry in enumerate(entries) if entry.name == "link_late")
+    lost, back = entries[late + 1 : late + 3]
+    assert lost.text.startswith("driving -> waiting: this computer did not run for 0.60 s")
+    assert back.text.startswith("waiting -> ready")
+
+
+def restarted(identity: bytes) -> list[TimelineEntry]:
+    """Return the timeline of a board that loses the link, and names itself in two reads."""
+    tape = Tape()
+    world = World(BOARD, recorder=tape)
+    world.run(1.0)
+    with world.mcu.mute():
+        world.run(0.5)
+        for data in (identity[:40], identity[40:]):
+            world.port.feed(Received(world.instant, data))
+            world.run(0.05)
+    world.run(1.0)
+    return story(tape)
+
+
+def test_a_board_that_names_itself_after_a_lost_link_has_an_entry_with_its_last_reset() -> None:
+    identity = b"!acsard-mcu 1 counts=3200 check=1 sample=1 lines=0 reset=brown-out\r\n"
+    (board,) = [entry for entry in restarted(identity) if entry.name == "board"]
+    assert board.text.startswith("the microcontroller names itself,")
+    assert board.text.endswith(": 1 counts=3200 check=1 sample=1 lines=0 reset=brown-out")
+
+
+def test_a_board_that_names_itself_again_and_again_has_an_entry_a_second() -> None:
+    entries = restarted(50 * b"!acsard-mcu 1 reset=pin\r\n")
+    assert len([entry for entry in entries if entry.name == "board"]) == 1
+
+
+def test_a_restart_that_the_robot_reports_has_no_second_entry() -> None:
+    tape = Tape()
+    world = World(BOARD, recorder=tape)
+    world.run(1.0)
+    world.port.feed(Received(world.instant, b"!acsard-mcu 1 reset=pin\r\n"))
+    world.run(1.0)
+    names = [entry.name for entry in story(tape)]
+    assert "mcu_restarted" in names
+    assert "board" not in names
 
 
 def test_reasons_that_alternate_in_every_step_make_an_entry_a_second() -> None:
@@ -152,7 +333,7 @@ def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
 
 def test_missing_steps_are_reported() -> None:
     gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
-    assert gaps == ["60 steps are missing before this one"]
+    assert gaps == ["60 steps are missing before this one: 0.3 s"]
 
 
 def test_a_summary_names_who_stopped_the_robot_and_counts_the_incidents() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from acsard.core.config.settings import Config
+from acsard.daemon.late_watch import LateWatch
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import Replay
 from acsard.report.report_data import ReportData
@@ -14,11 +15,14 @@ from tests.scenarios.world import World
 
 
 def report_of(
-    drive: Callable[[World], None], begin: float | None = None, end: float | None = None
+    drive: Callable[[World], None],
+    begin: float | None = None,
+    end: float | None = None,
+    late_watch: LateWatch | None = None,
 ) -> tuple[ReportData, list[Step]]:
     """Return the report's data of a drive, and the steps of the drive."""
     config, tape = Config(), Tape()
-    world = World(config, recorder=tape)
+    world = World(config, recorder=tape, late_watch=late_watch)
     drive(world)
     steps = tape.steps()
     return report_from(steps, config, begin, end), steps
@@ -29,15 +33,16 @@ def report_from(
     config: Config | None = None,
     begin: float | None = None,
     end: float | None = None,
+    ending: str = "",
 ) -> ReportData:
-    """Return the report's data of these steps."""
+    """Return the report's data of these steps, and of the way in which the recording ended."""
     config = config or Config()
     report, replay = ReportData(config, begin, end), Replay(config)
     for step in steps:
         replay.step(step)
         assert replay.outputs is not None
         report.step(step, replay.outputs, replay.robot)
-    report.end()
+    report.end(ending)
     return report
 
 

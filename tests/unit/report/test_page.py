@@ -13,6 +13,7 @@ import pytest
 
 from acsard.core.values import Command, Event, Refusal, Twist
 from acsard.recording.recorded_steps import Step
+from acsard.recording.time_span import date
 from acsard.report.page import MAX_OPEN, escaped, page
 from acsard.report.report_data import Mark, ReportData
 from acsard.report.report_text import Origin
@@ -135,6 +136,18 @@ def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
     assert "unnamed (native)" in words
 
 
+@pytest.mark.parametrize("apart_s", [3600, 86_400])
+def test_the_events_of_several_days_have_a_date(apart_s: int) -> None:
+    from acsard.core.config.settings import Config
+
+    noon, report = 1_800_014_400.0, ReportData(Config())
+    for seconds in (noon, noon + apart_s):
+        report.marks.add(Mark(0.0, "stop", "stopped", "info", "", 1, None, seconds))
+    times = Read(page(report, origin(), LIBRARY, clock)).words
+    at = f"{noon:.1f}"
+    assert (at if apart_s == 3600 else f"{date(noon)} {at}") in times
+
+
 def escaped_words(mark: Mark) -> str:
     return mark.text or mark.name.replace("_", " ")
 
@@ -154,7 +167,7 @@ def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
 
     report = ReportData(Config())
     for n in range(count):
-        report.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None))
+        report.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None, float(n)))
     (details,) = [
         a for tag, a in Read(page(report, origin(), LIBRARY, clock)).tags if tag == "details"
     ]

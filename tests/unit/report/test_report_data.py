@@ -7,12 +7,16 @@ from itertools import pairwise
 
 import pytest
 
+from acsard.core.values import NS_PER_S
 from acsard.recording.recorded_steps import MICRO
 from acsard.report.loop_lateness import Lateness
 from acsard.report.report_data import FIRST, LAST, Mark, Marks
+from acsard.report.report_text import Origin, notes
 from acsard.report.serial_counts import SerialCounts
 from tests.scenarios.world import START, World
 from tests.unit.report.driven import drive_of_two, report_from, report_of
+
+ORIGIN = Origin("a.mcap", "r", "1", "3")
 
 
 def test_the_path_and_its_length_are_the_recorded_poses() -> None:
@@ -97,12 +101,44 @@ def test_a_mark_has_the_client_and_the_place_of_its_event() -> None:
 def test_the_first_and_last_events_of_a_frequent_name_are_kept() -> None:
     marks = Marks()
     for n in range(1000):
-        marks.add(Mark(float(n), "stop", "stopped", "info", "joe", 2, None))
-    marks.add(Mark(500.5, "fault", "a wheel", "error", "", 1, None))
+        marks.add(Mark(float(n), "stop", "stopped", "info", "joe", 2, None, float(n)))
+    marks.add(Mark(500.5, "fault", "a wheel", "error", "", 1, None, 500.5))
     stops = [mark.t for mark in marks.all() if mark.name == "stop"]
     assert stops == [*range(FIRST), *range(1000 - LAST, 1000)]
     assert marks.left_out == 1000 - FIRST - LAST
     assert marks.counts == {"stop": 2000, "fault": 1}
+
+
+def test_events_of_one_time_keep_their_order() -> None:
+    marks = Marks()
+    for number in range(2 * FIRST):
+        for name in ("drive", "mode"):
+            marks.add(Mark(0.0, name, str(number), "info", "", 1, None, 0.0))
+    names = [mark.name for mark in marks.all()]
+    assert names == ["drive", "mode"] * (2 * FIRST)
+
+
+def test_the_last_marks_are_the_drive_that_goes_on_and_the_ending() -> None:
+    _, steps = drive_of_two()
+    report = report_from(steps[: len(steps) // 3], ending="cut: the disk accepted no more data")
+    drive, cut = report.marks.all()[-2:]
+    assert (drive.name, drive.text[:13]) == ("drive", "was driving, ")
+    assert (cut.name, cut.text) == ("cut", "the disk accepted no more data")
+
+
+def test_the_events_of_a_clock_that_was_set_have_the_time_of_the_clock() -> None:
+    def set_back(world: World) -> None:
+        world.run(1.0)
+        world.wall_offset_ns -= 3600 * NS_PER_S
+        world.call("stop")
+        world.run(0.5)
+
+    report, steps = report_of(set_back)
+    (stop,) = [mark for mark in report.marks.all() if mark.name == "stop"]
+    assert stop.seconds == pytest.approx(START.wall_ns / NS_PER_S - 3600 + 1.0, abs=0.1)
+    assert stop.t == pytest.approx(1.0, abs=0.1)
+    assert report.ended == steps[-1].inputs.now.wall_ns / NS_PER_S
+    assert any("was set during this time" in note for note in notes(report, ORIGIN))
 
 
 def test_a_pose_that_was_set_adds_no_distance() -> None:

@@ -23,6 +23,8 @@ OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
 
 Types = Callable[[str], None]
 
+pytestmark = pytest.mark.timeout(30)
+
 
 @pytest.fixture
 def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:

@@ -15,10 +15,24 @@ ROW = Row("robot1", True, replace(STATE, reason="driving: commanded by app"), 0.
 
 def test_a_line_has_all_of_a_robot() -> None:
     head, line = table([ROW], 120)
-    assert tuple(head.split()) == HEADS
+    assert tuple(head.split()) == tuple(one for one in HEADS if one != "FILE")
     assert line.split() == [
         "robot1", "driving", "+0.50", "up", "0.1.0", "0.1", "s", "commanded", "by", "app",
     ]  # fmt: skip
+
+
+def test_a_robot_whose_settings_differ_from_its_file_is_marked_and_no_other() -> None:
+    differ = "limits.linear_speed = 0.8, not 1.0"
+    state = replace(STATE, settings_differ=differ)
+    rows = [replace(ROW, state=state), replace(ROW, robot_id="robot2")]
+    head, first, second = table(rows, 160)
+    assert tuple(head.split()) == HEADS
+    at = head.index("FILE")
+    assert (first[at : at + 7], second[at : at + 7].strip()) == ("differs", "")
+    assert first.endswith(f"; settings: {differ}")
+    narrow = table(rows, 70)
+    assert "FILE" not in narrow[0]
+    assert "; settings: limits" in table(rows, 71)[1]
 
 
 def test_without_feedback_no_speed_is_shown() -> None:
@@ -46,7 +60,7 @@ def test_a_robot_that_is_gone_or_silent_is_reported(row: Row, words: str) -> Non
 
 def test_a_narrow_terminal_has_what_matters_most() -> None:
     head, line = table([ROW], 40)
-    assert head.split() == ["ROBOT", "MODE", "M/S", "HEARD", "WHY"]
+    assert head.split() == ["ROBOT", "MODE", "M/S", "SEEN", "WHY"]
     assert len(line) <= 40
     assert "driving" in line
 

@@ -701,7 +701,7 @@ DAY_NS = 86400 * 10**9
 )
 def test_a_certificate_that_ends_is_reported_in_time(days: int, level: int, words: str) -> None:
     config = replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls"))
-    made = Report(config, START, OUTPUTS.now.wall_ns + days * DAY_NS)
+    made = Report(config, START, {"": OUTPUTS.now.wall_ns + days * DAY_NS})
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
@@ -721,7 +721,7 @@ def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
 
 
 def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
-    made = Report(CONFIG, START, 0)
+    made = Report(CONFIG, START, {"": 0})
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)

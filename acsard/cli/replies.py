@@ -1,0 +1,68 @@
+"""Calls a service of several robots at the same time, and prints one line per robot."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from acsard.cli.echo import of_robot
+from acsard.client import Client
+from acsard.core.formatting import printable
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import ServiceReply
+from acsard.core.values import AcsardError
+from acsard.daemon.bus.robot_discovery import ALL, present, seen
+from acsard.host.errors import Exit
+
+AT_ONCE = 32
+"""Largest number of robots that are called at the same time."""
+
+Replies = Mapping[str, ServiceReply | AcsardError]
+"""The reply of each robot, or the reason why there is none."""
+
+
+def of_each(
+    robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
+) -> dict[str, ServiceReply | AcsardError]:
+    """Call a service of all these robots, and return their replies in the order of `ids`.
+
+    "*" in `ids` stands for all robots that are present. Raises `NoAnswerError` if there are none.
+    """
+    wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
+
+    def called(one: str) -> ServiceReply | AcsardError:
+        try:
+            return call(robot.like(one))
+        except AcsardError as error:  # the robot did not answer, or its answer cannot be decoded
+            return error
+
+    with ThreadPoolExecutor(min(len(wanted), AT_ONCE)) as calls:
+        return dict(zip(wanted, calls.map(called, wanted), strict=True))
+
+
+def print_each(
+    replies: Replies, robot: Client, ids: Sequence[str], silence: str, *, as_json: bool
+) -> int:
+    """Print one line per robot.
+
+    Args:
+        replies: the replies of the robots.
+        robot: the client whose connection was used.
+        ids: the robots that the operator named, perhaps as "*".
+        silence: the line of a robot without an answer; `{error}` stands for the reason.
+        as_json: whether to print JSON.
+
+    Returns the exit code: `UNREACHABLE` if a robot did not answer, else `FAILURE` if one refused.
+    """
+    for one, reply in replies.items():
+        if isinstance(reply, AcsardError):
+            reply = ServiceReply(False, silence.format(error=reply))
+        line = encode(reply, "json").decode()
+        print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
+    if ALL in ids:
+        print(f"acsard: {seen(robot.where.endpoint, len(replies))}", file=sys.stderr)
+    if any(isinstance(reply, AcsardError) for reply in replies.values()):
+        return int(Exit.UNREACHABLE)
+    done = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]
+    return int(Exit.OK if all(done) else Exit.FAILURE)

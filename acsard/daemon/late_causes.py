@@ -1,0 +1,265 @@
+"""Names the cause of a late control period from the kernel's counters; pure.
+
+`CAUSES` is the table of causes. A rule compares the counters from before the lateness with those
+after it, and returns a clause for a sentence, or "". A rule for a duration holds if the kernel's
+duration is at least `SHARE` of the lateness. Otherwise the small delays of normal load would count
+as causes. Several causes may hold at once, and a lateness without a known cause has none.
+
+The kernel also says how the loop's thread spent the lateness: it ran, it was ready and waited for a
+processor, or it slept. A slow processor delays only a thread that runs or waits for one, and a disk
+delays only a thread that sleeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from msgspec import Struct
+
+from acsard.core.formatting import many
+from acsard.core.values import NS_PER_S, Event
+from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
+
+SHARE = 0.5
+"""Share of a lateness that a cause must explain."""
+
+SLEPT_SHARE = 0.3
+"""Share of a lateness that the loop's thread must sleep if a disk is the cause. Reading pages from
+a fast virtual disk took as much processor time as sleep."""
+
+DISK_SHARE = 0.25
+"""Share of a lateness for which programs must wait for a disk. Of a thread that wrote to a disk all
+the time, the kernel counted 0.28 to 0.45 as waiting for the disk."""
+
+LEAST_STOLEN_NS = 3 * NS_PER_S // 100
+"""Shortest steal time that counts, ns: three of the kernel's ticks. On a virtual machine, 24 of
+607 comparisons had one tick and one had two, although the program was late for another reason."""
+
+SUSPENDED_NS = NS_PER_S // 10
+"""Shortest suspend, ns. The two clocks that tell it are not read at the same time."""
+
+
+class Lateness(Struct, frozen=True, omit_defaults=True):
+    """A late control period, and the kernel's counters from before and after it."""
+
+    late_ns: int
+    """Time from the first missed period to the step, ns."""
+    loop: Scheduled
+    """Time that the loop's thread ran and waited between the step before and the late step."""
+    before: Reading
+    after: Reading
+    busiest: Program | None = None
+    """The process that used the processor most right after the lateness, None if none did."""
+
+    def explains(self, duration_ns: int, share: float = SHARE) -> bool:
+        """Return whether a duration is at least this share of the lateness."""
+        return duration_ns >= share * self.late_ns
+
+    @property
+    def computed(self) -> bool:
+        """Whether the loop's thread ran or waited for a processor, instead of sleeping."""
+        return self.explains(self.loop.ran_ns + self.loop.waited_ns)
+
+    @property
+    def slept(self) -> bool:
+        """Whether the loop's thread slept for a part of the lateness."""
+        return self.explains(self.late_ns - self.loop.ran_ns - self.loop.waited_ns, SLEPT_SHARE)
+
+
+class Cause(Struct, frozen=True):
+    """A cause of lateness, with its rule and the advice against it."""
+
+    name: str
+    rule: Callable[[Lateness], str]
+    """Returns the cause as a clause, or "" if this is not the cause."""
+    advice: str
+
+
+def suspended(late: Lateness) -> str:
+    """Compare CLOCK_BOOTTIME, which goes on in a suspend, with CLOCK_MONOTONIC, which does not."""
+    asleep_ns = late.after.asleep_ns - late.before.asleep_ns
+    return (
+        f"this computer was suspended for {_seconds(asleep_ns)}"
+        if asleep_ns >= SUSPENDED_NS
+        else ""
+    )
+
+
+def undervoltage(late: Lateness) -> str:
+    """Read the alarm of the hwmon chip `rpi_volt` (in0_lcrit_alarm) and bit 0 of get_throttled."""
+    return low_voltage(late.after.conditions) if late.computed else ""
+
+
+def low_voltage(now: Conditions) -> str:
+    """Return the clause for a supply voltage that is too low now, or ""."""
+    return "the supply voltage is too low, which slows the processor" if now.undervoltage else ""
+
+
+def heat(late: Lateness) -> str:
+    """Compare the processors' `thermal_throttle` counts, and read the states of cooling devices.
+
+    On a Raspberry Pi the bits 1 to 3 of get_throttled count too.
+    """
+    hotter = late.after.conditions.throttled > late.before.conditions.throttled
+    return hot(late.after.conditions, hotter) if late.computed else ""
+
+
+def hot(now: Conditions, hotter: bool = False) -> str:
+    """Return the clause for a processor that is slowed down by heat, or ""."""
+    return "the processor is too hot and runs slower" if now.hot or hotter else ""
+
+
+def governor(late: Lateness) -> str:
+    """Compare the limit of the clock (scaling_max_freq) with the full clock (cpuinfo_max_freq).
+
+    A governor that keeps the lowest clock sets the limit to scaling_min_freq.
+    """
+    return slow(late.after.conditions) if late.computed and not heat(late) else ""
+
+
+def slow(now: Conditions) -> str:
+    """Return the clause for a processor whose clock is limited now, or ""."""
+    clock = now.slow_clock
+    if clock is None:
+        return ""
+    return (
+        f"the governor {clock.governor} keeps the processor at {clock.limit_mhz} of "
+        f"{clock.full_mhz} MHz"
+    )
+
+
+def cgroup_quota(late: Lateness) -> str:
+    """Compare the time without quota in `cpu.stat` of the cgroup (throttled_usec)."""
+    without_ns = late.after.quota_ns - late.before.quota_ns
+    if not late.explains(without_ns):
+        return ""
+    return f"the daemon's processor time was used up for {_seconds(without_ns)}"
+
+
+def stolen(late: Lateness) -> str:
+    """Compare the steal time of each processor in /proc/stat."""
+    stolen_ns = most_stolen(late.before, late.after)
+    if stolen_ns < LEAST_STOLEN_NS or not late.explains(stolen_ns):
+        return ""
+    return f"the host of this virtual machine took its processor for {_seconds(stolen_ns)}"
+
+
+def most_stolen(before: Reading, after: Reading) -> int:
+    """Return the most time that one processor lost to the host between two readings, ns."""
+    pairs = zip(before.steal_ns, after.steal_ns, strict=False)
+    return max((new - old for old, new in pairs), default=0)
+
+
+def memory(late: Lateness) -> str:
+    """Compare the major page faults of the process in /proc/self/stat."""
+    pages = late.after.major_faults - late.before.major_faults
+    if not pages or not late.slept:
+        return ""
+    return f"{many(pages, 'page')} of the daemon's memory had to be read from the disk"
+
+
+def disk(late: Lateness) -> str:
+    """Compare the times of waiting for a disk, of the loop's thread or else of all programs.
+
+    The loop's own time is in /proc/self/stat (delayacct_blkio_ticks), if the kernel measures it.
+    The time of all programs is in /proc/pressure/io, or else iowait in /proc/stat. It counts only
+    if the loop's thread itself read from a disk or wrote to one (/proc/self/task/TID/io), because
+    other programs may wait for a disk at any time.
+    """
+    before, after = late.before, late.after
+    own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
+    ours = after.own_bytes > before.own_bytes and late.explains(all_ns, DISK_SHARE)
+    if memory(late) or not (late.slept and (ours or late.explains(own_ns))):
+        return ""
+    return "the daemon waited for the disk"
+
+
+def other_program(late: Lateness) -> str:
+    """Compare the time that the loop's thread was ready and had no processor (schedstat)."""
+    if cgroup_quota(late) or stolen(late) or not late.explains(late.loop.waited_ns):
+        return ""
+    for_s = _seconds(late.loop.waited_ns)
+    busiest = late.busiest
+    if busiest is None:
+        return f"other programs used the processor for {for_s}"
+    kind = "real-time program" if busiest.real_time else "program"
+    return (
+        f"other programs used the processor for {for_s}, most of all the {kind} "
+        f"{busiest.name} (pid {busiest.pid})"
+    )
+
+
+CAUSES = (
+    Cause("suspended", suspended, "disable suspend: systemctl mask sleep.target"),
+    Cause("undervoltage", undervoltage, "use a stronger power supply and a shorter cable"),
+    Cause("heat", heat, "cool it"),
+    Cause("governor", governor, "choose the governor schedutil or performance"),
+    Cause("quota", cgroup_quota, "raise CPUQuota= of the service, or --cpus of the container"),
+    Cause("steal", stolen, "give the virtual machine a processor of its own"),
+    Cause("memory", memory, "free memory; the service locks that of the daemon"),
+    Cause("disk", disk, "find the program that uses it (`iotop`), or use a faster disk"),
+    Cause(
+        "processor",
+        other_program,
+        "run acsard as the service, and give other real-time programs a priority below 10",
+    ),
+)
+"""The causes, the rarer ones first."""
+
+
+def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
+    """Return the names of the causes of a lateness, and a clause with all of them and the advice.
+
+    Return empty values if the kernel's counters show no cause.
+    """
+    found = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
+    clauses = [f"{clause} ({cause.advice})" for cause, clause in found]
+    return tuple([cause.name for cause, _ in found]), ", and ".join(clauses)
+
+
+BECAUSE = ", because "
+"""The words before the causes in the text of an event."""
+
+
+def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
+    """Return the event with the causes of a lateness, of which `causes` has returned the clause."""
+    text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
+    return Event("missed_periods", text, "warning", kind="late", news=news)
+
+
+def cause_in(text: str) -> str:
+    """Return the duration and the causes from the text of an event or a line of the log.
+
+    Return "" if the text has no cause. A line may begin with the number of missed periods.
+    """
+    begin, because, clause = text.partition(BECAUSE)
+    return begin.rpartition(": ")[2] + because + clause if because else ""
+
+
+STOLEN_SHARE = 0.02
+"""Share of a second that a virtual machine's host may take from a processor without a warning."""
+
+
+def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
+    """Return the causes that make any program late now, each with its advice.
+
+    Args:
+        before: the counters at the beginning.
+        after: the counters at the end.
+        within_ns: the time between the two readings, ns.
+    """
+    now = after.conditions
+    stolen_ns = most_stolen(before, after)
+    hotter = now.throttled > before.conditions.throttled
+    host = f"the host of this virtual machine took its processor for {_seconds(stolen_ns)}"
+    clauses = {
+        "undervoltage": low_voltage(now),
+        "heat": hot(now, hotter),
+        "governor": slow(now),
+        "steal": host if stolen_ns > STOLEN_SHARE * within_ns else "",
+    }
+    return [(clauses[one.name], one.advice) for one in CAUSES if clauses.get(one.name)]
+
+
+def _seconds(duration_ns: int) -> str:
+    return f"{duration_ns / NS_PER_S:.2f} s"

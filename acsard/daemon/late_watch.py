@@ -1,0 +1,187 @@
+"""Watches for late control periods, and reports their cause if the kernel shows one.
+
+The control loop reads one small file in each period, its thread's times in `schedstat`, and hands a
+late period to a thread of this module. Only that thread reads the kernel's other files: four times
+a second to know them from before a lateness, and again after one. `late_causes.py` compares them.
+
+The event has the name `missed_periods`, like the robot's own event, which has the number of periods
+and comes first. The robot's event cannot name the cause, because the cause is known only later.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from typing import Self
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.core.values import NS_PER_S, Event
+from acsard.daemon.late_causes import Lateness, causes, event_of
+from acsard.host import clock
+from acsard.host.kernel_counters import Kernel, Program, Reading, Scheduled, scheduled
+from acsard.host.mailbox import Mailbox
+
+OWN_TIMES = "/proc/thread-self/schedstat"
+"""File of the times of the thread that opens it."""
+
+EVERY_S = 0.25
+"""Time between two readings while no period is late, s. The counters of a reading that is too old
+would contain the delays of normal load."""
+
+HISTORY = 12
+"""Readings that are kept: those of 3 s. A lateness is compared with a reading from before it began,
+and the watch goes on reading during the lateness."""
+
+SETTLE_S = 0.03
+"""Time from a late period to the reading after it, s. The kernel counts some times only at its next
+ticks, which are 10 ms apart at most."""
+
+PAUSE_NS = NS_PER_S
+"""Shortest time between two reports, ns. The log has at most a line a second of one name."""
+
+CONDITIONS_NS = 10 * NS_PER_S
+"""Age from which on the processor's conditions are read again, ns. They need the firmware's answer
+on some computers. After a lateness they are read in any case."""
+
+LOOK_S = 0.2
+"""Time between the two looks at all processes, s."""
+
+LOOK_AGAIN_NS = 10 * NS_PER_S
+"""Shortest time between two searches for the busiest process, ns. A search takes 20 us per process.
+"""
+
+NEWS_NS = 60 * NS_PER_S
+"""Time after which the same cause is reported at once again, ns. Repetitions wait for the next line
+about missed periods, as `news=False` of an event says."""
+
+MOST = 16
+"""Late periods and events that wait. The newest ones win."""
+
+
+class Late(Struct, frozen=True):
+    """A late period, as the control loop reports it."""
+
+    now_ns: int
+    """Monotonic time of its step."""
+    late_ns: int
+    before: bytes
+    """Content of `OWN_TIMES` in the period before, and in this one."""
+    after: bytes
+
+    @property
+    def loop(self) -> Scheduled:
+        """The times of the loop's thread between both periods."""
+        before, after = scheduled(self.before), scheduled(self.after)
+        return Scheduled(after.ran_ns - before.ran_ns, after.waited_ns - before.waited_ns)
+
+
+class LateWatch:
+    """The watch of one control loop. The loop's thread creates it, and calls `period` and `news`.
+
+    It is a context manager, whose thread runs inside the context.
+    """
+
+    def __init__(self, kernel: Kernel | None = None) -> None:
+        """Use another `kernel` in tests."""
+        self._kernel = kernel
+        self._box = Mailbox[Late](MOST)
+        self._news = Mailbox[Event](MOST, lambda: None)
+        self._thread = threading.Thread(target=self._work, name="lateness", daemon=True)
+        self._times = b""
+        try:
+            self._file = os.open(OWN_TIMES, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:
+            # This kernel does not measure them.
+            self._file = -1
+        self._readings: deque[tuple[int, Reading]] = deque(maxlen=HISTORY)
+        """The last readings, each with the monotonic time at which it was complete."""
+        self._reported: dict[tuple[str, ...], int] = {}
+        """Monotonic time of the last news about each combination of causes."""
+        self._busiest: Program | None = None
+        self._searched_ns: int | None = None
+
+    def __enter__(self) -> Self:
+        try:
+            self._thread.start()
+        except RuntimeError:
+            # This process cannot start another thread, so no cause is known. The robot drives.
+            self._box.close()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._box.close()
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+    # The control loop's thread calls these methods.
+
+    def period(self, now_ns: int, late_ns: int, missed: int) -> None:
+        """Take a period whose step began at monotonic `now_ns`, `late_ns` late.
+
+        `missed` periods before it had no step.
+        """
+        before = self._times
+        self._times = times = os.pread(self._file, 64, 0) if self._file >= 0 else b""
+        if missed:
+            self._box.put(Late(now_ns, late_ns, before, times))
+
+    def news(self) -> list[Event]:
+        """Return the events since the last call."""
+        return self._news.take() if self._news.waiting else []
+
+    # The other methods run in the watch's thread.
+
+    def _work(self) -> None:
+        kernel = self._kernel or Kernel()
+        conditions, looked_ns = kernel.conditions(), clock.mono_ns()
+        free_ns = looked_ns
+        self._keep(kernel.read(conditions))
+        while not self._box.closed:
+            if not self._box.wait(EVERY_S):
+                if clock.mono_ns() - looked_ns >= CONDITIONS_NS:
+                    conditions, looked_ns = kernel.conditions(), clock.mono_ns()
+                self._keep(kernel.read(conditions))
+                continue
+            time.sleep(max(SETTLE_S, (free_ns - clock.mono_ns()) / NS_PER_S))
+            late = max(self._box.take(), key=lambda one: one.late_ns, default=None)
+            before = None if late is None else self._before(late.now_ns - late.late_ns)
+            after = kernel.read()
+            conditions, looked_ns = after.conditions, clock.mono_ns()
+            self._keep(after)
+            if late is not None and before is not None:
+                self._report(kernel, Lateness(late.late_ns, late.loop, before, after))
+                free_ns = clock.mono_ns() + PAUSE_NS
+
+    def _keep(self, reading: Reading) -> None:
+        self._readings.append((clock.mono_ns(), reading))
+
+    def _before(self, now_ns: int) -> Reading | None:
+        """Return the newest reading that was complete at monotonic `now_ns`, None without one."""
+        older = [reading for read_ns, reading in self._readings if read_ns <= now_ns]
+        return older[-1] if older else None
+
+    def _report(self, kernel: Kernel, late: Lateness) -> None:
+        names, clause = causes(late)
+        if "processor" in names:
+            late = replace(late, busiest=self._busiest_of(kernel))
+            names, clause = causes(late)
+        if not names:
+            return
+        now_ns = clock.mono_ns()
+        reported_ns = self._reported.get(names)
+        news = reported_ns is None or now_ns - reported_ns >= NEWS_NS
+        if news:
+            self._reported[names] = now_ns
+        self._news.put(event_of(late, clause, news=news))
+
+    def _busiest_of(self, kernel: Kernel) -> Program | None:
+        """Return the busiest process, as of a search that may be `LOOK_AGAIN_NS` old."""
+        now_ns = clock.mono_ns()
+        if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:
+            self._busiest, self._searched_ns = kernel.busiest(LOOK_S), now_ns
+        return self._busiest

@@ -1,0 +1,333 @@
+"""Reads the kernel's counters that can explain why a program was late.
+
+`Kernel` reads the files, and the functions above it turn their text into values. A file that this
+computer does not have, or that this user may not read, counts as zeros. Reading takes up to some
+milliseconds, so the control loop never does it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
+
+SLOW_CLOCK = 0.6
+"""Share of the processor's full clock below which a limit of it counts as slow."""
+
+UNDERVOLTAGE_BIT = 1
+"""Bit of the Raspberry Pi's `get_throttled`: the supply voltage is too low now."""
+
+SLOWED_BITS = 0b1110
+"""Bits of `get_throttled`: the clock is limited, the processor is throttled, the soft temperature
+limit is active. All of them are about the present."""
+
+NICER = 9
+"""Largest nice value, above that of a thread, of a process that can delay the thread noticeably. At
+10 more the kernel gives it a tenth of the thread's weight."""
+
+OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
+"""Drivers whose governor `powersave` chooses the clock by the load. That of every other driver
+keeps the lowest clock."""
+
+COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
+"""Beginnings of the types of cooling devices that slow a processor down."""
+
+
+class SlowClock(Struct, frozen=True):
+    """A limit that keeps the processor below its full clock."""
+
+    governor: str
+    limit_mhz: int
+    full_mhz: int
+
+
+class Conditions(Struct, frozen=True, omit_defaults=True):
+    """The conditions under which the processor works now."""
+
+    undervoltage: bool = False
+    hot: bool = False
+    """Whether a cooling device or the firmware slows the processor down now."""
+    throttled: int = 0
+    """Number of times that the processors have slowed down because of heat."""
+    slow_clock: SlowClock | None = None
+
+
+class Reading(Struct, frozen=True, omit_defaults=True):
+    """The kernel's counters at one time. All durations count from the start of the computer."""
+
+    asleep_ns: int = 0
+    """Time in which this computer was suspended."""
+    steal_ns: tuple[int, ...] = ()
+    """Time for each processor in which the host of a virtual machine ran something else."""
+    disk_ns: int = 0
+    """Time in which a program waited for a disk."""
+    own_disk_ns: int = 0
+    """Time in which the first thread of the process waited for a disk. Most kernels do not measure
+    it unless the setting kernel.task_delayacct asks for it."""
+    own_bytes: int = 0
+    """Number of bytes that the first thread of the process read from disks and wrote to them."""
+    major_faults: int = 0
+    """Number of pages that the process had to read from a disk before it could go on."""
+    quota_ns: int = 0
+    """Time in which the process's cgroup had used up its processor time."""
+    conditions: Conditions = Conditions()
+
+
+class Scheduled(Struct, frozen=True, omit_defaults=True):
+    """The time that a thread ran, and the time that it was ready and had to wait, ns."""
+
+    ran_ns: int = 0
+    waited_ns: int = 0
+
+
+class Program(Struct, frozen=True):
+    """A process and the processor time that it has used."""
+
+    pid: int
+    name: str
+    ran_ns: int
+    priority: int = 20
+    """Priority of its first thread: 20 plus the nice value, or negative for a real-time one. The
+    lowest number is the highest priority."""
+
+    @property
+    def real_time(self) -> bool:
+        """Whether its first thread is real-time, so that it displaces all ordinary programs."""
+        return self.priority < 0
+
+
+def scheduled(text: bytes) -> Scheduled:
+    """Decode `/proc/PID/task/TID/schedstat`; return zeros if the text is empty."""
+    words = text.split()
+    return Scheduled(int(words[0]), int(words[1])) if len(words) > 1 else Scheduled()
+
+
+def steal(text: str, tick_ns: int) -> tuple[int, ...]:
+    """Decode the steal time of each processor from `/proc/stat`."""
+    rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
+    return tuple([int(row[8]) * tick_ns for row in rows if row[0] != "cpu" and len(row) > 8])
+
+
+def iowait(text: str, tick_ns: int) -> int:
+    """Decode from `/proc/stat` the time in which a processor was idle and a program waited for I/O.
+
+    The processors are not added up.
+    """
+    rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
+    return max((int(row[5]) * tick_ns for row in rows if row[0] != "cpu"), default=0)
+
+
+def stalled(text: str) -> int:
+    """Decode from a file of pressure stall information the time in which a task stalled, ns."""
+    for line in text.splitlines():
+        if line.startswith("some "):
+            return int(line.rpartition("total=")[2]) * 1000
+    return 0
+
+
+def quota(text: str) -> int:
+    """Decode the time without quota from `cpu.stat` of a cgroup (version 1 or 2), ns."""
+    for line in text.splitlines():
+        name, _, value = line.partition(" ")
+        if name == "throttled_usec":
+            return int(value) * 1000
+        if name == "throttled_time":
+            return int(value)
+    return 0
+
+
+def disk_bytes(text: str) -> int:
+    """Decode from `/proc/PID/task/TID/io` the bytes read from disks and written to them."""
+    rows = (line.partition(": ") for line in text.splitlines())
+    return sum(int(value) for name, _, value in rows if name in ("read_bytes", "write_bytes"))
+
+
+def fields(text: str) -> list[str]:
+    """Return the fields of `/proc/PID/stat` that follow the name of the program.
+
+    Index 0 is field 3 of proc(5). The name may contain spaces and brackets.
+    """
+    return text.rpartition(")")[2].split()
+
+
+def program(text: str, tick_ns: int) -> Program:
+    """Decode `/proc/PID/stat`. Raise `ValueError` or `IndexError` if it is not such a text."""
+    rest = fields(text)
+    before = text.rpartition(")")[0]
+    pid, _, name = before.partition(" (")
+    ran = (int(rest[11]) + int(rest[12])) * tick_ns
+    return Program(int(pid), name, ran, int(rest[15]))
+
+
+def busiest(
+    before: Iterable[Program], after: Iterable[Program], within_ns: int, priority: int
+) -> Program | None:
+    """Return the process that ran most between two looks, with the time it ran in between.
+
+    Return None if it used less than a quarter of a processor. A process that a thread of this
+    `priority` displaces does not count.
+    """
+    least = priority + NICER if priority >= 0 else priority
+    ran = {(one.pid, one.name): one.ran_ns for one in before}
+    grown = [
+        replace(one, ran_ns=one.ran_ns - ran[one.pid, one.name])
+        for one in after
+        if (one.pid, one.name) in ran and one.priority <= least
+    ]
+    found = max(grown, key=lambda one: one.ran_ns, default=None)
+    return found if found is not None and found.ran_ns * 4 >= within_ns else None
+
+
+def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
+    """Return the limit of a processor's clock from the files of its directory `cpufreq`.
+
+    Return None if the limit is at least `SLOW_CLOCK` of the full clock. The present clock does not
+    matter, because a processor at rest runs slowly and speeds up when there is work.
+    """
+    governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
+    if governor == "powersave" and policy.get("scaling_driver") not in OWN_SCALING:
+        limit = policy.get("scaling_min_freq", limit)
+    if governor == "userspace":
+        limit = policy.get("scaling_setspeed", limit)
+    full = policy.get("cpuinfo_max_freq", "")
+    if not (limit.isdigit() and full.isdigit()) or int(limit) >= SLOW_CLOCK * int(full):
+        return None
+    return SlowClock(governor, int(limit) // 1000, int(full) // 1000)
+
+
+class Kernel:
+    """The files of the kernel. Its methods are called from one thread."""
+
+    def __init__(self, root: Path = Path("/")) -> None:
+        """Find the files; `root` is another directory in tests."""
+        self._root, self._proc = root, root / "proc"
+        # The first thread of a process has the number of the process.
+        self._io = root / f"proc/self/task/{os.getpid()}/io"
+        self._tick_ns = NS_PER_S // os.sysconf("SC_CLK_TCK")
+        cpu, hwmon = root / "sys/devices/system/cpu", root / "sys/class/hwmon"
+        self._alarms = [
+            chip / "in0_lcrit_alarm"
+            for chip in sorted(hwmon.glob("hwmon*"))
+            if _text(chip / "name").strip() == "rpi_volt"
+        ]
+        self._firmware = sorted(root.glob("sys/devices/platform/soc*/*firmware/get_throttled"))
+        self._throttle_counts = sorted(cpu.glob("cpu*/thermal_throttle/*_throttle_count"))
+        self._coolers = [
+            device / "cur_state"
+            for device in sorted((root / "sys/class/thermal").glob("cooling_device*"))
+            if _text(device / "type").startswith(COOLERS)
+        ]
+        self._policies = sorted(cpu.glob("cpufreq/policy*"))
+        # A kernel without pressure stall information refuses to read these files, or lacks them.
+        self._pressure = next((path for path in self._pressures() if _text(path)), None)
+        self._quota = next((path for path in self._cgroups() if path.is_file()), None)
+
+    def read(self, conditions: Conditions | None = None) -> Reading:
+        """Read all counters, and the conditions unless the caller has them."""
+        stat = _text(self._proc / "stat")
+        own = fields(_text(self._proc / "self/stat"))
+        pressure = "" if self._pressure is None else _text(self._pressure)
+        disk_ns = stalled(pressure) if pressure else iowait(stat, self._tick_ns)
+        return Reading(
+            clock.asleep_ns(),
+            steal(stat, self._tick_ns),
+            disk_ns,
+            int(own[39]) * self._tick_ns if len(own) > 39 else 0,
+            disk_bytes(_text(self._io)),
+            int(own[9]) if len(own) > 9 else 0,
+            0 if self._quota is None else quota(_text(self._quota)),
+            self.conditions() if conditions is None else conditions,
+        )
+
+    def conditions(self) -> Conditions:
+        """Read the conditions under which the processor works now."""
+        bits = 0
+        for path in self._firmware:
+            bits |= _hexadecimal(_text(path))
+        low = bool(bits & UNDERVOLTAGE_BIT) or any(_number(path) for path in self._alarms)
+        cooled = any(_number(path) > 0 for path in self._coolers)
+        slow = (slow_clock(_policy(path)) for path in self._policies)
+        return Conditions(
+            low,
+            # The firmware sets the other bits for a low voltage as well.
+            cooled or (bool(bits & SLOWED_BITS) and not low),
+            sum(map(_number, self._throttle_counts)),
+            next((one for one in slow if one is not None), None),
+        )
+
+    def busiest(self, seconds: float) -> Program | None:
+        """Look at all processes twice, `seconds` apart, and return the busiest one.
+
+        Return None if no process uses a quarter of a processor or has enough priority to delay this
+        one, and if the kernel shows this user only its own processes.
+        """
+        before, began_ns = list(self.programs()), clock.mono_ns()
+        time.sleep(seconds)
+        passed_ns = clock.mono_ns() - began_ns
+        own = fields(_text(self._proc / "self/stat"))
+        priority = int(own[15]) if len(own) > 15 else 20
+        return busiest(before, self.programs(), passed_ns, priority)
+
+    def programs(self) -> Iterator[Program]:
+        """Yield the other processes that this user can see."""
+        own = str(os.getpid())
+        for name in os.listdir(self._proc):
+            if name.isdigit() and name != own:
+                try:
+                    yield program(_text(self._proc / name / "stat"), self._tick_ns)
+                except (ValueError, IndexError):
+                    # The process has ended.
+                    continue
+
+    def _pressures(self) -> Iterator[Path]:
+        # A sandbox may hide the first file (`ProcSubset=pid` of systemd).
+        yield self._proc / "pressure/io"
+        yield self._root / "sys/fs/cgroup/io.pressure"
+
+    def _cgroups(self) -> Iterator[Path]:
+        """Yield the places where the `cpu.stat` of this process's cgroup may be."""
+        mounted = self._root / "sys/fs/cgroup"
+        for line in _text(self._proc / "self/cgroup").splitlines():
+            controllers, path = line.split(":", 2)[1:]
+            if controllers and "cpu" not in controllers.split(","):
+                continue
+            # A container may see its own cgroup as the root.
+            yield mounted / controllers / path.strip("/") / "cpu.stat"
+            yield mounted / controllers / "cpu.stat"
+
+
+def _policy(directory: Path) -> dict[str, str]:
+    names = (
+        "scaling_driver", "scaling_governor", "scaling_max_freq", "scaling_min_freq",
+        "scaling_setspeed", "cpuinfo_max_freq",
+    )  # fmt: skip
+    return {name: _text(directory / name).strip() for name in names}
+
+
+def _number(path: Path) -> int:
+    try:
+        return int(_text(path))
+    except ValueError:
+        return 0
+
+
+def _hexadecimal(text: str) -> int:
+    try:
+        return int(text, 16)
+    except ValueError:
+        return 0
+
+
+def _text(path: Path) -> str:
+    try:
+        with open(path, "rb", buffering=0) as file:
+            return (file.read(16384) or b"").decode(errors="replace")
+    except OSError:
+        return ""

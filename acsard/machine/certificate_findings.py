@@ -1,0 +1,118 @@
+"""Examines the certificates of this machine and of the routers that it connects to.
+
+Each finding has the command that mends it, as a person can type it.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from acsard.core.config.settings import TLS, Config
+from acsard.core.messages.expiry import expiry, first
+from acsard.daemon.bus.certificate_watch import ends_of
+from acsard.daemon.bus.tls import (
+    AUTHORITY,
+    CA,
+    CERTIFICATE,
+    KEY,
+    common_name,
+    ends,
+    host_of,
+    require_usable,
+)
+from acsard.host.clock import now
+from acsard.host.errors import MendableError
+from acsard.host.extras import install
+from acsard.machine.certificates import CA_KEY, OWN
+from acsard.machine.finding import LEVELS, Finding
+
+
+def certificates(tls: str) -> Iterator[Finding]:
+    """Yield findings about the certificates in the directory `tls`; none if `tls` is "".
+
+    The findings say whether the files exist, are private and have not expired.
+    """
+    if not tls:
+        return
+    directory = Path(tls)
+    for name in (CA, CERTIFICATE, KEY):
+        file = directory / name
+        if not os.access(file, os.R_OK):
+            text = f"{file} is missing, or you may not read it"
+            yield Finding("certificates", "failure", text, _mend_of_absent(directory))
+        elif name == KEY and file.stat().st_mode & 0o077:
+            text, mend = f"other users may read {file}", f"chmod 600 {shlex.quote(str(file))}"
+            yield Finding("certificates", "failure", text, mend)
+    try:
+        require_usable(tls)
+    except MendableError as error:
+        yield Finding("certificates", "failure", str(error), _mend_of_absent(directory))
+        return
+    found = ends(tls)
+    level, words = expiry(found, now().wall_ns)
+    mend = renewal(tls, first(found)[0]) if found else f"run {install('tls')}, to read them"
+    yield Finding("certificates", LEVELS[level], f"{tls}: {words}", mend if level else "")
+
+
+def renewal(tls: str, whose: str) -> str:
+    """Return the commands that replace a certificate which ends soon.
+
+    Args:
+        tls: the directory of this machine's certificate.
+        whose: the owner of the certificate that ends first, as in `expiry`.
+    """
+    directory, name = Path(tls), common_name(tls)
+    if whose == AUTHORITY:
+        return (
+            f"on the machine that has {CA_KEY}, in the directory of that file, run `acsard tls "
+            "init --force --directory .`; then make and copy a new certificate for everybody"
+        )
+    if not whose and name == OWN:
+        there = "" if (directory / CA_KEY).exists() else f", after you have put {CA_KEY} there"
+        return f"run `{_command('renew', directory)}`{there}"
+    to = tls
+    if whose:
+        name, to = host_of(whose.rpartition(" ")[2]), "the router"
+    return (
+        f"on the machine that has {CA_KEY}, in the directory of that file, run `acsard tls renew "
+        f"--name {shlex.quote(name)} --directory .`; then copy clients/{name}/*.pem to {to}"
+    )
+
+
+def _mend_of_absent(directory: Path) -> str:
+    """Return what to do if a file of the directory cannot be used."""
+    if (directory / CA_KEY).exists():
+        return f"run `{_command('renew', directory)}`, or this command with sudo"
+    if not directory.is_dir() or not any(directory.iterdir()):
+        return f"run `{_command('init', directory)}`, or copy the files of `acsard tls add` there"
+    return (
+        f"run this command with sudo; or copy {CA}, {CERTIFICATE} and {KEY} there once more from "
+        f"the machine that has {CA_KEY}"
+    )
+
+
+def _command(action: str, directory: Path) -> str:
+    """Return the command line of an action of `acsard tls` in this directory.
+
+    With sudo it has the path of the program, because sudo does not search this user's PATH.
+    """
+    there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
+    program = "acsard"
+    if not os.access(there, os.W_OK):
+        found = shutil.which("acsard")
+        program = f"sudo {found or f'{sys.executable} -m acsard'}"
+    return f"{program} tls {action} --directory {shlex.quote(str(directory))}"
+
+
+def router_certificates(config: Config) -> Iterator[Finding]:
+    """Yield a finding about the certificate of each router that answers over TLS."""
+    tls = config.bus.tls
+    routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS)]
+    for whose, ends_ns in ends_of(routers, tls).items():
+        level, words = expiry({whose: ends_ns}, now().wall_ns)
+        yield Finding("router", LEVELS[level], words, renewal(tls, whose) if level else "")

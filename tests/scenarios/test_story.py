@@ -1,0 +1,495 @@
+"""A reader of one output of a recording learns what happened, when, why and by which client.
+
+The story has twelve incidents in three runs of the daemon. `acsard recording show`, the report and
+the exported `log` must tell all of them alike. The product has no battery yet, so a board that
+restarts, as after an undervoltage, stands for the empty battery.
+"""
+
+from __future__ import annotations
+
+import errno
+import html
+import io
+import os
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from msgspec.structs import replace
+
+from acsard.cli import main
+from acsard.core.config.settings import Config, McuConfig, RecordConfig
+from acsard.core.incoming.commands import Arrival
+from acsard.core.incoming.queries import Query
+from acsard.core.simulator import protocol
+from acsard.core.values import NS_PER_S, Latch, Latches
+from acsard.host.errors import Exit
+from acsard.recording import recorder as module
+from acsard.recording.directory import listed
+from acsard.recording.recorder import Recorder
+from tests.scenarios.speakers import Speaker, over
+from tests.scenarios.taped import chunks
+from tests.scenarios.world import World
+
+TOLERANCE_S = 1.0
+"""Largest difference between the time of an incident and the time of a line about it."""
+
+NAV, ANN, JOE, EVE = "nav2@robot", "ann@tablet", "joe@laptop", "eve@phone"
+ANNA, TOM = "anna@desk", "tom@train"
+IDENTITY = protocol.identity
+TOM_BY = rf"\(by {TOM}/[0-9a-f]{{16}}\)"
+
+
+class Line(NamedTuple):
+    """A line of an output."""
+
+    seconds: float
+    """Wall-clock time, s since 1970."""
+    text: str
+    """The name of the entry and its sentence, without the mark of its level."""
+
+
+class Incident(NamedTuple):
+    """An incident, and patterns for the lines that report it."""
+
+    name: str
+    wall_ns: int
+    patterns: tuple[str, ...]
+    """Each pattern must match a line within a second of the incident."""
+
+
+def signed(name: str) -> bytes:
+    return msgspec.json.encode({"sender": f"{name}/s3cret"})
+
+
+class Host:
+    """The computer of the robot: it runs the daemon, whose recorder writes when it is asked."""
+
+    def __init__(self, where: Path) -> None:
+        self.config = replace(
+            Config(mcu=McuConfig(port="/dev/ttyACM0", link_check="auto", encoder_counts=3200)),
+            record=RecordConfig(str(where), 100.0),
+        )
+        self.incidents: list[Incident] = []
+
+    def start(self, wall_ns: int, latches: Latches = Latches()) -> None:  # noqa: B008
+        """Start the daemon with a clock that shows `wall_ns`."""
+        self.recorder = Recorder(self.config, lambda event: self.world.loop._others.append(event))
+        self.world = World(self.config, recorder=self.recorder, latches=latches)
+        self.world.wall_offset_ns = wall_ns - self.world.now_ns
+
+    def note(self, name: str, *patterns: str, after: float = 0.0) -> None:
+        """Note that an incident happens `after` s from now."""
+        wall_ns = self.world.instant.wall_ns + int(after * NS_PER_S)
+        self.incidents.append(Incident(name, wall_ns, patterns))
+
+    def write(self) -> None:
+        """Write what the recorder's thread would write each second."""
+        self.recorder._writer.write(self.recorder._taken(), False)
+
+    def run(self, seconds: float) -> None:
+        self.world.run(seconds)
+        self.write()
+
+    def send(self, name: str, source: str, speed: float) -> None:
+        payload = msgspec.json.encode({"linear": {"x": speed}, "angular": {"z": 0.0}})
+        self.world.put(f"cmd/{source}", payload, attachment=signed(name))
+
+    def hold(self, name: str, source: str, speed: float, seconds: float) -> None:
+        """Send a speed at 20 Hz."""
+        for number in range(round(seconds * 20)):
+            self.send(name, source, speed)
+            self.world.run(0.05)
+            if number % 20 == 19:
+                self.write()
+        self.write()
+
+    def drive(self, seconds: float = 2.0) -> None:
+        """Let the navigation send zeros for a second, and then drive."""
+        self.hold(NAV, "nav", 0.0, 1.0)
+        self.hold(NAV, "nav", 0.5, seconds)
+        assert self.world.state.mode == "driving", self.world.state.reason
+
+    def call(self, service: str, name: str) -> None:
+        world, key = self.world, f"srv/{service}"
+        if service == "stop":
+            stop = Arrival(service, True, b"", "", world.now_ns, None, "", attachment=signed(name))
+            world.bus.arrivals.append(stop)
+        latch = msgspec.json.encode({"latch": world.state.latch})
+        payload = latch if service == "clear" else b""
+        query = Query(1, key, key, "", payload, "", world.now_ns, attachment=signed(name))
+        world.bus.queries.append(query)
+        self.run(0.05)
+
+    def crash(self) -> None:
+        """End the process without notice: the kernel closes its files."""
+        writer = self.recorder._writer
+        assert writer._writing is not None
+        assert writer._ring is not None
+        writer._writing.close()
+        writer._ring.close()
+
+
+def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
+    """Return the line with which a board names itself that an undervoltage has restarted."""
+    return IDENTITY(counts, watchdog_ms, sample).removesuffix(b"\r\n") + b" reset=brown-out\r\n"
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Let each sync fail as on a disk without free space."""
+
+    def refuse(handle: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(os, "fsync", refuse)
+        yield
+
+
+def by(name: str, source: str = "") -> str:
+    """Return a pattern for the client in a line, with its source if it has one."""
+    found = f"{re.escape(name)}/[0-9a-f]{{16}}"
+    return rf"\(by {source} \({found}\)\)" if source else rf"\(by {found} \(native\)\)"
+
+
+NINE = 1_800_000_000 * NS_PER_S
+"""The time at which the story begins by a right clock."""
+
+
+def first_run(host: Host) -> None:
+    """Play the incidents until the process crashes."""
+    host.start(NINE - 10 * 3600 * NS_PER_S)
+    host.note("start", "^start: the daemon starts")
+    host.run(3.0)
+    host.world.wall_offset_ns += 10 * 3600 * NS_PER_S
+    host.note("wrong clock", "^clock: the clock of this computer was set forward by 10 h")
+    host.run(2.0)
+
+    host.drive()
+    host.hold(ANN, "teleop", 0.0, 0.5)
+    waits = "waits: sends speeds and must wait: the robot follows"
+    host.note(
+        "two commanders", rf"^commander: nav \({NAV}/\w+\) -> teleop \({ANN}/\w+\)", after=-0.5
+    )
+    host.note(
+        "two commanders: why",
+        rf"^{waits} teleop \({ANN}/\w+\), which has the higher priority {by(NAV, 'nav')}",
+        after=1.0,
+    )
+    for _ in range(40):
+        host.send(NAV, "nav", 0.5)
+        host.send(ANN, "teleop", 0.3)
+        host.world.run(0.05)
+    host.write()
+    host.note(
+        "the first commander drives again",
+        rf"^commander: teleop .* -> nav \({NAV}/\w+\)",
+        after=0.5,
+    )
+    host.hold(NAV, "nav", 0.5, 2.0)
+    host.note(
+        "end of a drive of two commanders",
+        r"^drive: drove \d+\.\d\d m in \d+\.\d s \(by nav, teleop\)",
+    )
+    host.run(1.0)
+
+    host.hold(JOE, "app", 0.0, 1.0)
+    host.note(
+        "two commanders of one source",
+        rf"^{waits} app \({JOE}/\w+\), which came first {by(EVE, 'app')}",
+        after=1.3,
+    )
+    for number in range(40):
+        host.send(JOE, "app", 0.3)
+        host.send(EVE, "app", 0.2 if number > 5 else 0.0)
+        host.world.run(0.05)
+    host.run(1.0)
+
+    host.drive()
+    host.note(
+        "stop by anna",
+        f"^stop: stopped and latched; srv/clear releases it {by(ANNA)}",
+        rf"^mode: driving -> stopped: stopped by {ANNA}/\w+ \(native\)",
+        r"^drive: drove \d\.\d\d m in \d\.\d s \(by nav\)",
+    )
+    host.call("stop", ANNA)
+    host.run(2.0)
+    host.note("clear by anna", f"^clear: cleared; each sender must send a zero .* {by(ANNA)}")
+    host.call("clear", ANNA)
+    host.run(1.0)
+
+    host.note(
+        "neutral-first",
+        f"^reason: ready: send a zero first: nav must send a zero .* {by(NAV, 'nav')}",
+    )
+    host.note(
+        "neutral-first, for long",
+        f"^commands without effect: nav: send a zero first: .* for over 3 s {by(NAV, 'nav')}",
+        after=3.0,
+    )
+    host.hold(NAV, "nav", 0.5, 4.0)
+
+    host.drive()
+    host.note(
+        "cable pulled",
+        "^link down: the serial port is closed; it is being reopened",
+        "^mode: driving -> waiting: /dev/ttyACM0 was lost",
+        r"^drive: drove \d\.\d\d m in \d\.\d s \(by nav\)",
+    )
+    host.world.port.unplug()
+    host.world.port.trouble = "/dev/ttyACM0 was lost; reopening it"
+    host.run(3.0)
+    host.note("cable plugged in", "^link up: linked", after=0.1)
+    host.world.port.trouble = ""
+    host.world.port.plug(host.world.mcu)
+    host.run(3.0)
+
+    host.drive()
+    host.note(
+        "undervoltage of the board",
+        "^link stale: the microcontroller has fallen silent",
+        "^board: the microcontroller names itself, .* reset=brown-out",
+        "^mode: driving -> waiting:",
+        r"^drive: drove \d\.\d\d m in \d\.\d s \(by nav\)",
+        after=0.3,
+    )
+    host.world.mcu.reset(host.world.now_ns, 1_000_000_000)
+    host.run(4.0)
+
+    host.drive()
+    host.note(
+        "congested Wi-Fi",
+        rf"^command refused: .*stale.*: the network delayed it, .* {TOM_BY}",
+        after=3.6,
+    )
+    speaker = Speaker(host.world, "client", f"{TOM}/s3cret")
+    speaker.open()
+    over(host.world, speaker, lambda t: 0.6 if t > 1.0 else 0.005, lambda t: 0.4, 3.0)
+    host.run(1.0)
+
+    host.drive()
+    host.note(
+        "late host",
+        r"^link late: this computer did not run for 0\.60 s",
+        r"^missed periods: \d+ x missed",
+        "^mode: driving -> waiting: this computer did not run",
+        after=0.6,
+    )
+    host.world.stall(0.6)
+    host.run(1.5)
+
+    host.drive()
+    host.note(
+        "damaged board",
+        "^wheel fault: .*front_left wheel is left out .* check its encoder",
+        "^fault: front_left wheel turns against its command: check the motor's leads",
+        "^mode: driving -> fault: front_left wheel",
+        after=0.3,
+    )
+    with host.world.mcu.reversed_encoder(1):
+        host.hold(NAV, "nav", 0.5, 2.0)
+    host.run(1.0)
+    host.note("the fault is cleared by anna", f"^clear: cleared; .* {by(ANNA)}")
+    host.call("clear", ANNA)
+
+    host.drive()
+    host.note(
+        "full disk",
+        "^cut: the disk accepted no more data",
+        r"^drive: was driving, .* so far \(by nav\)",
+        after=1.0,
+    )
+    with full_disk():
+        host.hold(NAV, "nav", 0.5, 2.0)
+    host.hold(NAV, "nav", 0.5, 4.0)
+    host.note(
+        "the disk has room again",
+        r"^recording: to .* again; \d+ steps are missing \(.*No space left on device\)",
+        r"^continues: an earlier recording goes on here: driving, link up, .* \(by nav\)",
+    )
+    host.hold(NAV, "nav", 0.5, 4.0)
+    host.note(
+        "crash while driving",
+        r"^drive: was driving, \d\.\d\d m in \d\.\d s so far, .* \(by nav\)",
+        "^cut: the daemon or the computer ended without notice",
+    )
+    host.crash()
+
+
+def second_run(host: Host) -> None:
+    """Restart after the crash, drive, and end in the ordinary way."""
+    host.start(host.world.instant.wall_ns + 5 * NS_PER_S)
+    host.note("restart after the crash", "^start: the daemon starts")
+    host.run(2.0)
+    host.drive()
+    host.note(
+        "ordinary end",
+        "^end: the daemon received the request to end",
+        "^mode: driving -> shutdown: the daemon is going down",
+        r"^drive: drove \d\.\d\d m in \d\.\d s \(by nav\)",
+    )
+    host.world.loop.shutting_down = True
+    host.run(0.5)
+    host.recorder.close()
+
+
+def third_run(host: Host) -> None:
+    """Restart a robot that anna has stopped before."""
+    wall_ns = host.world.instant.wall_ns
+    client = f"{ANNA}/0123456789abcdef (native)"
+    stop = Latch(1, wall_ns, client, f"stopped by {client}", kept=True)
+    host.start(wall_ns + 60 * NS_PER_S, Latches(stop=stop))
+    host.note(
+        "restart of a stopped robot",
+        "^start: the daemon starts",
+        rf"^mode: start -> stopped: was stopped by {ANNA}/\w+ \(native\) .* before the restart",
+    )
+    host.run(2.0)
+    host.recorder.close()
+
+
+def seconds_of(text: str, date: str = "") -> float:
+    """Return a local time like 2027-01-15 08:00:59.950 in s since 1970.
+
+    `date` is the date of a time that has none.
+    """
+    whole, _, fraction = (text if "-" in text else f"{date} {text}").partition(".")
+    return time.mktime(time.strptime(whole, "%Y-%m-%d %H:%M:%S")) + float(f"0.{fraction}")
+
+
+def shown(*words: str) -> list[Line]:
+    """Return the lines of `acsard recording show`."""
+    with redirect_stdout(io.StringIO()) as printed:
+        assert main(["recording", "show", *words]) == 0
+    rows = [row.split("  ", 1) for row in printed.getvalue().splitlines()]
+    return [Line(seconds_of(at), re.sub("^!!? ", "", text)) for at, text in rows]
+
+
+def reported(where: Path, directory: Path) -> list[Line]:
+    """Return the lines of the lists of events in the reports, in the order of the recordings."""
+    assert main(["recording", "report", "all", "--directory", str(where)]) == 0
+    cells = (
+        r'<td class="time">(.*?)</td><td class="name .*?">(.*?)</td><td>(.*?)</td><td>(.*?)</td>'
+    )
+    found = []
+    for path in sorted(directory.glob("*.html")):
+        page = path.read_text(encoding="utf-8")
+        (began,) = re.findall(r"<dt>When</dt><dd>(\S+) ", page)
+        for row in re.findall(f"<tr>{cells}</tr>", page):
+            at, name, text, client = map(html.unescape, row)
+            who = f" (by {client})" if client else ""
+            found.append(Line(seconds_of(at, began), f"{name}: {text}{who}"))
+    return found
+
+
+def exported(where: Path, directory: Path) -> list[Line]:
+    """Return the lines of the topic `log` in the exports, in the order of the recordings."""
+    assert main(["recording", "export", "all", "--directory", str(where)]) == 0
+    return [line for path in sorted(directory.glob("*.ros2.mcap")) for line in log_of(path)]
+
+
+def log_of(path: Path) -> list[Line]:
+    """Return the lines of the topic `log` in an exported file."""
+    found = []
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for decoded in reader.iter_decoded_messages("/log"):
+            message = decoded.decoded_message
+            seconds = message.stamp.sec + message.stamp.nanosec / 1e9
+            text = f"{message.name.replace('_', ' ')}: {message.msg}"
+            found.append(Line(seconds, text))
+    return found
+
+
+class Story(NamedTuple):
+    """The incidents, and the lines of each output."""
+
+    incidents: list[Incident]
+    outputs: dict[str, list[Line]]
+    where: Path
+    """The directory of the recordings."""
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
+    where, here = tmp_path_factory.mktemp("story") / "record", tmp_path_factory.mktemp("here")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(module, "FLUSH_S", 1000.0)
+        patched.setattr(module, "CLOSE_S", 20.0)
+        patched.setattr(protocol, "identity", identity)
+        patched.chdir(here)
+        host = Host(where)
+        for run in (first_run, second_run, third_run):
+            run(host)
+        outputs = {
+            "show": shown("all", "--directory", str(where)),
+            "report": reported(where, here),
+            "export": exported(where, here),
+        }
+    return Story(host.incidents, outputs, where)
+
+
+def is_near(line: Line, incident: Incident) -> bool:
+    """Return whether a line has the time of an incident."""
+    return abs(line.seconds - incident.wall_ns / NS_PER_S) <= TOLERANCE_S
+
+
+@pytest.mark.parametrize("output", ["show", "report", "export"])
+def test_one_output_alone_tells_what_happened_when_why_and_by_which_client(
+    output: str, story: Story
+) -> None:
+    lines = story.outputs[output]
+    missing = [
+        (incident.name, pattern)
+        for incident in story.incidents
+        for pattern in incident.patterns
+        if not any(is_near(line, incident) and re.search(pattern, line.text) for line in lines)
+    ]
+    assert missing == []
+
+
+def test_the_three_outputs_have_the_same_lines_at_the_same_times(story: Story) -> None:
+    show = story.outputs["show"]
+    assert len(show) > 80
+    for output in ("report", "export"):
+        lines = story.outputs[output]
+        assert [line.text for line in lines] == [line.text for line in show], output
+        apart = [abs(one.seconds - other.seconds) for one, other in zip(lines, show, strict=True)]
+        assert max(apart) < 0.002, output
+
+
+@pytest.mark.parametrize(("begin", "end"), [(18.5, 19.5), (7.0, 9.7), (0.0, 6.0)])
+def test_show_and_export_of_a_part_have_the_same_lines(
+    begin: float, end: float, story: Story, tmp_path: Path
+) -> None:
+    """A drive that goes on at the end of the part has a line in both."""
+    first, new = str(listed(story.where)[0]), tmp_path / "new.mcap"
+    times = ["--from", str(begin), "--to", str(end)]
+    assert main(["recording", "export", first, str(new), *times]) == 0
+    show = shown(first, *times)
+    assert show[-1].text.startswith("drive: was driving, ")
+    assert [line.text for line in log_of(new)] == [line.text for line in show]
+
+
+def test_show_and_export_of_a_damaged_recording_have_the_same_lines(
+    story: Story, tmp_path: Path
+) -> None:
+    """The export has no messages of the steps behind the damage, but their events."""
+    bad, new = tmp_path / "bad.mcap", tmp_path / "new.mcap"
+    data = bytearray(listed(story.where)[0].read_bytes())
+    begin, end = chunks(data)[4]
+    data[(begin + end) // 2] ^= 0xFF
+    bad.write_bytes(data)
+    assert main(["recording", "export", str(bad), str(new)]) == Exit.INCOMPLETE
+    show = shown(str(bad))
+    (gap,) = [number for number, line in enumerate(show) if line.text.startswith("gap: ")]
+    assert len(show) - gap > 20
+    assert [line.text for line in log_of(new)] == [line.text for line in show]

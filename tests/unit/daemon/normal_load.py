@@ -1,0 +1,73 @@
+"""Records latenesses without a cause in the kernel, under the load that the machine has.
+
+    python -m tests.unit.daemon.normal_load FILE SECONDS
+
+A thread keeps periods of 10 ms as the control loop does, and is late by sleeping. The kernel's
+counters show no cause of that, whatever other programs do meanwhile. Each line of the file is one
+lateness as the watch judges it. A lateness that the machine itself caused must not be in the file,
+so a lateness for which the thread waited for a processor is left out. The output says how many.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+
+from acsard.core.values import NS_PER_S
+from acsard.daemon import late_watch
+from acsard.daemon.late_causes import Lateness
+from acsard.daemon.late_watch import LateWatch
+from acsard.host import clock
+from acsard.host.kernel_counters import Kernel
+
+PERIOD_S = 0.01
+
+SIZES_S = (0.012, 0.02, 0.035, 0.06, 0.1, 0.2)
+
+EVERY = 60
+"""Periods from one lateness to the next."""
+
+
+class Noting(LateWatch):
+    """A watch that notes each lateness instead of reporting it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.noted: list[Lateness] = []
+
+    def _report(self, kernel: Kernel, late: Lateness) -> None:
+        self.noted.append(late)
+
+
+def record(seconds: float) -> list[Lateness]:
+    """Make a lateness in every `EVERY` periods, and return all of them."""
+    late_watch.PAUSE_NS = 0
+    with Noting() as watch:
+        due = time.monotonic()
+        end, number = due + seconds, 0
+        while time.monotonic() < end:
+            due += PERIOD_S
+            time.sleep(max(0.0, due - time.monotonic()))
+            late = time.monotonic() - due
+            missed = int(late / PERIOD_S)
+            watch.period(clock.mono_ns(), int(late * NS_PER_S), missed)
+            due += PERIOD_S * missed
+            number += 1
+            if number % EVERY == 0:
+                time.sleep(SIZES_S[number // EVERY % len(SIZES_S)])
+        return watch.noted
+
+
+def main() -> None:
+    path, seconds = Path(sys.argv[1]), float(sys.argv[2])
+    noted = record(seconds)
+    kept = [one for one in noted if one.loop.waited_ns < 0.5 * one.late_ns]
+    path.write_bytes(b"".join(msgspec.json.encode(one) + b"\n" for one in kept))
+    print(f"{len(kept)} kept, {len(noted) - len(kept)} waited for a processor")
+
+
+if __name__ == "__main__":
+    main()

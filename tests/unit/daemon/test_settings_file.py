@@ -1,0 +1,524 @@
+"""The daemon names the settings that its next start would not have, and writes them if asked."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
+from acsard.core.values import Answer, Event, Latches, Plain, Request
+from acsard.daemon import settings_file as module
+from acsard.daemon.settings_file import SettingsFile, keeps
+from acsard.host import config_file, edit_process
+from acsard.host.config_file import Edit
+from acsard.host.edit_process import edited_apart
+
+TEXT = "[limits]\nlinear_speed = 0.5\n"
+LOWERED = "limits.linear_speed = 0.3, not 0.5"
+
+Started = Callable[..., SettingsFile]
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
+    """Yield a function that starts to watch a file, and end all of them afterwards."""
+    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    files: list[SettingsFile] = []
+
+    def start(file: Path | None, config: Config, options: dict[str, object]) -> SettingsFile:
+        made = SettingsFile(file, lambda text: parse(text, {"limits": options}), config)
+        files.append(made)
+        made.start()
+        return made
+
+    yield start
+    for one in files:
+        one.close()
+
+
+def until(look: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 10.0
+    while not look():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
+def with_speed(config: Config, speed: float) -> Config:
+    return replace(config, limits=replace(config.limits, linear_speed=speed))
+
+
+def test_a_setting_that_was_changed_is_named_until_it_is_changed_back(
+    tmp_path: Path, started: Started
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    config = parse(file.read_bytes())
+    made = started(file, config, {})
+    made.use(with_speed(config, 0.3))
+    until(lambda: made.differ == LOWERED)
+    made.use(config)
+    until(lambda: made.differ == "")
+
+
+def test_an_edited_file_is_compared_again(tmp_path: Path, started: Started) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, with_speed(parse(TEXT.encode()), 0.3), {})
+    until(lambda: made.differ == LOWERED)
+    file.write_text(TEXT.replace("0.5", "0.30"))
+    until(lambda: made.differ == "")
+
+
+def test_an_option_of_the_daemon_is_no_difference(tmp_path: Path, started: Started) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    options: dict[str, object] = {"linear_speed": 0.4}
+    config = parse(TEXT.encode(), {"limits": options})
+    made = started(file, config, options)
+    made.use(with_speed(config, 0.3))
+    until(lambda: made.differ == LOWERED.replace("0.5", "0.4"))
+    made.use(config)
+    until(lambda: made.differ == "")
+
+
+def test_a_daemon_without_a_file_is_compared_with_its_start(started: Started) -> None:
+    made = started(None, Config(), {})
+    made.use(with_speed(Config(), 0.3))
+    until(lambda: "linear_speed = 0.3, not" in made.differ)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"[limits\n", "the file cannot be used at the next start: not TOML"),
+        (b"[limits]\nlinear_sped = 1\n", "the file cannot be used at the next start: limits."),
+        (None, "the file cannot be read: No such file or directory"),
+    ],
+)
+def test_a_file_with_which_the_daemon_cannot_start_is_reported(
+    tmp_path: Path, started: Started, text: bytes | None, words: str
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    if text is None:
+        file.unlink()
+    else:
+        file.write_bytes(text)
+    until(lambda: made.differ.startswith(words))
+    file.write_text(TEXT)
+    until(lambda: made.differ == "")
+
+
+def test_the_text_is_short_when_every_setting_differs(tmp_path: Path, started: Started) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(
+        "[limits]\n"
+        + "".join(
+            f"{name} = {getattr(Config().limits, name) * 0.9 + 0.1}\n"
+            for name in Config().limits.__struct_fields__
+        )
+    )
+    made = started(file, Config(), {})
+    until(lambda: " more" in made.differ)
+    assert len(made.differ) <= module.MAX_TEXT
+
+
+# a `set` that is to be kept
+
+REQUEST = Request("set", 7, by="anna", settings={"limits.linear_speed": 0.8})
+OBEYED = Answer(7, True, "limits.linear_speed = 0.8 (was 0.5)")
+
+
+def result(made: SettingsFile, events: list[Event] | None = None) -> Request | Answer:
+    """Return the next result, long before any answer is overdue."""
+    found: list[Request | Answer] = []
+
+    def look() -> bool:
+        found.extend(made.results(0, [] if events is None else events))
+        return bool(found)
+
+    until(look)
+    (one,) = found
+    return one
+
+
+def test_a_setting_is_written_after_the_robot_has_obeyed(tmp_path: Path, started: Started) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(f"# mine\n{TEXT}")
+    config, events = parse(file.read_bytes()), list[Event]()
+    made = started(file, config, {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+    assert file.read_text() == f"# mine\n{TEXT}"
+    made.use(with_speed(config, 0.8))
+    assert made.obeyed(OBEYED)
+    assert result(made, events) == Answer(7, True, f"{OBEYED.message}; written to {file}")
+    assert file.read_text() == f"# mine\n{TEXT.replace('0.5', '0.8')}"
+    (event,) = events
+    assert (event.name, event.by) == ("set", "anna")
+    assert event.text == f"limits.linear_speed to {file}"
+    until(lambda: made.differ == "")
+    assert made.results(10**12, events) == []
+    assert os.listdir(tmp_path) == ["acsard.toml"]
+
+
+def test_a_setting_that_the_robot_refuses_is_not_written(tmp_path: Path, started: Started) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+    assert not made.obeyed(Answer(7, False, "stop the robot first"))
+    assert made.results(10**12, []) == []
+    assert file.read_text() == TEXT
+
+
+def test_an_answer_to_another_request_is_not_for_the_file(started: Started) -> None:
+    assert not started(None, Config(), {}).obeyed(OBEYED)
+
+
+def read_only(file: Path) -> None:
+    file.chmod(0o444)
+
+
+def broken(file: Path) -> None:
+    file.write_text("[limits\n")
+
+
+def tracked(file: Path) -> None:
+    for words in (["init", "-q"], ["add", file.name]):
+        subprocess.run(["git", *words], cwd=file.parent, check=True)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "settings", "words"),
+    [
+        (read_only, {}, "it is read-only for the daemon"),
+        (broken, {}, "was not changed: not TOML"),
+        (tracked, {}, "git tracks it"),
+        (
+            None,
+            {"commands.sources.app.timeout": 0.3},
+            "in [[commands.sources]] cannot be changed there",
+        ),
+    ],
+)
+def test_nothing_is_set_if_the_file_cannot_be_changed(
+    tmp_path: Path,
+    started: Started,
+    spoil: Callable[[Path], None] | None,
+    settings: dict[str, Plain],
+    words: str,
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    if spoil is not None:
+        spoil(file)
+    before = file.read_text()
+    made.keep(replace(REQUEST, settings=settings or REQUEST.settings), 0)
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert not answer.success
+    assert answer.message.startswith("nothing is set: ")
+    assert words in answer.message
+    assert file.read_text() == before
+
+
+def test_nothing_is_set_if_the_daemon_has_no_file(started: Started) -> None:
+    made = started(None, Config(), {})
+    made.keep(REQUEST, 0)
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert answer.message.startswith("nothing is set: the daemon runs without a configuration file")
+
+
+def test_a_file_beside_tracked_ones_is_changed(tmp_path: Path, started: Started) -> None:
+    other, file = tmp_path / "tracked.toml", tmp_path / "acsard.toml"
+    other.write_text(TEXT)
+    tracked(other)
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("limits.linear_sped", 1.0, "limits.linear_sped"),
+        ("mcu.baud_rate", 9600, "read only when the daemon starts"),
+        ("limits.linear_speed", -1.0, "limits.linear_speed"),
+    ],
+)
+def test_settings_that_the_robot_would_refuse_are_refused_in_its_words(
+    tmp_path: Path, started: Started, key: str, value: float, words: str
+) -> None:
+    made = started(tmp_path / "absent.toml", Config(), {})
+    made.keep(replace(REQUEST, settings={key: value}), 0)
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert not answer.success
+    assert words in answer.message
+    assert "absent.toml" not in answer.message
+
+
+def test_a_file_that_changes_between_check_and_writing_keeps_both_changes(
+    tmp_path: Path, started: Started
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+    file.write_text(f"# new\n{TEXT}[rates]\nstate = 5.0\n")
+    assert made.obeyed(OBEYED)
+    assert result(made) == Answer(7, True, f"{OBEYED.message}; written to {file}")
+    assert file.read_text() == f"# new\n{TEXT.replace('0.5', '0.8')}[rates]\nstate = 5.0\n"
+
+
+def test_a_failure_after_the_robot_has_obeyed_is_no_success(
+    tmp_path: Path, started: Started
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+    read_only(file)
+    assert made.obeyed(OBEYED)
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert not answer.success
+    assert answer.message.startswith(f"{OBEYED.message}; until the next start: {file} was not")
+
+
+@pytest.mark.parametrize("obeyed", [False, True])
+def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch, obeyed: bool
+) -> None:
+    file, begun, hangs = tmp_path / "acsard.toml", threading.Event(), threading.Event()
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+
+    def hang(*_: object) -> Edit:
+        begun.set()
+        hangs.wait()
+        return Edit(file, {}, b"", "")
+
+    if obeyed:
+        made.keep(REQUEST, 0)
+        assert result(made) is REQUEST
+    monkeypatch.setattr(module, "keep", hang)
+    monkeypatch.setattr(module, "keepable", hang)
+    if obeyed:
+        assert made.obeyed(OBEYED)
+    else:
+        made.keep(REQUEST, 0)
+    assert begun.wait(10.0)
+    assert made.results(module.PATIENCE_NS, []) == []
+    (answer,) = made.results(module.PATIENCE_NS + 1, [])
+    assert isinstance(answer, Answer)
+    assert not answer.success
+    assert "the disk did not answer within 2.5 s" in answer.message
+    assert answer.message.startswith(OBEYED.message if obeyed else "nothing is set")
+    hangs.set()
+    until(lambda: made._results.waiting)
+    assert made.results(0, []) == []
+
+
+def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
+    tmp_path: Path, started: Started
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    config, latches = parse(file.read_bytes()), Latches()
+    made = started(file, config, {})
+    assert made.latches(latches, with_speed(config, 0.3).limits) is latches
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+    assert made.obeyed(OBEYED)
+    result(made)
+    kept, limits = with_speed(config, 0.8).limits, with_speed(config, 0.6).limits
+    assert made.latches(latches, kept).lowered == {}
+    # The robot itself compares with 0.5, the limit of its start.
+    to_keep = made.latches(latches, limits)
+    assert to_keep.lowered == {"limits.linear_speed": 0.6}
+    assert made.latches(latches, limits) is to_keep
+
+
+def test_keep_is_recognized_in_every_notation() -> None:
+    text = rb'{"settings": {"limits.linear_speed": 0.8}, "\u006beep": true}'
+    assert keeps("application/json", text)
+    assert not keeps("application/json", text.replace(b"true", b"false"))
+
+
+def test_a_pipe_in_place_of_the_file_is_not_read(tmp_path: Path, started: Started) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    file.unlink()
+    os.mkfifo(file)
+    until(lambda: made.differ == "the file cannot be read: it is not a regular file")
+    made.keep(REQUEST, 0)
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert "it is not a regular file" in answer.message
+
+
+def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, hangs, checked = tmp_path / "acsard.toml", threading.Event(), list[object]()
+    file.write_text(TEXT)
+
+    def slow(*words: object) -> Edit:
+        checked.append(words)
+        hangs.wait()
+        return Edit(file, {}, b"", "")
+
+    monkeypatch.setattr(module, "keepable", slow)
+    made = started(file, Config(), {})
+    for number in range(1, module.JOBS + 11):
+        made.keep(replace(REQUEST, id=number), 0)
+    until(lambda: checked)
+    refused = [one.id for one in made.results(0, []) if isinstance(one, Answer)]
+    assert refused == [*range(module.JOBS + 1, module.JOBS + 11)]
+    assert len(made.results(module.PATIENCE_NS + 1, [])) == module.JOBS
+    hangs.set()
+    until(lambda: not made._box.waiting)
+    made.keep(replace(REQUEST, id=99), 0)
+    assert result(made) == replace(REQUEST, id=99)
+    assert len(checked) == 2  # the first one, which hung, and the last one
+
+
+def test_changed_settings_do_not_displace_a_change_of_the_file(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, hangs = tmp_path / "acsard.toml", threading.Event()
+    file.write_text(TEXT)
+    config = parse(TEXT.encode())
+    made = started(file, config, {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+    read = SettingsFile._read
+    monkeypatch.setattr(SettingsFile, "_read", lambda self: hangs.wait() and read(self))
+    assert made.obeyed(OBEYED)
+    for _ in range(2 * module.JOBS):
+        made.use(with_speed(config, 0.8))
+    hangs.set()
+    assert result(made) == Answer(7, True, f"{OBEYED.message}; written to {file}")
+
+
+def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, hangs, done = tmp_path / "acsard.toml", threading.Event(), list[str]()
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+
+    def slow(*_: object) -> Edit:
+        done.append("check")
+        hangs.wait()
+        return Edit(file, {}, b"", "")
+
+    monkeypatch.setattr(module, "keepable", slow)
+    monkeypatch.setattr(module, "keep", lambda edit: done.append("write"))
+    for number in (8, 9):
+        made.keep(replace(REQUEST, id=number), 0)
+    until(lambda: done)
+    assert made.obeyed(OBEYED)
+    hangs.set()
+    until(lambda: len(done) == 3)
+    assert done == ["check", "write", "check"]
+
+
+def test_an_editor_that_writes_while_the_change_is_computed_loses_nothing(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, texts = tmp_path / "acsard.toml", ["# second\n"]
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+
+    def edited(text: str, keys: Mapping[str, object]) -> str:
+        changed = edited_apart(text, keys)
+        if texts:
+            file.write_text(texts.pop() + file.read_text())
+        return changed
+
+    monkeypatch.setattr(config_file, "edited_apart", edited)
+    file.write_text(f"# first\n{TEXT}")
+    assert made.obeyed(OBEYED)
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert answer.success
+    assert file.read_text() == f"# second\n# first\n{TEXT.replace('0.5', '0.8')}"
+
+
+def test_the_directory_is_on_the_disk_before_the_answer(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, synced = tmp_path / "acsard.toml", list[tuple[Path, bool]]()
+    file.write_text(TEXT)
+
+    def sync(path: Path) -> None:
+        synced.append((path, "0.8" in file.read_text()))
+        raise OSError(errno.EINVAL, "this file system cannot")
+
+    monkeypatch.setattr(config_file, "sync", sync)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+    assert made.obeyed(OBEYED)
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert answer.success
+    assert synced == [(tmp_path, True)]
+
+
+def test_the_text_is_computed_where_the_priority_cannot_be_lowered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The unit of the service blocks the system call."""
+
+    def refuse(increment: int) -> int:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    task = msgspec.json.encode(edit_process.Task(TEXT, {"limits.linear_speed": 0.8}))
+    given, answer = io.TextIOWrapper(io.BytesIO(task)), io.TextIOWrapper(io.BytesIO())
+    monkeypatch.setattr(os, "nice", refuse)
+    monkeypatch.setattr(sys, "stdin", given)
+    monkeypatch.setattr(sys, "stdout", answer)
+    edit_process.main()
+    answer.seek(0)
+    made = msgspec.json.decode(answer.read(), type=edit_process.Result)
+    assert made == edit_process.Result(TEXT.replace("0.5", "0.8"))
+
+
+def test_git_does_not_read_the_repository_of_another_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its configuration names programs, which would run with the rights of the daemon."""
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    tracked(file)
+    assert config_file.is_tracked(file)
+    monkeypatch.setenv("GIT_TEST_ASSUME_DIFFERENT_OWNER", "1")
+    assert not config_file.is_tracked(file)

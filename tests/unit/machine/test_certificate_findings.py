@@ -1,0 +1,162 @@
+"""The doctor names the certificate that ends, and its advice works as it is printed."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from acsard.cli import main
+from acsard.core.config.settings import BusConfig, Config
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus import certificate_watch
+from acsard.daemon.bus.tls import AUTHORITY, ends, require_usable
+from acsard.host import clock
+from acsard.machine.authority import Authority
+from acsard.machine.certificate_findings import certificates, renewal, router_certificates
+from acsard.machine.finding import Finding
+
+DAY_NS = 86400 * NS_PER_S
+
+PEM = ("ca.pem", "certificate.pem", "key.pem")
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Path:
+    """Return an authority's directory with a certificate for robot4."""
+    directory = tmp_path / "fleet"
+    assert main(["tls", "init", "--directory", str(directory)]) == 0
+    assert main(["tls", "add", "robot4", "--directory", str(directory)]) == 0
+    return directory
+
+
+def finding(directory: Path) -> Finding:
+    (found,) = certificates(str(directory))
+    return found
+
+
+def days_left(directory: Path) -> int:
+    return round((ends(str(directory))[""] - clock.now().wall_ns) / DAY_NS)
+
+
+def typed(mend: str, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Type the command of an advice in this directory."""
+    (command,) = re.findall(r"`acsard ([^`]+)`", mend)
+    monkeypatch.chdir(where)
+    assert main(shlex.split(command)) == 0
+
+
+def test_sound_certificates_need_no_advice(fleet: Path) -> None:
+    told = Finding("certificates", "ok", f"{fleet}: valid for 730 days")
+    assert finding(fleet) == told
+
+
+def test_the_robots_own_certificate_is_renewed_as_printed(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
+    told = finding(fleet)
+    assert (told.level, told.text) == ("warning", f"{fleet}: valid for 10 days")
+    typed(told.mend, fleet, monkeypatch)
+    assert finding(fleet).level == "ok"
+
+
+def test_without_the_authoritys_key_the_advice_asks_for_it(fleet: Path) -> None:
+    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
+    (fleet / "ca-key.pem").unlink()
+    assert finding(fleet).mend.endswith(", after you have put ca-key.pem there")
+
+
+@pytest.mark.parametrize("days", [9.9, -3.0])
+def test_a_robot_of_a_fleet_is_renewed_as_printed(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: float
+) -> None:
+    """The directory of robot4 on the robot has no key of the authority."""
+    Authority.load(fleet, str).issue(fleet / "clients" / "robot4", "robot4", ["10.0.0.4"], days)
+    there = tmp_path / "etc tls"
+    shutil.copytree(fleet / "clients" / "robot4", there)
+    told = finding(there)
+    assert told.level == ("warning" if days > 0 else "failure")
+    typed(told.mend, fleet, monkeypatch)
+    assert told.mend.endswith(f"; then copy clients/robot4/*.pem to {there}")
+    for name in PEM:
+        shutil.copy(fleet / "clients" / "robot4" / name, there)
+    require_usable(str(there))
+    assert (finding(there).level, days_left(there)) == ("ok", 730)
+
+
+def test_the_advice_about_an_authority_makes_a_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = tmp_path / "fleet"
+    Authority.make(directory, "fleet", 2).issue(directory, "robot", [], 700)
+    told = finding(directory)
+    assert told.text == f"{directory}: valid for 10 days (that of the authority)"
+    typed(told.mend, directory, monkeypatch)
+    assert finding(directory).level == "ok"
+
+
+def test_the_advice_about_a_router_names_its_certificate(fleet: Path) -> None:
+    told = renewal(str(fleet / "clients" / "robot4"), "the router tls/router.local:7447")
+    assert "`acsard tls renew --name router.local --directory .`" in told
+    assert told.endswith("then copy clients/router.local/*.pem to the router")
+    assert "init --force" in renewal(str(fleet), AUTHORITY)
+
+
+def test_the_end_of_each_router_that_answers_is_a_finding(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end_ns = clock.now().wall_ns + 9 * DAY_NS
+    ends_ns = {"tls/router.local:7447": end_ns, "tls/away.local:7447": None}
+    monkeypatch.setattr(certificate_watch, "peer_ends_ns", lambda one, tls: ends_ns[one])
+    bus = BusConfig(
+        mode="client", connect=("tcp/127.0.0.1:7447", *ends_ns), tls=str(fleet / "clients/robot4")
+    )
+    (told,) = router_certificates(Config(bus=bus))
+    assert (told.subject, told.level) == ("router", "warning")
+    assert told.text == "valid for 9 days (that of the router tls/router.local:7447)"
+    assert "--name router.local" in told.mend
+
+
+def test_a_directory_without_files_gets_a_first_certificate_as_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = tmp_path / "tls"
+    told = [*certificates(str(directory))]
+    assert {one.level for one in told} == {"failure"}
+    first, *_ = re.findall(r"`(acsard tls init [^`]+)`", told[0].mend)
+    typed(f"`{first}`", tmp_path, monkeypatch)
+    assert finding(directory).level == "ok"
+
+
+def test_a_missing_key_beside_the_authoritys_key_is_made_as_printed(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (fleet / "key.pem").unlink()
+    typed(next(iter(certificates(str(fleet)))).mend, fleet, monkeypatch)
+    assert finding(fleet).level == "ok"
+
+
+def test_a_missing_key_of_a_robot_of_a_fleet_does_not_lead_to_a_new_authority(fleet: Path) -> None:
+    own = fleet / "clients" / "robot4"
+    (own / "key.pem").unlink()
+    for one in certificates(str(own)):
+        assert "tls init" not in one.mend
+        assert "copy ca.pem, certificate.pem and key.pem there once more" in one.mend
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_directory_of_root_needs_sudo_with_the_path_of_the_program(fleet: Path) -> None:
+    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
+    fleet.chmod(0o555)
+    assert re.match(r"run `sudo /\S+acsard tls renew --directory ", finding(fleet).mend)
+
+
+def test_a_key_that_others_may_read_is_made_private(fleet: Path) -> None:
+    (fleet / "key.pem").chmod(0o644)
+    (told, _) = certificates(str(fleet))
+    assert told.mend == f"chmod 600 {fleet}/key.pem"
