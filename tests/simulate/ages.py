@@ -117,7 +117,7 @@ class Ages:
             allowed += int((1.0 + minutes) * NS)
         if clock.loose or age <= prompt + allowed:
             fresh = True
-        elif least is None or self._falls(recent, age, arrived_ns, min(timeout_ns, 2 * NS)):
+        elif least is None or self._falls(clock, age, arrived_ns, min(timeout_ns, 2 * NS)):
             fresh = False
         else:
             fresh = age <= least + allowed
@@ -128,12 +128,17 @@ class Ages:
             recent.append((arrived_ns, age))
         return fresh
 
-    def _falls(self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int) -> bool:
-        """Return whether the delays cannot have looked constant for the time of a proof."""
+    def _falls(self, clock: Clock, age: int, now_ns: int, proof_ns: int) -> bool:
+        """Return whether the delays cannot have looked constant for the time of a proof.
+
+        If the robot has followed this clock, they must be lower than in the 3 s before. One late
+        message before a prompt one does not look like a backlog then.
+        """
+        recent = clock.recent
         window = [(at, d) for at, d in recent if at >= now_ns - proof_ns - MARGIN_NS]
         if not window or window[0][0] > now_ns - proof_ns + MARGIN_NS:
             return recent[0][0] > now_ns - proof_ns if recent else True
         middle = now_ns - proof_ns // 2
-        first = [d for at, d in window if at < middle]
+        first = [d for at, d in (recent if clock.followed else window) if at < middle]
         second = [d for at, d in window if at >= middle] + [age]
         return bool(first) and min(first) - min(second) > EARLY_NS
