@@ -14,6 +14,7 @@ import os
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from typing import Self
 
 from msgspec import Struct
@@ -125,8 +126,10 @@ class LateWatch:
 
         `missed` periods before it had no step.
         """
-        before = self._times
-        self._times = times = os.pread(self._file, 64, 0) if self._file >= 0 else b""
+        before, times = self._times, b""
+        with suppress(OSError):  # a lateness without its times only has fewer causes
+            times = os.pread(self._file, 64, 0) if self._file >= 0 else b""
+        self._times = times
         if missed:
             self._box.put(Late(now_ns, late_ns, before, times))
 

@@ -174,6 +174,8 @@ class SettingsFile:
             if pending is None:
                 continue  # it was overdue, and has its answer
             if isinstance(one, _Checked):
+                if now_ns > pending.due_ns:
+                    continue  # its answer below says that nothing is set
                 pending.edit = one.edit
                 found.append(one.request)
                 continue

@@ -220,7 +220,8 @@ class _Clock:
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int | None) -> None:
         """Note a pause, or stamps that go back or stand, unless the numbers show a loss.
 
-        Stamps have gone back only if the command after that also lies below the highest one.
+        Stamps that go back or stand count once the next command confirms it: its stamp goes back
+        too, stands, or has still not caught up.
         """
         doubted, self._doubted = self._doubted, None
         if number is not None and self._number is not None and number != self._number + 1:

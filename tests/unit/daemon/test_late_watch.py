@@ -86,6 +86,16 @@ def test_a_late_period_is_reported_with_its_cause(monkeypatch: pytest.MonkeyPatc
         assert kernel.threads == {"lateness"}
 
 
+def test_times_that_cannot_be_read_stop_no_control_step(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(late_watch, "OWN_TIMES", str(tmp_path))  # a directory opens, and no more
+    with watching(monkeypatch) as (watch, kernel):
+        kernel.reading = Reading(asleep_ns=2000 * MS)
+        period(watch, 30 * MS, 2)
+        assert "suspended for 2.00 s" in reported(watch).text
+
+
 def test_neither_a_punctual_period_nor_an_unknown_cause_is_an_event(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -379,6 +379,18 @@ def test_a_pipe_in_place_of_the_file_is_not_read(tmp_path: Path, started: Starte
     assert "it is not a regular file" in answer.message
 
 
+def test_a_request_that_is_checked_too_late_is_not_obeyed(tmp_path: Path, started: Started) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(TEXT)
+    made = started(file, parse(TEXT.encode()), {})
+    made.keep(REQUEST, 0)
+    until(lambda: made._results.waiting)
+    (answer,) = made.results(module.PATIENCE_NS + 1, [])
+    assert isinstance(answer, Answer)
+    assert not answer.success
+    assert answer.message.startswith("nothing is set")
+
+
 def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
