@@ -20,6 +20,10 @@ ROOM = 10.0
 COUNTS_M2, COUNTS_RAD2 = 1e-4, 1e-3
 """Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn."""
 
+UNKNOWN_RAD = 1.0
+"""Deviation of the heading from which on the position is not judged: terms of second order, which
+are larger than those of first order then, make it far too uncertain rather than too certain."""
+
 CALM_NS = NS
 """For this time after trouble the wheels of a side may still seem to slip."""
 
@@ -77,7 +81,7 @@ class Spread:
         self._yaw = math.sqrt(
             self._yaw**2 + self._yaw_by_metre * rolled + self._yaw_by_radian * turn
         )
-        wide = xx + yy > ROOM * self._place**2 + COUNTS_M2
+        wide = self._yaw < UNKNOWN_RAD and xx + yy > ROOM * self._place**2 + COUNTS_M2
         if wide or yawyaw > ROOM * self._yaw**2 + COUNTS_RAD2:
             raise BrokenError(
                 "the covariance grows by motion only", now_ns,
