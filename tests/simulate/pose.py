@@ -37,6 +37,10 @@ VAGUE = 0.05
 nearly unknown also falls."""
 
 SIGMAS = 6.0
+COARSE_COUNTS = 6
+"""Counts by which encoders of 96 counts may be off until the daemon knows the counts, if neither the
+configuration nor the lines tell them: each line then shows a speed over a time that is not exact."""
+
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
 
@@ -59,6 +63,10 @@ class PoseWitness:
         counts = config.get("sim", {}).get("encoder_counts")
         self._coarse = counts == 96 and config.get("control", {}).get("rate") not in RATES
         """Whether the pose drifts if the lines do not have the counts."""
+        untold = counts == 96 and not config["mcu"].get("encoder_counts")
+        turn = COARSE_COUNTS * math.tau / 96 if untold else 0.0
+        self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
+        """Distance that such encoders may be off, m."""
         self._known_ns = 0
         """From when on the lines show the motion again."""
         self._seldom = config.get("control", {}).get("rate") == 10.0
@@ -193,6 +201,7 @@ class PoseWitness:
         dyaw = math.remainder(pose[2] - expected[2], math.tau)
         xx, _, _, yy, _, yawyaw = covariance
         far = math.hypot(true[0] - self._anchor[0][0], true[1] - self._anchor[0][1])
+        by_time += self._unsure_m
         room = ROOM_M + self._room + by_time
         room_yaw = ROOM_RAD + self._room / self.track + by_time / self.track
         allowed = SIGMAS * math.sqrt(xx + yy) + room + far * room_yaw
