@@ -38,8 +38,8 @@ nearly unknown also falls."""
 
 SIGMAS = 6.0
 COARSE_COUNTS = 6
-"""Counts by which encoders of 96 counts may be off until the daemon knows the counts, if neither the
-configuration nor the lines tell them: each line then shows a speed over a time that is not exact."""
+"""Counts by which encoders of 96 counts may be off until the daemon knows the counts, if neither
+the configuration nor the lines tell them: a line then shows a speed over an inexact time."""
 
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""

@@ -51,7 +51,8 @@ HARMLESS = {
 """Troubles of the board that are no reason to latch a fault."""
 
 DISOBEYS_NS = NS
-"""Within this time and `feedback.fault_time` a wheel that does not obey is a fault."""
+"""Within this time, `feedback.fault_time` and three time constants of a motor, in which a dead one
+comes to rest, a wheel that does not obey is a fault."""
 
 CLEARLY = 4.0
 """rad/s. From this speed on, a wheel that does not obey cannot be taken for one that does."""
@@ -136,7 +137,9 @@ class Witness:
         """When the last fault of the board began."""
         fault_time = config.get("feedback", {}).get("fault_time", 0.5)
         coarse = config.get("sim", {}).get("encoder_counts", 3200) < 400
-        self._disobeys_ns = 0 if coarse or not fault_time else DISOBEYS_NS + int(fault_time * NS)
+        lag = config.get("sim", {}).get("motor_time_constant", 0.1)
+        seen_ns = DISOBEYS_NS + int((fault_time + 3 * lag) * NS)
+        self._disobeys_ns = 0 if coarse or not fault_time else seen_ns
         """Within this time a wheel that does not obey is a fault; 0 if the robot cannot see it."""
         self._driven: list[tuple[int, float]] = [(0, 0.0)] * 4
         """Since when each wheel has been commanded to turn clearly and in one direction."""

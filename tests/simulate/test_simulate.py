@@ -222,7 +222,7 @@ def test_a_wheel_that_clearly_does_not_obey_must_become_a_fault(speed: float, ra
     witness.lies = [("dead_motor", (witness.motors[2][0],))]
 
     def drive() -> None:
-        for n in range(100, 350):
+        for n in range(100, 450):
             witness.obeyed(n * NS // 100, (0.0, 0.0, -speed, 0.0))
 
     expected = pytest.raises(BrokenError, match="does not obey") if raises else nullcontext()
