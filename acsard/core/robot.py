@@ -10,6 +10,7 @@ line that leaves.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import assert_never
 
 from acsard.core.config.live import changed
@@ -35,6 +36,7 @@ from acsard.core.values import (
     REST,
     STILL,
     Answer,
+    Command,
     Estimate,
     Event,
     Inputs,
@@ -368,18 +370,23 @@ class Robot:
 
     def _hear(self, inputs: Inputs, events: list[Event]) -> None:
         now_ns = inputs.now.mono_ns
-        for refusal in inputs.refusals:
-            self._refuse(refusal, now_ns, events)
-            if refusal.source:
-                self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
-        for command in inputs.commands:
-            if command.stamp_replaced:
+        heard: Sequence[Command | Refusal] = inputs.commands
+        if inputs.refusals:
+            # A message that nobody could read cancels the zeros that came before it, and no later
+            # one. The refusals of messages that were lost have no time, so they come first.
+            heard = sorted([*inputs.refusals, *heard], key=lambda one: one.arrived_ns)
+        for one in heard:
+            if isinstance(one, Refusal):
+                self._refuse(one, now_ns, events)
+                if one.source:
+                    self._arbiter.notice(one.source, one.sender, one.arrived_ns)
+                continue
+            if one.stamp_replaced:
                 self.counters["stamps_replaced"] += 1
-            reason = self._arbiter.accept(command)
+            reason = self._arbiter.accept(one)
             if reason:
-                text = f"source {command.source}: {REFUSED[reason]}"
-                refusal = Refusal(reason, text, command.source, command.sender)
-                self._refuse(refusal, now_ns, events)
+                text = f"source {one.source}: {REFUSED[reason]}"
+                self._refuse(Refusal(reason, text, one.source, one.sender), now_ns, events)
             else:
                 self.counters["commands"] += 1
 

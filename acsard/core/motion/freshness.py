@@ -57,7 +57,8 @@ that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
 """A silence of this length ends a proof. A foreign clock may have been set by any amount while its
-sender paused for this time by its own stamps. Numbers tell a pause from commands that were lost."""
+sender paused for this time, by its own stamps and by the arrivals. Numbers tell a pause from
+commands that were lost."""
 
 STANDS_NS = 10_000
 """Two stamps that are no further apart, of commands that did not arrive together, show a clock that
@@ -230,7 +231,7 @@ class _Clock:
         if doubted is not None and (departed <= STANDS_NS or stamp_ns <= doubted[2]):
             self._before = doubted[0] if self._before is None else self._before
             self._shown += doubted[1]
-        if departed > GAP_NS:
+        if departed > GAP_NS and silence > GAP_NS:
             self._paused = True
         elif departed <= STANDS_NS and silence > APART_NS:
             self._doubted = self._delay, silence - departed, self._stamp_ns

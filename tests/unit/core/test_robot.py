@@ -1359,6 +1359,31 @@ def test_a_message_that_was_refused_ends_the_wait_of_a_shared_zero() -> None:
     assert bench.mode() == "ready"
 
 
+@pytest.mark.parametrize(("refused_ms", "mode"), [(2, "ready"), (0, "driving")])
+def test_a_refused_message_ends_only_the_wait_of_zeros_before_it(
+    refused_ms: int, mode: str
+) -> None:
+    bench = Bench().linked()
+    for number in range(120):
+        bench.now_ns += 10 * MS
+        zero_ns = bench.now_ns - 9 * MS
+        refused = Refusal("malformed", "it cannot be read", "app", "", zero_ns + refused_ms * MS)
+        inputs = Inputs(
+            bench.now, True, True, bench.opened,
+            received=(Received(bench.now, bench.codec.stop),),
+            commands=(Command("app", REST, zero_ns + MS, shared=True),) if number == 0 else (),
+            refusals=(refused,) if number == 0 else (),
+        )  # fmt: skip
+        bench.out = bench.robot.step(inputs)
+    bench.now_ns += 10 * MS
+    command = Command("app", GO, bench.now_ns, shared=True)
+    bench.out = bench.robot.step(
+        Inputs(bench.now, True, True, bench.opened, commands=(command,),
+               received=(Received(bench.now, bench.codec.stop),))
+    )  # fmt: skip
+    assert bench.mode() == mode
+
+
 def test_the_first_commands_of_a_clock_are_counted_apart_from_those_refused() -> None:
     bench = Bench().linked()
     bench.step(REST, late_ms=0.0)

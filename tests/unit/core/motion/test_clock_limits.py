@@ -304,6 +304,15 @@ def test_a_sender_that_pauses_for_over_2_s_may_have_set_its_clock(
     assert sender.steadily(late, 30)[-1] == verdict
 
 
+def test_stamps_that_leap_in_commands_that_came_together_show_no_pause() -> None:
+    """The daemon drops commands when too many come at once, as after a suspend of its computer."""
+    sender, late = Sender(), 8 * NS_PER_S
+    assert sender.sends(5 * NS_PER_S, 4900 * MS) == "stale"
+    sender.sends(0, 1900 * MS)
+    assert sender.sends(PERIOD + late - 1900 * MS, late) == "stale"
+    assert set(sender.steadily(late, 100)) == {"stale"}
+
+
 @each(
     ("before", "then", "verdict"),
     [(7, 8, "set"), (7, 51, "stale"), (7, 9, "stale"), (7, None, "set"), (None, 8, "set")],
