@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard.calibration.fit import SEPARATION
-from acsard.calibration.prepared import RATIO, TRACK
+from acsard.calibration.multipliers import SEPARATION
+from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.evidence import (
+from acsard.calibration.fit import (
     BIAS_ERROR,
     COUNT,
     INVERSE_TRACK,
@@ -32,8 +32,7 @@ from acsard.calibration.evidence import (
     of_rows,
 )  # fmt: skip
 from acsard.calibration.log_table import Floats, LogError
-from acsard.calibration.runs import Run
-from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative, gaps, inside, rests
+from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
 """Shortest rest in which the gyro bias is measured, and the margin cut off at both of its ends, s.
@@ -95,6 +94,13 @@ class Headings(Struct, frozen=True):
     """
 
 
+TURNING = 0.05
+"""Turn rate below which a row counts as straight, rad/s."""
+
+FASTEST = 0.95
+"""Fraction of the turned angle that was turned more slowly than `Rates.fastest`."""
+
+
 class Rows(Struct, frozen=True):
     """The motion of the robot in intervals of about a second."""
 
@@ -114,7 +120,15 @@ class Rows(Struct, frozen=True):
     """Length of each interval, s."""
 
 
-def of_gyro(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Headings | None:
+class Rates(Struct, frozen=True):
+    """The turn rates of a log, rad/s."""
+
+    mean: float
+    """Mean, weighted by the turned angle."""
+    fastest: float
+
+
+def of_gyro(driven: Sequence[Run]) -> Headings | None:
     """Return the headings by the column yaw_rate, or None if no run has it.
 
     Raises `LogError` if the yaw rate never changes.
@@ -138,12 +152,12 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Headings | 
         found.append(Heading(run.gyro_t, _sums(rate, steps), holes))
     seconds = [float(run.t[-1]) for run in driven]
     return Headings(
-        "yaw_rate", tuple(found), offset(found, angles), usual, bias_unknown=not len(all_biases),
+        "yaw_rate", tuple(found), offset(found, driven), usual, bias_unknown=not len(all_biases),
         bias_std=_bias_std(rested, seconds) if len(all_biases) else 0.0,
     )  # fmt: skip
 
 
-def of_yaw(driven: Sequence[Run], angles: Sequence[WheelAngles], gain: float) -> Headings | None:
+def of_yaw(driven: Sequence[Run], gain: float) -> Headings | None:
     """Return the headings by the column yaw, or None if no run has it.
 
     Raises `LogError` if the yaw is in degrees, because jumps of 360 would not be recognized as
@@ -152,21 +166,21 @@ def of_yaw(driven: Sequence[Run], angles: Sequence[WheelAngles], gain: float) ->
     if not any(len(run.yaw) for run in driven):
         return None
     found = []
-    for run, wheels in zip(driven, angles, strict=True):
-        if _in_degrees(run, wheels, gain):
+    for run in driven:
+        if _in_degrees(run, gain):
             raise LogError("yaw is in degrees, but must be in radians: multiply it by pi / 180")
         angle = np.asarray(np.unwrap(run.yaw)) if len(run.yaw) else run.yaw
         found.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
-    return Headings("yaw", tuple(found), offset(found, angles), 0.0, bias_unknown=False)
+    return Headings("yaw", tuple(found), offset(found, driven), 0.0, bias_unknown=False)
 
 
-def _in_degrees(run: Run, wheels: WheelAngles, gain: float) -> bool:
+def _in_degrees(run: Run, gain: float) -> bool:
     if len(run.yaw) < 2 or np.ptp(run.yaw) < 3 * np.pi:
         return False
     steps = np.diff(run.yaw)
     if np.any((np.abs(steps) > 300.0) & (np.abs(steps) < 400.0)):
         return True
-    left, right = wheels.angles(run.yaw_t)
+    left, right = run.angles(run.yaw_t)
     by_wheels = gain * np.diff(right - left)
     small = np.abs(steps) < 100.0
     return float(np.sum(np.abs(steps[small]))) > DEGREES * float(np.sum(np.abs(by_wheels[small])))
@@ -233,7 +247,7 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
     return cumulative((rate[1:] + rate[:-1]) / 2 * steps) if len(rate) else rate
 
 
-def offset(found: Sequence[Heading], angles: Sequence[WheelAngles]) -> float:
+def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
     The turns of the wheels are the differences of both sides. If the sign of one side is wrong,
@@ -241,11 +255,11 @@ def offset(found: Sequence[Heading], angles: Sequence[WheelAngles]) -> float:
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
-    for heading, wheels in zip(found, angles, strict=True):
-        grid = np.arange(wheels.t[0], wheels.t[-1], GRID_S)
+    for heading, run in zip(found, driven, strict=True):
+        grid = np.arange(run.t[0], run.t[-1], GRID_S)
         if len(heading.t) < 2 or len(grid) < 4:
             continue
-        left, right = wheels.angles(grid)
+        left, right = run.angles(grid)
         sensor = np.diff(np.interp(grid, heading.t, heading.angle))
         sensor[~inside(grid[:-1], grid[1:], heading.gaps)] = 0.0
         sensor -= sensor.mean()
@@ -274,17 +288,12 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
     return np.concatenate((whole[-reach:], whole[: reach + 1]))
 
 
-def rows(
-    headings: Headings | None,
-    driven: Sequence[Run],
-    angles: Sequence[WheelAngles],
-    parts: Sequence[Block],
-) -> Rows:
+def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
     """Return the rows of all blocks in which the heading sensor has samples.
 
     If `headings` is None, return the rows of all blocks, with the wheels alone.
     """
-    fast = [_fast(run, wheels) for run, wheels in zip(driven, angles, strict=True)]
+    fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
         count = max(1, round((part.end - part.begin) / ROW_S))
@@ -297,7 +306,7 @@ def rows(
             angle = np.interp(seen, heading.t, heading.angle)
             whole = inside(seen[:-1], seen[1:], heading.gaps)
             whole &= (seen[:-1] >= heading.t[0]) & (seen[1:] <= heading.t[-1])
-        left, right = angles[part.run].angles(edges)
+        left, right = driven[part.run].angles(edges)
         squares = np.interp(edges, driven[part.run].t, fast[part.run])
         series = (angle, left, right, squares, edges)
         found.append((np.full(count, number)[whole], *(np.diff(sums)[whole] for sums in series)))
@@ -305,6 +314,20 @@ def rows(
         return Rows(np.zeros(0, dtype=np.int64), *[np.zeros(0)] * 5)
     block, *columns = (np.concatenate(column) for column in zip(*found, strict=True))
     return Rows(block.astype(np.int64), *columns)
+
+
+def rates(rows: Rows, by_wheels: Floats) -> Rates:
+    """Return the turn rates of these rows; `by_wheels` has their turns from the wheels, rad."""
+    turned = np.abs(by_wheels)
+    rate = turned / rows.seconds
+    turning = rate > TURNING
+    if not turning.any():
+        return Rates(0.0, 0.0)
+    order = np.argsort(rate[turning])
+    share = np.cumsum(turned[turning][order]) / turned[turning].sum()
+    fastest = rate[turning][order][int(np.searchsorted(share, FASTEST))]
+    mean = float(rate[turning] @ turned[turning] / turned[turning].sum())
+    return Rates(mean, float(fastest))
 
 
 def level(rows: Rows) -> Rows:
@@ -320,8 +343,8 @@ def level(rows: Rows) -> Rows:
     return Rows(rows.block, turned, left, right, fast, rows.seconds)
 
 
-def _fast(run: Run, wheels: WheelAngles) -> Floats:
-    apart = wheels.speed_difference(run.t)
+def _fast(run: Run) -> Floats:
+    apart = run.speed_difference(run.t)
     steps = np.minimum(np.diff(run.t), ROW_S)
     return _sums(np.abs(apart) * apart, steps)
 

@@ -158,6 +158,10 @@ class LogError(AcsardError):
     """A log that cannot be used. The text names the place and the fault, and says what to do."""
 
 
+class RefusedError(AcsardError):
+    """The log cannot be used for a calibration. The text says why and what to do."""
+
+
 def noted(error: Exception, notes: Iterable[str]) -> None:
     """Add the notes about a log to an error, because they may explain it."""
     for note in notes:

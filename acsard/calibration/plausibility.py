@@ -1,21 +1,58 @@
-"""Checks whether a log and its calibration are plausible: signs, sides, units and times.
+"""Checks whether a log and its calibration are plausible, and whether the robot moved enough.
 
-A log with an error that would spoil the calibration is refused, and the message names the probable
-cause. Unusual facts that the calibration corrects or tolerates are reported as remarks.
+A log with an error that would spoil the calibration is refused: a wrong sign, side, unit or time,
+or sensors that contradict the wheels. The message names the probable cause. If a log does not
+contain enough movement, the message says what to drive. Unusual facts that the calibration corrects
+or tolerates are reported as remarks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from acsard.calibration import heading
-from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.fit import (
+    INVERSE_TRACK,
+    LEAST_BLOCKS,
+    LEFT,
+    RIGHT,
+    Base,
+    Fit,
+    condition,
+)  # fmt: skip
 from acsard.calibration.heading import Rows
-from acsard.calibration.log_table import Floats
+from acsard.calibration.log_table import Floats, RefusedError
+from acsard.calibration.multipliers import Multipliers
+from acsard.calibration.runs import Block
 from acsard.calibration.search import StartingPoint
-from acsard.core.values import AcsardError
+
+LEAST_ANGLE = 2 * np.pi
+"""Smallest total turn of the robot, rad."""
+
+LEAST_ROLL = 3.0
+"""Smallest angle by which the wheels must roll in all, rad.
+
+Both the mean of the sides and half of their difference must reach it.
+"""
+
+ALIKE = 0.98
+"""Squared correlation of the mean and the difference of both sides at which a log is refused.
+
+Such a robot drives the same curve all the time.
+"""
+
+WORST = 0.2, 0.03
+"""Largest useful standard deviations, as fractions: of the track, and of the ratio of the radii."""
+
+WORST_CONDITION = 1e4
+"""Largest condition number of the normal equations at which radii and track can be separated."""
+
+DRIVE = (
+    "drive 60 s: stand 3 s, 2 m straight ahead and back, three full turns to the left and three to "
+    "the right, some of them slow and some fast, then curves both ways"
+)
 
 UNLIKE = 0.5
 """Largest fraction of the sum of a sensor's squared motions that the wheels may not explain."""
@@ -69,8 +106,73 @@ LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 """Ratios of effective track to wheel separation that are usual. Others are reported."""
 
 
-class RefusedError(AcsardError):
-    """The log cannot be used for a calibration. The text says why and what to do."""
+def drives_enough(parts: Sequence[Block]) -> None:
+    """Raise `RefusedError` if the log has too few blocks in which the wheels turn."""
+    if len(parts) < LEAST_BLOCKS:
+        seconds = sum(part.end - part.begin for part in parts)
+        raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
+
+
+def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
+    """Raise `RefusedError` if the wheels lack a movement that the fit needs.
+
+    Both sides must roll in opposite directions and in the same direction, and the proportion of the
+    two movements must vary. If `spins` is true, turns on the spot are enough.
+    """
+    together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
+    for rolled, what in ((together, "ahead or back"), (against, "against each other")):
+        if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
+            if spins and what == "ahead or back":
+                continue
+            raise RefusedError(
+                f"the wheels roll {turns:.1f} turns {what} in all, which is too little to measure "
+                f"their size, the ratio of left to right and the effective track: {DRIVE}"
+            )
+        cross = float(together @ against) ** 2
+        if cross > ALIKE * float(together @ together) * float(against @ against):
+            raise RefusedError(
+                f"the robot always drives the same curve, which does not separate the wheels from "
+                f"the track: {DRIVE}"
+            )
+
+
+def turns_enough(turned: Floats) -> None:
+    """Raise `RefusedError` if the robot hardly turns. `turned` is the turn of each row, rad."""
+    if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
+        raise RefusedError(
+            f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
+            f"effective track: {DRIVE}"
+        )
+
+
+TRACK, RATIO = "the effective track", "the ratio of left to right"
+"""Names of the two quantities that a log may leave unsure."""
+
+
+def unsure(
+    found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
+) -> dict[str, float]:
+    """Return the relative standard deviations that are too large to be useful, by name.
+
+    The names are `TRACK` and `RATIO`.
+
+    Args:
+        found: the multipliers.
+        track_std: the standard deviation of the track as a fraction. It leaves out that the track
+            itself varies with the turn rate and from block to block.
+        worst: the largest useful standard deviations of the track and of the ratio of the radii.
+    """
+    deviations = {TRACK: track_std, RATIO: found.ratio_std}
+    return {
+        name: deviation
+        for (name, deviation), most in zip(deviations.items(), worst, strict=True)
+        if not deviation <= most
+    }
+
+
+def separates_track(fitted: Fit) -> bool:
+    """Return whether the log separates the radii from the track."""
+    return condition(fitted.marginal()) <= WORST_CONDITION
 
 
 def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:

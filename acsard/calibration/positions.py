@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.evidence import (
+from acsard.calibration.fit import (
     COUNT,
     DELAY,
     INVERSE_TRACK,
@@ -26,8 +26,7 @@ from acsard.calibration.evidence import (
     huber,
 )  # fmt: skip
 from acsard.calibration.log_table import Floats
-from acsard.calibration.runs import Complexes, Run
-from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative
+from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
 LEAST_POINTS = 5
 """Smallest number of positions in a block, which has three unknowns: shift (two) and rotation."""
@@ -109,11 +108,9 @@ class Path(Struct, frozen=True):
         return np.interp(t, self.t, self.place) + lever * ahead, ahead
 
 
-def segments(
-    driven: Sequence[Run], angles: Sequence[WheelAngles], parts: Sequence[Block]
-) -> list[Segment]:
+def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
     """Return the positions of each block, split at jumps."""
-    edges = [jumps(run, wheels) for run, wheels in zip(driven, angles, strict=True)]
+    edges = [jumps(run) for run in driven]
     found = []
     for number, part in enumerate(parts):
         run = driven[part.run]
@@ -125,12 +122,12 @@ def segments(
     return found
 
 
-def jumps(run: Run, wheels: WheelAngles) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Return the indices of the positions before which the source jumped."""
     steps = np.abs(np.diff(run.place))
     if len(steps) < LEAST_POINTS:
         return np.zeros(0, dtype=np.int64)
-    left, right = wheels.angles(run.place_t)
+    left, right = run.angles(run.place_t)
     rolled = np.maximum(np.abs(np.diff(left)), np.abs(np.diff(right)))
     moving = rolled > 0.25 * float(np.max(rolled))
     per_rad = float(np.median(steps[moving] / rolled[moving])) if moving.any() else 0.0
@@ -139,13 +136,13 @@ def jumps(run: Run, wheels: WheelAngles) -> np.ndarray[tuple[int], np.dtype[np.i
     return np.flatnonzero(beyond > JUMP * usual + JUMP_M) + 1
 
 
-def wheel_steps(run: Run, wheels: WheelAngles, fine_s: float = FINE_S) -> WheelSteps:
+def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
     """Return the wheel steps of a run, each of about `fine_s` s or one sample."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
-    t, left, right = run.t[kept], wheels.left[kept], wheels.right[kept]
-    apart, steps = wheels.speed_difference((t[1:] + t[:-1]) / 2), np.diff(t)
+    t, left, right = run.t[kept], *(angles[kept] for angles in run.rolled)
+    apart, steps = run.speed_difference((t[1:] + t[:-1]) / 2), np.diff(t)
     return WheelSteps(t, np.diff(left), np.diff(right), np.abs(apart) * apart * steps)
 
 

@@ -17,10 +17,10 @@ from msgspec.structs import replace
 
 from acsard.calibration import ros_bag_log
 from acsard.calibration.log_table import AS_CSV, LogError, Table, noted, read
+from acsard.calibration.multipliers import Tape
 from acsard.calibration.ros_bag_log import PAGE, Choice, RosMessage
 from acsard.calibration.runs import runs
 from acsard.calibration.solve import Calibration, calibrate
-from acsard.calibration.tape_distance import Tape
 from acsard.core.config.settings import Config
 from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import measured

@@ -21,10 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.guided.leg_recorder import on_arrival_clock
 from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table, bounded, spikes
-from acsard.calibration.runs import RESTART_S
-from acsard.calibration.wheel_angles import cumulative, gaps
+from acsard.calibration.runs import RESTART_S, cumulative, gaps, on_arrival_clock
 from acsard.core.formatting import many, printable
 from acsard.core.messages.encodings import DecodeError, decode_cdr
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Quaternion

@@ -19,12 +19,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration import positions
-from acsard.calibration.evidence import DELAY, INVERSE_TRACK, LEFT, RIGHT, Base, Evidence
-from acsard.calibration.fit import fit
+from acsard.calibration.fit import DELAY, INVERSE_TRACK, LEFT, RIGHT, Base, Evidence, fit
 from acsard.calibration.log_table import Floats
 from acsard.calibration.positions import Segment, WheelSteps, place, wheel_steps
 from acsard.calibration.runs import Run
-from acsard.calibration.wheel_angles import WheelAngles
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
 """Ratios of configured to true track that are tried. They are finer in the usual range."""
@@ -81,16 +79,15 @@ class StartingPoint(Struct, frozen=True):
 
 
 def search(
-    segments: Sequence[Segment], driven: Sequence[Run], angles: Sequence[WheelAngles], base: Base,
-    sides: Floats | None = None,
-) -> StartingPoint:  # fmt: skip
+    segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
+) -> StartingPoint:
     """Return the best starting point for these positions.
 
     `sides` is the result of `heading.first`, or None without a heading sensor.
     """
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
-    steps = {run: wheel_steps(driven[run], angles[run], COARSE_S) for run in needed}
+    steps = {run: wheel_steps(driven[run], COARSE_S) for run in needed}
     points: list[StartingPoint] = []
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
         points += _local_minima(

@@ -1,7 +1,8 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
 A method of calibration consists of questions to ask first and legs to drive in order. `methods.py`
-has the table of the methods, and `runner.py` leads a person through one of them.
+has the table of the methods, and `runner.py` leads a person through one of them. The command line
+and the page import this module to name the methods, so it does not load numpy.
 
 The robot stays within its limits and on a floor of 3 m x 3 m. How far it turns for a command is not
 known before the calibration: the plan must work for an effective track of 1 to 2.5 times the wheel
@@ -23,6 +24,23 @@ from msgspec import Struct
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.core.values import AcsardError
 from acsard.terminal.prompt import Ask
+
+NEEDS: dict[str, str] = {
+    "gyro": "a gyro on the key imu, and a tape measure",
+    "positions": "positions on a key",
+    "tape": "a tape measure and a straight line on the floor",
+    "wall": "a straight wall and a tape measure",
+    "umbmark": "a tape measure and marks",
+}
+"""Equipment by the name of the method, as `--method` takes it."""
+
+SIMULATED = (
+    "positions",
+    "On the simulator there is no floor to lay a tape on: use positions with sim/pose, the true "
+    "position, or gyro if [odometry] gyro is on, with its distance left empty. tape, wall and "
+    "umbmark are for a real robot.",
+)
+"""The method to use first on the simulator, and the reason."""
 
 
 class GuideError(AcsardError):

@@ -23,7 +23,7 @@ from acsard.calibration.guided.drive_plan import (
     Setup,
     Slant,
 )  # fmt: skip
-from acsard.calibration.tape_distance import LEAST_M
+from acsard.calibration.multipliers import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005

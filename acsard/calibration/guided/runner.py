@@ -6,14 +6,25 @@ from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 
-from acsard.calibration.guided.drive_plan import UNITS, DisturbedError, Leg, Setup, Slant
-from acsard.calibration.guided.equipment import NEEDS
+from acsard.calibration.guided.drive_plan import (
+    NEEDS,
+    UNITS,
+    DisturbedError,
+    Leg,
+    Setup,
+    Slant,
+)  # fmt: skip
 from acsard.calibration.guided.methods import METHODS, STRAIGHT
-from acsard.calibration.guided.tape_calibration import calibrated
-from acsard.calibration.guided.tape_readings import Answers, Reading, reading, track_ratio
+from acsard.calibration.guided.tape_readings import (
+    Answers,
+    Reading,
+    calibrated,
+    reading,
+    track_ratio,
+)  # fmt: skip
+from acsard.calibration.multipliers import LEAST_M, Tape
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import Calibration, calibrate
-from acsard.calibration.tape_distance import LEAST_M, Tape
 from acsard.terminal.prompt import Ask, Prompt
 
 MOST_REPEATS = 2

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from msgspec import structs
 
-from acsard.calibration import prepared, solve, wheel_angles
 from acsard.calibration import runs as reading
-from acsard.calibration.evidence import Base
+from acsard.calibration import solve
+from acsard.calibration.fit import Base
 from acsard.calibration.heading import of_gyro
 from acsard.calibration.log_table import Table, bounded, read
-from acsard.calibration.prepared import Prepared
-from acsard.calibration.tape_distance import Tape
+from acsard.calibration.multipliers import Tape
+from acsard.calibration.solve import Prepared, prepared
 from acsard.core.config.settings import DriveConfig
 from tests.unit.calibration.robots import GUIDED, Drive, Plan, Robot, drive
 
@@ -72,8 +72,7 @@ def log_of_runs(drives: Iterable[Drive], *, gyro: bool = True, places: bool = Tr
 
 def ready(log: str | Table) -> Prepared:
     runs = log_of(log).runs
-    angles = [wheel_angles.angles_of(run) for run in runs]
-    return prepared.prepared(runs, angles, of_gyro(runs, angles), BASE, 4.0)
+    return prepared(runs, of_gyro(runs), BASE, 4.0)
 
 
 def calibrated(log: str | Table | reading.Log, tape: Tape | None = None) -> solve.Calibration:

@@ -7,18 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acsard.calibration.evidence import DELAY, INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.fit import DELAY, INVERSE_TRACK, LEFT, RIGHT, Base
 from acsard.calibration.positions import segments
+from acsard.calibration.runs import blocks
 from acsard.calibration.search import StartingPoint, search
-from acsard.calibration.wheel_angles import angles_of, blocks
 from tests.unit.calibration.cut import BASE, log_of, table, usual
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 
 def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> StartingPoint:
     runs = log_of(table(seen, gyro=False)).runs
-    angles = [angles_of(run) for run in runs]
-    return search(segments(runs, angles, blocks(runs, angles, 8.0)), runs, angles, base, sides)
+    return search(segments(runs, blocks(runs, 8.0)), runs, base, sides)
 
 
 @pytest.mark.variations(3)

@@ -1,7 +1,7 @@
-"""Corrects the multipliers by a distance that was measured by tape.
+"""The multipliers that the parameters of a fit give, and their correction by a tape measure.
 
-A log of turn rates alone shows the ratios of the multipliers. The distance shows how large the
-wheels are.
+A log of turn rates alone shows the ratios of the multipliers. A distance that was measured by tape
+shows how large the wheels are.
 """
 
 from __future__ import annotations
@@ -11,9 +11,76 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.fit import LEFT_RADIUS, RIGHT_RADIUS, SEPARATION, Multipliers
-from acsard.calibration.log_table import Floats
-from acsard.calibration.plausibility import RefusedError
+from acsard.calibration.fit import INVERSE_TRACK, LEFT, RIGHT, TRACK_GROWTH, Base
+from acsard.calibration.heading import Rates
+from acsard.calibration.log_table import Floats, RefusedError
+
+SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
+"""Indices into `values` and `covariance` of `Multipliers`."""
+
+
+class Multipliers(Struct, frozen=True):
+    """The multipliers of wheel separation, left and right wheel radius, and their covariance."""
+
+    values: Floats
+    covariance: Floats
+
+    @property
+    def std(self) -> Floats:
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def ratio_std(self) -> float:
+        """Standard deviation of the ratio of both radii, as a fraction."""
+        shares = self.covariance / np.outer(self.values, self.values)
+        apart = np.array([0.0, 1.0, -1.0])
+        return float(np.sqrt(max(0.0, apart @ shares @ apart)))
+
+    def own(self) -> tuple[Floats, float]:
+        """Return four standard deviations, as the settings of `[odometry]` declare them.
+
+        The first three belong to one multiplier each. The fourth belongs to the common scale of all
+        multipliers, as a fraction. The odometry treats the four errors as independent.
+
+        Let d be the relative variance of the difference of both radii. Each radius then has its own
+        variance d / 2, which contributes d / 4 to the variance of their mean. This d / 4 is
+        subtracted from the variances of the mean radius (the scale) and of the track relative to
+        the mean radius (the track).
+        """
+        shares = self.covariance / np.outer(self.values, self.values)
+        mean, track, apart = (
+            float(row @ shares @ row)
+            for row in np.array([[0.0, 0.5, 0.5], [1.0, -0.5, -0.5], [0.0, 1.0, -1.0]])
+        )
+        own = np.sqrt(np.maximum(0.0, [track - apart / 4, apart / 2, apart / 2]))
+        return self.values * own, float(np.sqrt(max(0.0, mean - apart / 4)))
+
+
+def configured(base: Base) -> Multipliers:
+    """Return the configured multipliers, with a covariance of zero because it is unknown."""
+    return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
+
+
+def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
+    """Return the multipliers that fit best at the turn rates of the log.
+
+    The variance of the track is that of the best constant track there. The turns that
+    skid more or less than usual belong to the noise of the odometry.
+
+    Args:
+        parameters: the parameters of a fit.
+        covariance: the covariance of the parameters.
+        rate: the turn rates of the log.
+    """
+    inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
+    slower = 1.0 - growth * rate.mean
+    values = np.array([1 / (inverse * slower), parameters[LEFT], parameters[RIGHT]])
+    jacobian = np.zeros((3, len(parameters)))
+    jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
+    jacobian[SEPARATION, INVERSE_TRACK] = -values[SEPARATION] / inverse
+    jacobian[SEPARATION, TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
+    return Multipliers(values, jacobian @ covariance @ jacobian.T)
+
 
 TAPE_M = 0.01
 """Standard deviation of a distance by tape, m. It includes the choice of the point on the robot."""
