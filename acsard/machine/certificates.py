@@ -33,13 +33,6 @@ CA_KEY = "ca-key.pem"
 OWN = "robot"
 """Common name of the certificate that `tls init` makes for the robot itself."""
 
-UNLIMITED = (
-    "The authority was made by an earlier version and may sign for any web site. If browsers trust "
-    "it, run `acsard tls init --force`, make all certificates again, and remove the old authority "
-    "from the phones."
-)
-"""Warning about an authority without name constraints."""
-
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 """Matches a host name or an IP address."""
 
@@ -102,10 +95,10 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
     return place
 
 
-def renew(directory: Path, addresses: Sequence[str], days: int) -> tuple[list[str], str]:
+def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     """Replace the robot's own certificate.
 
-    Returns its names and addresses, with those of the old one, and a warning or "".
+    Returns its names and addresses, with those of the old one.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
@@ -113,7 +106,7 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> tuple[list[st
     # The machine may have another name or address than when the authority was made.
     names = [*filter(authority.permits, known), *addresses]
     authority.issue(directory, OWN, names, days)
-    return list(dict.fromkeys(names)), "" if authority.limited else UNLIMITED
+    return list(dict.fromkeys(names))
 
 
 def _names_of(name: str) -> list[str]:

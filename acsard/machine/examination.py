@@ -2,10 +2,9 @@
 
 This module itself examines the configuration, the machine and the serial port;
 `certificate_findings.py` examines the certificates, and `daemon_findings.py` the daemon and its
-link. The doctor opens no port and sends nothing to
-a robot. If a daemon runs, its own configuration is examined, because the file may have changed
-since and options may override it. For a daemon on another machine, only its own reports are
-examined: its port, files and gateway are there.
+link. The doctor opens no port and sends nothing to a robot. If a daemon runs, its own configuration
+is examined, because the file may have changed since and options may override it. For a daemon on
+another machine, only its own reports are examined: its port, files and gateway are there.
 """
 
 from __future__ import annotations
@@ -27,9 +26,8 @@ from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel
 from acsard.host.processes import holders, running
 from acsard.machine.certificate_findings import certificates, router_certificates
-from acsard.machine.daemon_findings import daemon, found, gateway, routers
+from acsard.machine.daemon_findings import Running, compared, daemon, found, gateway, routers
 from acsard.machine.finding import Finding, Level
-from acsard.machine.running import Running, compared
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
 REAL = (
