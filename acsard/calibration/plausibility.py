@@ -25,8 +25,8 @@ from acsard.calibration.fit import (
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats, RefusedError
 from acsard.calibration.multipliers import Multipliers
+from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
-from acsard.calibration.search import StartingPoint
 
 LEAST_ANGLE = 2 * np.pi
 """Smallest total turn of the robot, rad."""

@@ -52,9 +52,8 @@ from acsard.calibration.multipliers import (
     scaled,
 )  # fmt: skip
 from acsard.calibration.plausibility import DRIVE, RATIO, TRACK
-from acsard.calibration.positions import Segment, WheelSteps
+from acsard.calibration.positions import Segment, WheelSteps, search
 from acsard.calibration.runs import Block, Log, Run, blocks
-from acsard.calibration.search import search
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import AcsardError
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Mapping
 
 from msgspec import Struct
 
@@ -15,13 +16,13 @@ from acsard.core.config.settings import Config
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.robot import Robot
 from acsard.core.ros.shapes import how_often
-from acsard.core.thinning import Band, Curve, Place, Track
+from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist
 from acsard.recording.recorded_steps import MICRO, Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
-from acsard.report.loop_lateness import Lateness
-from acsard.report.serial_counts import SerialCounts
+
+NS_PER_MS = 1_000_000
 
 MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
 """Modes of the robot. If short spans must be merged, the first of these modes wins."""
@@ -100,6 +101,152 @@ class Driven(Struct):
 
     seconds: float = 0.0
     metres: float = 0.0
+
+
+class Lateness:
+    """Delay of each period's step, relative to the step with the smallest delay.
+
+    The recording has the number of missed periods, so the number of each period is known. Its due
+    time is then known except for a constant offset. The step with the smallest delay gives this
+    offset.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = int(NS_PER_S / rate_hz)
+        self._curve = Curve()
+        self._number = 0
+        """Number of the last period."""
+        self._ahead = 0
+        """Number of lines since then that were sent at once, in place of a later period's line."""
+        self._began_ns: int | None = None
+        self._earliest = math.inf
+        """Smallest delay, ns."""
+        self.missed = 0
+        """Number of periods without a step."""
+
+    def at_once(self) -> None:
+        """Register a line that was sent at once, in place of the next period's line."""
+        self._ahead += 1
+
+    def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
+        """Take the step of a period.
+
+        Args:
+            t: time of the step, s.
+            now_ns: monotonic time of the step, ns.
+            missed: number of periods since the previous tick that had no step.
+            known: False if the recording lacks steps before this one. Then the number of the period
+                is computed from the clock.
+        """
+        period_ns, began_ns = self._period_ns, self._began_ns
+        if began_ns is None:
+            began_ns = self._began_ns = now_ns
+            missed = 0
+        elif known:
+            self._number += 1 + missed + self._ahead
+        else:
+            self._number, missed = round((now_ns - began_ns) / period_ns), 0
+        behind_ns = now_ns - began_ns - self._number * period_ns
+        if missed and self._ahead and behind_ns < self._earliest - period_ns / 2:
+            # The line that was sent at once took the place of a missed period.
+            self._number -= 1
+            behind_ns += period_ns
+        self._ahead = 0
+        self.missed += missed
+        self._earliest = min(self._earliest, behind_ns)
+        self._curve.add(t, (behind_ns + missed * period_ns) / NS_PER_MS)
+
+    def points(self) -> list[Point]:
+        """Return the delay in ms over the time in s."""
+        least = self._earliest / NS_PER_MS
+        return [Point(t, value - least) for t, value in self._curve.points()]
+
+    @property
+    def most_ms(self) -> float:
+        """Largest delay, ms."""
+        return max([point.value for point in self.points()], default=0.0)
+
+
+class SerialTotals:
+    """Number of sent, accepted, dropped and unanswered lines of the collected steps."""
+
+    def __init__(self) -> None:
+        self.sent = self.good = self.dropped = self.unanswered = 0
+
+
+class SerialCounts:
+    """Number of sent, accepted, dropped and unanswered lines in each second."""
+
+    def __init__(self) -> None:
+        self.sent, self.good, self.dropped, self.unanswered = Curve(), Curve(), Curve(), Curve()
+        self.totals = SerialTotals()
+        self._second: int | None = None
+        self._sent = 0
+        """Lines sent in this second."""
+        self._base = 0
+        """Lines received before the first collected step."""
+        self._before = (0, 0)
+        """Good and dropped lines since the daemon's start, at the beginning of this second."""
+        self._now = (0, 0)
+        """Good and dropped lines since the daemon's start, at the last step."""
+        self._outstanding: int | None = None
+        """Smallest number of unanswered lines at any step of this second.
+
+        At another step the answer to the newest line may just not have arrived yet. The smallest
+        number counts only the lines whose answers are lost.
+        """
+        self._lost: int | None = None
+        """Largest `_outstanding` of all earlier seconds."""
+
+    def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
+        """Take a step.
+
+        Args:
+            t: time of the step, s.
+            sent: True if a line was sent.
+            counters: the robot's counters after the step.
+        """
+        received = self._now = _received(counters)
+        if self._second is None:
+            self._second, self._before, self._base = int(t), received, sum(received)
+        elif int(t) != self._second:
+            self._end(received)
+            self._second = int(t)
+        outstanding = self.totals.sent + self._sent - (sum(received) - self._base)
+        if self._outstanding is None or outstanding < self._outstanding:
+            self._outstanding = outstanding
+        self._sent += sent
+
+    def _end(self, received: tuple[int, int]) -> None:
+        """Finish a second. The next step may be many seconds later."""
+        t, totals = float(self._second or 0) + 0.5, self.totals
+        good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
+        outstanding = self._outstanding or 0
+        lost = outstanding if self._lost is None else max(outstanding, self._lost)
+        unanswered = 0 if self._lost is None else lost - self._lost
+        for curve, count in (
+            (self.sent, self._sent),
+            (self.good, good),
+            (self.dropped, dropped),
+            (self.unanswered, unanswered),
+        ):
+            curve.add(t, count)
+        totals.sent += self._sent
+        totals.good += good
+        totals.dropped += dropped
+        totals.unanswered += unanswered
+        self._sent, self._before, self._lost, self._outstanding = 0, received, lost, None
+
+    def end(self) -> None:
+        """Finish the last second."""
+        if self._second is not None:
+            self._end(self._now)
+
+
+def _received(counters: Mapping[str, int]) -> tuple[int, int]:
+    """Return the number of accepted and dropped lines. An implausible line could be read, too."""
+    bad = sum(count for name, count in counters.items() if name.startswith("line_"))
+    return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
 
 class ReportData:

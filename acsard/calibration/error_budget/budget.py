@@ -21,8 +21,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.error_budget.drive_log import Line, motion
-from acsard.calibration.error_budget.step_errors import Driving, Steps, rounding
+from acsard.calibration.error_budget.measured_errors import Driving, Line, Steps, motion, rounding
 from acsard.core.config.settings import Config, OdometryConfig
 from acsard.core.motion.error_model import DECIMAL, ErrorModel, TwistUncertainty, columns
 from acsard.core.motion.kinematics import Kinematics

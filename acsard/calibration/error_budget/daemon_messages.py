@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 
 from acsard.calibration.error_budget.budget import Budget, Received, budget
-from acsard.calibration.error_budget.drive_log import Line
+from acsard.calibration.error_budget.measured_errors import Line
 from acsard.client import Client, Subscription
 from acsard.client.follower import FIRST_S
 from acsard.client.synchronous import decoder
