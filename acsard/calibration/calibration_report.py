@@ -100,13 +100,9 @@ class Report(Struct, frozen=True):
 
 
 def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
-    """Return the report of a calibration.
+    """Return the report of a calibration from a log, or from the guided drive of this name.
 
-    Args:
-        log: the name of the log, or of the guided drive.
-        calibration: the calibration.
-        drive: the geometry that the multipliers belong to.
-        written: the name of the file that now contains the multipliers, or "".
+    `written` is the name of the file that now contains the multipliers, or "".
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()

@@ -96,12 +96,8 @@ def of_rows(
 ) -> Evidence:
     """Return the evidence of rows, summed by block.
 
-    Args:
-        jacobian: derivatives of each row's prediction, shape (rows, COUNT).
-        residual: measured minus predicted value of each row.
-        weight: weight of each row.
-        block: block number of each row.
-        blocks: number of blocks.
+    Each row has the derivatives of its prediction (`jacobian`, shape (rows, COUNT)), its measured
+    minus its predicted value (`residual`), its weight and the number of its block.
     """
     normal = np.zeros((blocks, COUNT, COUNT))
     score = np.zeros((blocks, COUNT))
@@ -246,8 +242,7 @@ def fit(
     Args:
         sources: the sensors.
         start: the parameters to start from, which must be nearly right.
-        places: whether positions are among the sources.
-        gyro: whether a gyro is among the sources.
+        places, gyro: whether positions and a gyro are among the sources.
         bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not depend
             on the bias.
         held: combinations of parameters that the fit does not change.
@@ -313,13 +308,7 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[int, float]
 ) -> tuple[Floats, Floats]:
-    """Return the prior information as normal equations.
-
-    Args:
-        parameters: the present parameters.
-        held: the combinations of parameters that do not change.
-        usual: the prior standard deviation of each parameter that has one.
-    """
+    """Return the prior information at the present parameters as normal equations."""
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2

@@ -14,7 +14,7 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -179,6 +179,21 @@ class Table(Struct, frozen=True):
     """Names of the runs, by number."""
     notes: tuple[str, ...]
     """Sentences about data that was left out."""
+
+    @classmethod
+    def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
+        """Return the table of one run in which each sample of each sensor is a row, by time.
+
+        Each sensor has the column "t", and columns of its own.
+        """
+        ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
+        columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
+        for begin, sensor in zip(ends, sensors, strict=False):
+            for name, values in sensor.items():
+                columns[name][begin : begin + len(values)] = values
+        order = np.argsort(columns["t"], kind="stable")
+        columns = {name: values[order] for name, values in columns.items()}
+        return cls(columns, np.zeros(len(order), dtype=np.int64), ("",), ())
 
 
 def read(data: bytes) -> Table:

@@ -64,13 +64,9 @@ def configured(base: Base) -> Multipliers:
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that fit best at the turn rates of the log.
 
-    The variance of the track is that of the best constant track there. The turns that
-    skid more or less than usual belong to the noise of the odometry.
-
-    Args:
-        parameters: the parameters of a fit.
-        covariance: the covariance of the parameters.
-        rate: the turn rates of the log.
+    `parameters` and `covariance` are those of a fit. The variance of the track is that of the best
+    constant track there. The turns that skid more or less than usual belong to the noise of the
+    odometry.
     """
     inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -127,16 +123,8 @@ def scaled(
     """Return the corrected multipliers, and the name of the run that the distance belongs to.
 
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
-
-    Args:
-        found: the multipliers that the fit gave.
-        tape: the measured distance.
-        names: the names of the runs.
-        follow: computes the extent of a run.
-        known: whether positions have already measured the scale.
-
-    Raises:
-        RefusedError: the log has no such run, or the run is not straight enough.
+    `names` has the names of the runs. `known` says that positions have already measured the scale.
+    Raises `RefusedError` if the log has no such run, or the run is not straight enough.
     """
     if tape.run and tape.run not in names:
         raise RefusedError(

@@ -81,7 +81,7 @@ A higher rate is in degrees, since no robot turns twice a second.
 LEAST_CHI = 0.4
 """Smallest ratio of effective track to wheel separation.
 
-WheelAngles that skid make the effective track larger, and nothing makes it this much smaller.
+Wheels that skid make the effective track larger, and nothing makes it this much smaller.
 """
 
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
@@ -154,13 +154,9 @@ def unsure(
 ) -> dict[str, float]:
     """Return the relative standard deviations that are too large to be useful, by name.
 
-    The names are `TRACK` and `RATIO`.
-
-    Args:
-        found: the multipliers.
-        track_std: the standard deviation of the track as a fraction. It leaves out that the track
-            itself varies with the turn rate and from block to block.
-        worst: the largest useful standard deviations of the track and of the ratio of the radii.
+    The names are `TRACK` and `RATIO`, and `worst` has the limits in this order. `track_std` is the
+    standard deviation of the track as a fraction. It leaves out that the track itself varies with
+    the turn rate and from block to block.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -175,16 +171,14 @@ def separates_track(fitted: Fit) -> bool:
     return condition(fitted.marginal()) <= WORST_CONDITION
 
 
-def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
+def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
 
-    Args:
-        source: the name of the heading sensor.
-        turned: the turn of each row according to the sensor, rad.
-        by_wheels: the turn of each row from the wheels, rad, scaled to fit the sensor best.
+    `sides` is the result of `heading.first`, which fits the wheels to the sensor best.
     """
-    spread = float(turned @ turned)
-    if not spread or float(np.sum((turned - by_wheels) ** 2)) > UNLIKE * spread:
+    spread = float(rows.turned @ rows.turned)
+    off = rows.turned - heading.by_sides(rows, base, sides)
+    if not spread or float(off @ off) > UNLIKE * spread:
         raise RefusedError(
             f"{source} does not follow the wheels. Check that it is the yaw axis (not roll or "
             "pitch), that it is from the same drive, that its clock agrees within 2 s, that the "
@@ -204,10 +198,8 @@ def positions_follow(begun: StartingPoint) -> None:
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
     """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
 
-    Args:
-        source: the name of the heading sensor.
-        sides: the result of `heading.first`, or None without a heading sensor.
-        begun: the best starting point that the positions give, or None without positions.
+    `sides` is the result of `heading.first`, and `begun` that of `search`. They are None without
+    the sensor.
     """
     left = right = 1.0
     if begun is not None:
@@ -252,9 +244,9 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
         )
 
 
-def turns_like_the_wheels(source: str, turned: Floats, rows: Rows, base: Base) -> None:
+def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
     """Raise `RefusedError` if the sensor shows nearly no turns while the wheels turn the robot."""
-    shown = float(np.abs(turned).sum())
+    shown = float(np.abs(rows.turned).sum())
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
     if shown < LEAST_TURN * by_wheels:
         raise RefusedError(
@@ -266,18 +258,13 @@ def turns_like_the_wheels(source: str, turned: Floats, rows: Rows, base: Base) -
         )
 
 
-def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
+def turn_rates(source: str, rows: Rows) -> None:
     """Raise `RefusedError` if the turns are in degrees, because no robot turns this fast.
 
     The wheels are not compared here: if their speeds are in degrees too, both errors hide each
     other.
-
-    Args:
-        source: the name of the heading sensor.
-        turned: the turn of each row by the sensor, rad.
-        seconds: the length of each row, s.
     """
-    rate = float(np.percentile(np.abs(turned) / seconds, 90))
+    rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > FASTEST_TURN:
         raise RefusedError(
             f"{source} is in degrees (multiply by pi / 180): it shows turns of {rate:.0f} rad/s; "
@@ -358,7 +345,7 @@ def remarks(
         delays: the delay of each sensor behind the wheels, s.
         bias: the gyro bias, rad/s.
         turned: the turn of each row, rad, positive to the left.
-        values: the multipliers of the track, the left and the right radius.
+        values: the multipliers, as in `Multipliers.values`.
         base: the configured geometry.
         sized: whether the size of the wheels was measured.
     """

@@ -45,15 +45,9 @@ OTHER_BAGS = {
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
-    """Return the calibration from a recorded drive.
+    """Return the calibration from a recorded drive: a file, or the directory of a bag.
 
     Raises `LogError`, `RefusedError`, and `MendableError` for a file that cannot be read.
-
-    Args:
-        log: the file, or the directory of a bag.
-        config: the robot.
-        tape: a distance that was measured by tape, or None.
-        choice: the topics of a bag that the user chose.
     """
     try:
         table = _table(log, config, choice)

@@ -494,12 +494,8 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
 def on_arrival_clock(came: Floats, made: Floats) -> Floats:
     """Return the times of the samples of one stream by the clock of their arrival, s.
 
-    If the delays vary little, the times are the stamps plus the smallest delay. Otherwise they are
-    the times of arrival.
-
-    Args:
-        came: the times of arrival, s.
-        made: the stamps by the sender's clock, s.
+    If the delays between the stamps `made` by the sender's clock and the times of arrival `came`
+    vary little, the times are the stamps plus the smallest delay. Otherwise they are `came`.
     """
     delay = came - made
     if float(np.ptp(delay)) > MOST_JITTER_S:

@@ -130,16 +130,9 @@ class Calibration(Struct, frozen=True):
 def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
     """Return the calibration of the robot that recorded this log.
 
-    Args:
-        log: the recorded runs.
-        drive: the geometry that the multipliers belong to, and the present multipliers.
-        tape: a distance that was measured by tape, or None.
-
-    Raises:
-        LogError: a sensor of the log cannot be used.
-        RefusedError: the log gives no calibration.
-
-    The notes of the log are added to each of these errors.
+    `drive` has the geometry that the multipliers belong to, and the present multipliers. Raises
+    `LogError` if a sensor of the log cannot be used, and `RefusedError` if the log gives no
+    calibration, both with the notes of the log.
     """
     try:
         return _calibrated(log, drive, tape)
@@ -192,12 +185,10 @@ def prepared(
     sources: list[Source] = []
     sides = by_positions = None
     if headings is not None and len(rows.turned):
-        plausibility.turns_like_the_wheels(headings.source, rows.turned, rows, base)
+        plausibility.turns_like_the_wheels(headings.source, rows, base)
         plausibility.turns_enough(rows.turned)
         sides = heading.first(rows, base)
-        plausibility.heading_follows(
-            headings.source, rows.turned, heading.by_sides(rows, base, sides)
-        )
+        plausibility.heading_follows(headings.source, rows, base, sides)
         sources.append(lambda p: heading.evidence(rows, base, p, count))
     if segments:
         by_positions = search(segments, driven, base, sides)
@@ -219,7 +210,7 @@ def prepared(
         start[[LEFT, RIGHT]] = size * sides / mean
         start[INVERSE_TRACK] = mean / size
     if headings is not None:
-        plausibility.turn_rates(headings.source, rows.turned, rows.seconds)
+        plausibility.turn_rates(headings.source, rows)
     _check_units(headings, start, base, by_positions is not None)
     return Prepared(driven, headings, base, parts, every, segments, steps, sources, start)
 

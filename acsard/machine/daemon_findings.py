@@ -355,9 +355,8 @@ def daemon(running: Running) -> Iterator[Finding]:
 def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     """Yield a finding if a certificate that the daemon or its gateway uses ends soon.
 
-    Args:
-        row: the row of the daemon's diagnostics, None without TLS.
-        here: whether the daemon runs on this machine, where its files are examined too.
+    `row` is that of the daemon's diagnostics. `here` says that the daemon runs on this machine,
+    where its files are examined too.
     """
     if row is None or not row.level:
         return

@@ -131,12 +131,9 @@ class Lateness:
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
         """Take the step of a period.
 
-        Args:
-            t: time of the step, s.
-            now_ns: monotonic time of the step, ns.
-            missed: number of periods since the previous tick that had no step.
-            known: False if the recording lacks steps before this one. Then the number of the period
-                is computed from the clock.
+        `t` (s) and `now_ns` (monotonic, ns) are its time, and `missed` is the number of periods
+        since the previous tick that had no step. `known` is False if the recording lacks steps
+        before this one. Then the number of the period is computed from the clock.
         """
         period_ns, began_ns = self._period_ns, self._began_ns
         if began_ns is None:
@@ -199,13 +196,7 @@ class SerialCounts:
         """Largest `_outstanding` of all earlier seconds."""
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
-        """Take a step.
-
-        Args:
-            t: time of the step, s.
-            sent: True if a line was sent.
-            counters: the robot's counters after the step.
-        """
+        """Take a step at `t`, s, whether it sent a line, and the robot's counters after it."""
         received = self._now = _received(counters)
         if self._second is None:
             self._second, self._before, self._base = int(t), received, sum(received)

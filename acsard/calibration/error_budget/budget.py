@@ -150,12 +150,9 @@ class Received(Struct, frozen=True):
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
-    """Return the error budget of a drive.
+    """Return the error budget of a drive, with the position error after `metres`.
 
-    Args:
-        received: the drive.
-        config: the configuration of the daemon.
-        metres: the distance after which the position error is given.
+    `config` is the configuration of the daemon.
     """
     model, lines = _Model(config, metres), received.lines
     still = _standing(received, config, model)
@@ -255,14 +252,10 @@ class _Model:
     ) -> Share:  # fmt: skip
         """Return the error of one cause.
 
-        Args:
-            cause: the cause.
-            basis: the source of the size of the error.
-            ahead: the steps that are repeated until the distance is driven.
-            left: the steps that are repeated until a whole turn is made.
-            only: the settings, without the errors of other causes.
-            counts: encoder counts per wheel turn; 0 if their resolution is not the cause.
-            scale: the relative standard deviation of the gyro's scale.
+        The steps `ahead` are repeated until the distance is driven, and the steps `left` until a
+        whole turn is made. `only` has the settings without the errors of other causes. `counts`
+        (encoder counts per wheel turn) and `scale` (relative standard deviation of the gyro's
+        scale) are 0 if they are not the cause.
         """
         if basis == "unknown":
             return Share(cause, None, None, basis)

@@ -155,20 +155,12 @@ class Recorder:
 
     def run(self) -> Run:
         """Return the leg as a run. Raises `LogError` if there are too few wheel samples."""
-        count = sum(map(len, self.samples.values()))
-        columns: dict[str, Floats] = {"t": np.full(count, math.nan)}
-        at = 0
+        sensors: list[dict[str, Floats]] = []
         for stream, names in STREAMS.items():
             samples = self.samples[stream]
-            rows = slice(at, at + len(samples))
-            columns["t"][rows] = times(samples)
-            for number, column in enumerate(names):
-                columns[column] = np.full(count, math.nan)
-                columns[column][rows] = [sample.values[number] for sample in samples]
-            at += len(samples)
-        order = np.argsort(columns["t"], kind="stable")
-        columns = {column: values[order] for column, values in columns.items()}
-        return runs(Table(columns, np.zeros(count, dtype=np.int64), ("",), ())).runs[0]
+            values = np.array([sample.values for sample in samples]).reshape(-1, len(names)).T
+            sensors.append({"t": times(samples)} | dict(zip(names, values, strict=True)))
+        return runs(Table.joined(sensors)).runs[0]
 
 
 def times(samples: Sequence[Sample]) -> Floats:

@@ -40,22 +40,19 @@ def table(seen: Drive, *, gyro: bool = True, places: bool = True) -> Table:
 
     `test_a_table_is_that_of_the_written_log` compares both.
     """
-    counts = len(seen.t), len(seen.gyro_t) * gyro, len(seen.place_t) * places
-    ends = np.cumsum([0, *counts])
-    cells = np.full((6, ends[-1]), np.nan)
-    sensors = (
-        (seen.t, {1: seen.left, 2: seen.right}, 2),
-        (seen.gyro_t, {3: seen.gyro}, 6),
-        (seen.place_t, {4: seen.place.real, 5: seen.place.imag}, 4),
+    sensors = [
+        (seen.t, {"left": seen.left, "right": seen.right}, 2, True),
+        (seen.gyro_t, {"yaw_rate": seen.gyro}, 6, gyro),
+        (seen.place_t, {"x": seen.place.real, "y": seen.place.imag}, 4, places),
+    ]
+    made = Table.joined(
+        [
+            {"t": np.round(t[: len(t) * used], 6)}
+            | {name: np.round(sensed[: len(t) * used], decimals) for name, sensed in values.items()}
+            for t, values, decimals, used in sensors
+        ]
     )
-    for begin, count, (times, values, decimals) in zip(ends, counts, sensors, strict=False):
-        rows = slice(begin, begin + count)
-        cells[0, rows] = np.round(times[:count], 6)
-        for column, sensed in values.items():
-            cells[column, rows] = np.round(sensed[:count], decimals)
-    cells = cells[:, np.argsort(cells[0], kind="stable")]
-    columns = dict(zip(("t", "left", "right", "yaw_rate", "x", "y"), cells, strict=True))
-    return Table(columns, np.zeros(ends[-1], np.int64), ("",), tuple(bounded(columns)))
+    return structs.replace(made, notes=tuple(bounded(made.columns)))
 
 
 def log_of(log: str | Table) -> reading.Log:
