@@ -201,17 +201,12 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
     `sides` is the result of `heading.first`, and `begun` that of `search`. They are None without
     the sensor.
     """
-    left = right = 1.0
+    by_places = by_heading = ""
     if begun is not None:
-        left, right = np.sign(begun.parameters[[LEFT, RIGHT]] * begun.parameters[INVERSE_TRACK])
-    by_places = {(1.0, 1.0): "", (-1.0, -1.0): "turn", (-1.0, 1.0): "left"}.get(
-        (left, right), "right"
-    )
-    by_heading = by_places
+        turn = begun.parameters[INVERSE_TRACK]
+        by_places = by_heading = _wrong_sign(begun.parameters[[LEFT, RIGHT]] * turn)
     if sides is not None:
-        by_heading = {(True, True): "", (False, False): "turn", (False, True): "left"}.get(
-            (bool(sides[0] > 0), bool(sides[1] > 0)), "right"
-        )
+        by_heading = _wrong_sign(sides)
     for side in ("left", "right"):
         if side in (by_heading, by_places):
             raise RefusedError(
@@ -242,6 +237,14 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
             "right are swapped, or ahead is negative on both sides"
             f"{or_sensor}"
         )
+
+
+def _wrong_sign(sides: Floats) -> str:
+    """Return which sign is wrong: that of the "left" or "right" wheels, of each "turn", or ""."""
+    left, right = (sides > 0.0).tolist()
+    if left:
+        return "" if right else "right"
+    return "left" if right else "turn"
 
 
 def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:

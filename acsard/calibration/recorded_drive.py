@@ -9,10 +9,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from mcap.exceptions import EndOfFile
-from mcap.records import Channel, Header, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.reader import NonSeekingReader
 from msgspec.structs import replace
 
 from acsard.calibration import ros_bag_log
@@ -34,7 +34,7 @@ MOST_RECORD_BYTES = 1 << 28
 """Size of the largest record of a bag that is read. A chunk of rosbag2 has less than 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
-"""Exceptions for a damaged bag: those of MCAP, of LZ4, and of a message without its channel."""
+"""Exceptions for a damaged bag: those of MCAP, of LZ4, and of a channel without its schema."""
 
 OTHER_BAGS = {
     ".db3": (b"SQLite format 3\0", "in SQLite: convert it to MCAP with `ros2 bag convert`"),
@@ -99,10 +99,13 @@ def _is_ours(log: Path) -> bool:
     """Return whether an MCAP file is a recording of acsard, as far as its beginning shows."""
     with log.open("rb") as stream:
         try:
-            first = next(StreamReader(stream, record_size_limit=MOST_RECORD_BYTES).records)
+            return _reader(stream).get_header().profile == "acsard"
         except (*DAMAGE, StopIteration):
             return True  # the reader of recordings names the damage
-        return not isinstance(first, Header) or first.profile == "acsard"
+
+
+def _reader(stream: IO[bytes]) -> NonSeekingReader:
+    return NonSeekingReader(stream, record_size_limit=MOST_RECORD_BYTES)
 
 
 def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
@@ -122,22 +125,12 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
     If the bag is cut off or damaged, the messages before that place are yielded, and a sentence is
     added to `notes`.
     """
-    types: dict[int, str] = {}
-    channels: dict[int, Channel] = {}
     with file.open("rb") as stream:
         try:
-            for record in StreamReader(stream, record_size_limit=MOST_RECORD_BYTES).records:
-                match record:
-                    case Schema():
-                        types[record.id] = record.name
-                    case Channel():
-                        channels[record.id] = record
-                    case Message():
-                        channel = channels[record.channel_id]
-                        yield RosMessage(
-                            channel.topic, types.get(channel.schema_id, ""),
-                            channel.message_encoding, record.log_time, record.data,
-                        )  # fmt: skip
+            for schema, channel, one in _reader(stream).iter_messages(log_time_order=False):
+                type_ = "" if schema is None else schema.name
+                encoding = channel.message_encoding
+                yield RosMessage(channel.topic, type_, encoding, one.log_time, one.data)
         except EndOfFile:
             notes.append(f"{file.name} has no end: the messages before the cut are used")
         except BAG_DAMAGE as error:
