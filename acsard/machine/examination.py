@@ -9,7 +9,6 @@ another machine, only its own reports are examined: its port, files and gateway 
 
 from __future__ import annotations
 
-import grp
 import os
 import stat
 import time
@@ -139,18 +138,14 @@ def _hardware(name: str) -> Iterator[Finding]:
 def _permission(path: str) -> Finding:
     if os.access(path, os.R_OK | os.W_OK):
         return Finding("port", "ok", f"{path} may be read and written")
-    group = _group_of(os.stat(path).st_gid)
+    try:
+        group = Path(path).group()
+    except KeyError:
+        group = str(os.stat(path).st_gid)
     mend = f"sudo usermod -aG {group} $USER, then log in again (the service has the group itself)"
     return Finding(
         "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
     )
-
-
-def _group_of(number: int) -> str:
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
 
 
 def examine(

@@ -164,19 +164,24 @@ class Lateness:
         return max([point.value for point in self.points()], default=0.0)
 
 
-class SerialTotals:
-    """Number of sent, accepted, dropped and unanswered lines of the collected steps."""
+class LineCount:
+    """Number of lines of one kind, in each second and in all."""
 
     def __init__(self) -> None:
-        self.sent = self.good = self.dropped = self.unanswered = 0
+        self.curve, self.total = Curve(), 0
+
+    def add(self, t: float, count: int) -> None:
+        """Add the lines of the second around `t`."""
+        self.curve.add(t, count)
+        self.total += count
 
 
 class SerialCounts:
     """Number of sent, accepted, dropped and unanswered lines in each second."""
 
     def __init__(self) -> None:
-        self.sent, self.good, self.dropped, self.unanswered = Curve(), Curve(), Curve(), Curve()
-        self.totals = SerialTotals()
+        self.sent, self.good = LineCount(), LineCount()
+        self.dropped, self.unanswered = LineCount(), LineCount()
         self._second: int | None = None
         self._sent = 0
         """Lines sent in this second."""
@@ -203,29 +208,22 @@ class SerialCounts:
         elif int(t) != self._second:
             self._end(received)
             self._second = int(t)
-        outstanding = self.totals.sent + self._sent - (sum(received) - self._base)
+        outstanding = self.sent.total + self._sent - (sum(received) - self._base)
         if self._outstanding is None or outstanding < self._outstanding:
             self._outstanding = outstanding
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
         """Finish a second. The next step may be many seconds later."""
-        t, totals = float(self._second or 0) + 0.5, self.totals
+        t = float(self._second or 0) + 0.5
         good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
         outstanding = self._outstanding or 0
         lost = outstanding if self._lost is None else max(outstanding, self._lost)
         unanswered = 0 if self._lost is None else lost - self._lost
-        for curve, count in (
-            (self.sent, self._sent),
-            (self.good, good),
-            (self.dropped, dropped),
-            (self.unanswered, unanswered),
-        ):
-            curve.add(t, count)
-        totals.sent += self._sent
-        totals.good += good
-        totals.dropped += dropped
-        totals.unanswered += unanswered
+        self.sent.add(t, self._sent)
+        self.good.add(t, good)
+        self.dropped.add(t, dropped)
+        self.unanswered.add(t, unanswered)
         self._sent, self._before, self._lost, self._outstanding = 0, received, lost, None
 
     def end(self) -> None:

@@ -235,15 +235,15 @@ class TimeFigures:
     def serial(self) -> Figure:
         """Draw the number of sent, answered and lost lines per second."""
         counts = self._data.serial
-        bad = [Line("dropped", COLOURS["error"], counts.dropped.points(), "hvh")]
+        bad = [Line("dropped", COLOURS["error"], counts.dropped.curve.points(), "hvh")]
         if not self._data.config.mcu.reply_period:
-            bad.append(Line("no answer", COMMANDED, counts.unanswered.points(), "hvh"))
+            bad.append(Line("no answer", COMMANDED, counts.unanswered.curve.points(), "hvh"))
         parts = [
             Part(
                 "lines per second",
                 [
-                    Line("sent", LIMITED, counts.sent.points(), "hvh", BENEATH),
-                    Line("answered", MEASURED, counts.good.points(), "hvh"),
+                    Line("sent", LIMITED, counts.sent.curve.points(), "hvh", BENEATH),
+                    Line("answered", MEASURED, counts.good.curve.points(), "hvh"),
                 ],
             ),
             Part("lost per second", bad),

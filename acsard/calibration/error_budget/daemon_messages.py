@@ -92,7 +92,7 @@ class Feed:
         self._config, self._first = config, first
         self._start_ns = first.stamp.to_ns()
         self._odom: dict[int, Odometry] = {}
-        self._lines: deque[tuple[int, Line]] = deque(maxlen=MOST)
+        self._lines: deque[Line] = deque(maxlen=MOST)
         self._sent: deque[int] = deque(maxlen=MOST)
         self._wheels: dict[int, JointState] = {}
         self._count = 0
@@ -110,11 +110,10 @@ class Feed:
 
     def received(self, last: RobotState, diagnostics: DiagnosticArray) -> Received:
         """Return the drive so far. `last` and `diagnostics` are the daemon's present values."""
-        lines, zero = [line for _, line in self._lines], self._start_ns
         learned, deviation, used = _learned(diagnostics)
         return Received(
-            lines,
-            [(at - zero) / NS_PER_S for at in self._sent],
+            list(self._lines),
+            [(at - self._start_ns) / NS_PER_S for at in self._sent],
             whole=self._whole(last),
             counted=self._config.mcu.wants_samples and _value(diagnostics, "check") == SAMPLED,
             gyro=last.gyro in ("used", "disagrees"),
@@ -140,7 +139,7 @@ class Feed:
         e, f, g, h = wheels.position
         at = (stamp_ns - self._start_ns) / NS_PER_S
         yaw = 2 * math.atan2(q.z, q.w)
-        self._lines.append((stamp_ns, Line(at, (a, b, c, d), (e, f, g, h), yaw, covariance[35])))
+        self._lines.append(Line(at, (a, b, c, d), (e, f, g, h), yaw, covariance[35]))
         self._count += 1
 
     def _whole(self, last: RobotState) -> bool:

@@ -230,13 +230,13 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         t, np.array([line.speeds for line in lines]), np.array(turns),
         np.array([line.yaw_variance for line in lines]),
     )  # fmt: skip
-    seen = _Gaps(t, twists, rolled, found, whole)
+    filled, unfilled, missing, unseen = _gaps(t, twists, rolled, found, whole)
     late = _late(t, twists, found)
-    late[seen.unfilled.any(axis=1)] = 0.0
+    late[unfilled.any(axis=1)] = 0.0
     return Motion(
         float(t[-1] - t[0]), found.period, np.array([one.linear for one in rolled]),
-        np.array(turns), growth, late, float(np.sqrt(np.mean(found.late**2))), seen.filled,
-        seen.unfilled, seen.missing, seen.unseen,
+        np.array(turns), growth, late, float(np.sqrt(np.mean(found.late**2))), filled,
+        unfilled, missing, unseen,
     )  # fmt: skip
 
 
@@ -280,51 +280,38 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
     return parts
 
 
-class _Gaps:
-    """The errors of the gaps of a drive, by the odometry's own model of unseen motion."""
-
-    def __init__(
-        self, t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
-    ) -> None:
-        self.filled = np.zeros((len(rolled), 2))
-        self.unfilled = np.zeros((len(rolled), 4))
-        self.missing, self.unseen = 0, 0.0
-        gaps = Gaps()
-        gaps.interrupt(twists[0])
-        for k, (moved, missing) in enumerate(zip(rolled, found.missing[1:].tolist(), strict=True)):
-            before, after, dt = twists[k], twists[k + 1], float(t[k + 1] - t[k])
-            mean = Twist((before.linear + after.linear) / 2, (before.angular + after.angular) / 2)
-            moves = moved != Twist() or after == Twist()
-            if not moves and dt >= LATEST_S:
-                self.unseen += dt
-                self.missing += missing
-                along, yaw = gaps.unseen(dt, before, after)
-                self.unfilled[k] = dt * mean.linear, dt * mean.angular, along, yaw
-                gaps.interrupt(after)
-            elif missing and whole:
-                self.unseen += missing * found.period
-                self.missing += missing
-                self.filled[k] = _filled_variances(
-                    missing * found.period, moved, before, after, mean, found.period, gaps
-                )
-                gaps.interrupt(after)
-            else:
-                gaps.follow(after, found.period)
-
-
-def _filled_variances(
-    seconds: float, moved: Twist, before: Twist, after: Twist, mean: Twist, period: float,
-    gaps: Gaps,
-) -> tuple[float, float]:  # fmt: skip
-    """Return the variances (m2, rad2) of a gap that odometry filled.
-
-    They are the model's variances for unseen motion, plus the squared difference between the motion
-    that odometry filled in and the motion at the mean of the speeds before and after the gap.
-    """
-    along, yaw = gaps.unseen(seconds, before, after)
-    off = moved.linear - after.linear * period - mean.linear * seconds
-    turned = moved.angular - after.angular * period - mean.angular * seconds
-    return along + off * off, yaw + turned * turned
+def _gaps(
+    t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
+) -> tuple[Floats, Floats, int, float]:
+    """Return the last four fields of `Motion`, by the odometry's own model of unseen motion."""
+    filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
+    lost, unseen = 0, 0.0
+    gaps = Gaps()
+    gaps.interrupt(twists[0])
+    for k, (moved, missing) in enumerate(zip(rolled, found.missing[1:].tolist(), strict=True)):
+        before, after, dt = twists[k], twists[k + 1], float(t[k + 1] - t[k])
+        mean = Twist((before.linear + after.linear) / 2, (before.angular + after.angular) / 2)
+        moves = moved != Twist() or after == Twist()
+        if not moves and dt >= LATEST_S:
+            unseen += dt
+            lost += missing
+            along, yaw = gaps.unseen(dt, before, after)
+            unfilled[k] = dt * mean.linear, dt * mean.angular, along, yaw
+            gaps.interrupt(after)
+        elif missing and whole:
+            seconds = missing * found.period
+            unseen += seconds
+            lost += missing
+            # Odometry may have filled in another motion than that at the mean of the speeds before
+            # and after the gap.
+            off = moved.linear - after.linear * found.period - mean.linear * seconds
+            turned = moved.angular - after.angular * found.period - mean.angular * seconds
+            along, yaw = gaps.unseen(seconds, before, after)
+            filled[k] = along + off * off, yaw + turned * turned
+            gaps.interrupt(after)
+        else:
+            gaps.follow(after, found.period)
+    return filled, unfilled, lost, unseen
 
 
 TOGETHER = 0.8
