@@ -110,10 +110,7 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number of normal equations, scaled so that units do not matter.
-
-    It is infinite if a parameter does not occur in the equations.
-    """
+    """Return the condition number apart from units. It is infinite if a parameter is missing."""
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
         return np.inf
@@ -160,10 +157,7 @@ LEAST_BLOCKS = 5
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t for these degrees of freedom.
-
-    It is infinite at 2, so at least 3 are assumed.
-    """
+    """Return the variance of Student's t for at least 3 degrees of freedom; at 2 it is infinite."""
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
 

@@ -278,10 +278,7 @@ def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Return the correlation of two series of equal length for shifts from -reach to reach.
-
-    A positive shift means that `later` lags behind `earlier`.
-    """
+    """Return the correlation for shifts from -reach to reach. At a positive one `later` lags."""
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
@@ -289,10 +286,7 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Return the rows of all blocks in which the heading sensor has samples.
-
-    If `headings` is None, return the rows of all blocks, with the wheels alone.
-    """
+    """Return the rows of all blocks with samples of the sensor; of all blocks without a sensor."""
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
@@ -421,8 +415,5 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the robot's turn in each row, rad, computed from the wheels.
-
-    `sides` has the factors of left and right that `first` returns.
-    """
+    """Return the turn of each row by the wheels, rad, with the factors `sides` of `first`."""
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

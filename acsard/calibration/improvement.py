@@ -116,10 +116,7 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 
 
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
-    """Return the folds of the cross-validation, one for each drive that has blocks.
-
-    A block is left out with each drive that it overlaps.
-    """
+    """Return a fold for each drive that has blocks. It leaves out each block that it overlaps."""
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
     )

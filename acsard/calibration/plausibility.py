@@ -73,10 +73,7 @@ Between it and 1 / `UNITS`, the wheel speeds have a wrong unit.
 """
 
 FASTEST_TURN = 12.0
-"""Fastest credible turn rate, rad/s.
-
-A higher rate is in degrees, since no robot turns twice a second.
-"""
+"""Fastest credible turn rate, rad/s. No robot turns twice a second, so a higher one is in deg/s."""
 
 LEAST_CHI = 0.4
 """Smallest ratio of effective track to wheel separation.
@@ -94,10 +91,7 @@ LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which it is reported."""
 
 ONE_SIDED = 0.1
-"""Ratio of the turns to the rarer side to all turns to the other side.
-
-Below it, the report says that turns to one side are missing.
-"""
+"""Ratio of the turns to both sides below which the report says that one side is missing."""
 
 ODD_SIZE = 1.25
 """Ratio of the measured radius to the configured one from which it is reported."""

@@ -157,10 +157,7 @@ def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
 
 
 def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
-    """Return the path of the robot, which starts at the origin with heading 0.
-
-    Each step is an exact arc.
-    """
+    """Return the path of the robot from the origin with heading 0. Each step is an exact arc."""
     left, right, turn, rate = parameters[[LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]]
     gain = base.gain * turn
     mean = gain * (left + right) / 2
@@ -183,10 +180,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the place of the robot at the times of the steps, like `Path.place` but faster.
-
-    The track does not change with the turn rate here.
-    """
+    """Return the places as in `Path.place`, but faster, for a track that does not change."""
     left, right = parameters[LEFT] * steps.left, parameters[RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
@@ -224,10 +218,7 @@ class Aligned(Struct, frozen=True):
 
 
 def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
-    """Align the path of each segment with its positions, and yield the result.
-
-    Outliers have a smaller weight.
-    """
+    """Align the path of each segment with its positions. Outliers have a smaller weight."""
     for segment in segments:
         place, derivatives = paths[segment.run].at(segment.t, parameters)
         weight = np.ones(len(place))
@@ -280,10 +271,7 @@ DELAYS = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that are tried, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Number of segments that are used to try and to refine: those with the longest reach.
-
-A search needs no more of them.
-"""
+"""Numbers of segments that are used to try and to refine: those with the longest reach."""
 
 MOST_POINTS = 80
 """Approximate number of positions per segment that are used, evenly spaced."""
@@ -330,10 +318,7 @@ class StartingPoint(Struct, frozen=True):
 def search(
     segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
 ) -> StartingPoint:
-    """Return the best starting point for these positions.
-
-    `sides` is the result of `heading.first`, or None without a heading sensor.
-    """
+    """Return the best starting point. `sides` is the result of `heading.first`, or None."""
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
     steps = {run: wheel_steps(driven[run], COARSE_S) for run in needed}

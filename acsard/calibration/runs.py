@@ -148,10 +148,7 @@ class Run(Struct, frozen=True, dict=True):
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
     def speed_difference(self, t: Floats) -> Floats:
-        """Return the speed of the right wheels minus that of the left at these times, rad/s.
-
-        It is an average over `SMOOTH_S`.
-        """
+        """Return the right minus the left wheels' speed, rad/s, each averaged over `SMOOTH_S`."""
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -386,10 +383,7 @@ def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
 def _stream(
     columns: dict[str, Floats], rows: Rows, names: Iterable[str], notes: Notes
 ) -> tuple[Floats, ...]:
-    """Return the times and values of a sensor, sorted, with one row for each time.
-
-    Rows in which one of its columns is empty are left out.
-    """
+    """Return a sensor's sorted times and values, without rows in which one of them is empty."""
     held = [columns.get(name) for name in names]
     if any(values is None for values in held):
         return (np.zeros(0),) * (1 + len(held))

@@ -236,10 +236,7 @@ class Candidate(Struct, frozen=True):
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """Quantities that stay as configured, `TRACK` and `RATIO`.
-
-    The value is the relative standard deviation to which the log determines the quantity.
-    """
+    """`TRACK` or `RATIO` if it stays as configured, with its relative deviation by the log."""
 
 
 def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:

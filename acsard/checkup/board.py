@@ -51,10 +51,7 @@ class Wire(Protocol):
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Wait until this time and return the received pieces with their times, ns.
-
-        Raises `WireLostError`.
-        """
+        """Return the pieces received until then with their times, ns. Raises `WireLostError`."""
 
 
 class Operator(Protocol):
@@ -213,12 +210,7 @@ class Board:
     # Sending
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
-        """Return the command for these speeds.
-
-        Args:
-            motors: speeds of motors a to d, rad/s.
-            comma: whether the line ends in a comma; None uses the form in force.
-        """
+        """Return the line for these speeds, rad/s. A `comma` of None is the form in force."""
         line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
             return line

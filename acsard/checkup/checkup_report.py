@@ -20,10 +20,7 @@ Changes = dict[str, object]
 """New values by dotted key, in the order of the file."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
-"""Keys that improve the link but are not necessary.
-
-They are left out if the wire has no room for the longer lines.
-"""
+"""Keys that only improve the link. They go if the wire has no room for the longer lines."""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
@@ -32,10 +29,7 @@ def answered(findings: Iterable[Finding]) -> bool:
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
-    """Return the keys that should differ from the configuration.
-
-    `port` is included if it is not "" and a board answered there.
-    """
+    """Return the keys to change, with the `port` if one is given and a board answered there."""
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
         wanted |= finding.keys

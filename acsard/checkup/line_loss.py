@@ -135,10 +135,7 @@ def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
 
 
 PULSE_S = 0.08
-"""Time for which a single line turns the motors, s.
-
-It is long enough to see and shorter than the watchdog.
-"""
+"""Time for which a single line turns the motors, s: long enough to see, below the watchdog's."""
 
 TOLD, PULSES_S = 8, 20.0
 """Number of unanswered pulses that shows the direction, and longest time to wait for them, s."""
@@ -186,10 +183,7 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
-    """Send pulses to these standing motors and count the losses.
-
-    Returns None if the motors are too slow or too coarse to tell.
-    """
+    """Send pulses to standing motors and count the losses; None if the motors cannot tell."""
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
     # A board that reports by its own clock answers no line, so nothing has shown any loss yet.
     end_s = board.now_s + (10.0 if board.own_clock else PULSES_S)

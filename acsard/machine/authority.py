@@ -107,9 +107,7 @@ class Authority:
         )
 
     def names_in(self, directory: Path) -> list[str]:
-        """Return the host names and IP addresses in the certificate of `directory`, if it
-        exists.
-        """
+        """Return the names and addresses in the certificate of `directory`, if there is one."""
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
             names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value

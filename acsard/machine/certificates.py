@@ -42,10 +42,7 @@ HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
-    """Create an authority, the robot's certificate and one for each role.
-
-    Returns the robot's names.
-    """
+    """Create an authority and the first certificates. Returns the robot's names."""
     if (directory / CA).exists() and not force:
         raise MendableError(
             f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
@@ -96,10 +93,7 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 
 
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
-    """Replace the robot's own certificate.
-
-    Returns its names and addresses, with those of the old one.
-    """
+    """Replace the robot's own certificate. Returns its names, with those of the old one."""
     authority = _load(directory)
     _require_permitted(authority, addresses)
     known = _robot_names(authority.names_in(directory))

@@ -147,10 +147,7 @@ def _tables(its: Mapping[str, Difference]) -> str:
 
 
 def answers(endpoint: str) -> bool:
-    """Return whether a program listens at the endpoint.
-
-    Raises `UsageError` if it is not an endpoint.
-    """
+    """Return whether a program listens there. Raises `UsageError` if it is not an endpoint."""
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)

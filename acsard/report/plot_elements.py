@@ -92,10 +92,7 @@ def numbers(values: Iterable[float]) -> dict[str, str]:
 
 
 def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
-    """Return a curve, or marks, through the points with the coordinates `x` and `y`.
-
-    `look` has plotly's attributes of the curve or of the marks.
-    """
+    """Return a curve or marks through these points; `look` has their attributes in plotly."""
     return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
 
 

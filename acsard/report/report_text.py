@@ -20,10 +20,7 @@ from acsard.daemon.late_causes import cause_in
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
-"""Function that formats a time in s since 1970 as local time.
-
-The text has the date if the second argument is true.
-"""
+"""Function from a time in s since 1970, and whether to add the date, to local time in words."""
 
 MAX_REASONS = 8
 """Largest number of rows in the table of reasons."""

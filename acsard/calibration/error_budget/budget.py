@@ -51,10 +51,7 @@ MOST_STEPS = 20_000
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""A step straight ahead, m, and a step of a turn on the spot, rad.
-
-The errors of a robot that stands are computed for them.
-"""
+"""Steps straight ahead (m) and on the spot (rad), for the errors of a robot that stands."""
 
 
 class Share(Struct, frozen=True):

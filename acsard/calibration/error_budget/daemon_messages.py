@@ -123,10 +123,7 @@ class Feed:
         )
 
     def _join(self, stamp_ns: int) -> None:
-        """Combine the `odom` and the `wheel_states` message with this stamp to a feedback line.
-
-        If one of them has not arrived yet, do nothing.
-        """
+        """Combine the `odom` and the `wheel_states` message of this stamp, if both have arrived."""
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
         if odom is None or wheels is None:
             for waiting in (self._odom, self._wheels):

@@ -105,10 +105,7 @@ def _even(t: Floats) -> LineTimes:
 
 
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
-    """Estimate the delays of the lines of a board that answers each line of the daemon.
-
-    Returns None if too few lines of the daemon are known.
-    """
+    """Estimate the delays of a board that answers each line; None if too few of these are known."""
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
     at = np.interp(t, sent, np.arange(len(sent)))
@@ -151,10 +148,7 @@ LEAST_LINES, ALIKE = 20, 0.99
 the cosine of turn and time above which the fit cannot separate them."""
 
 LATEST_S = 0.1
-"""Delay in s from which a stamp says nothing about when the line was made.
-
-The motion of such a line is treated as a gap.
-"""
+"""Delay, s, from which a stamp says nothing, so that the motion of its line counts as a gap."""
 
 Wheels = tuple[float, float, float, float]
 """Values of the four wheels, in the order of `values.WHEELS`."""
@@ -337,10 +331,7 @@ class Rounding(Struct, frozen=True):
 
 
 def rounding(speeds: Floats, period: float) -> Rounding:
-    """Estimate the rounding errors of wheel speeds.
-
-    `speeds` has one row for each feedback line, in rad/s. A feedback line covers `period` s.
-    """
+    """Estimate the rounding errors of `speeds`, rad/s. Each row is a line, which covers `period` s."""
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
     alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
@@ -401,10 +392,7 @@ class Steps(Struct, frozen=True):
     """Whether a gyro measured the turns. Otherwise the wheels did."""
 
     def to_the_left(self) -> Steps:
-        """Return the steps with every turn to the left.
-
-        The missed turn of a step to the right changes its sign as well.
-        """
+        """Return the steps with every turn, and the missed part of it, to the left."""
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
         return Steps(rows, self.by_gyro)
@@ -452,10 +440,7 @@ class Driving:
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return the steps with the rounding errors of feedback lines.
-
-        The resolution of the encoders is not included.
-        """
+        """Return the steps with the rounding errors of lines, without the encoders' resolution."""
         found = self._rounding
         if found.count:
             return self._steps(missed=self._of_wheels(found.offset[1:]))

@@ -96,10 +96,7 @@ class Mean(Struct, frozen=True):
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn relative to a line or a wall.
-
-    The person measures the distances from the line to two points of the robot.
-    """
+    """A measurement of the robot's turn by the distances of two of its points from a line."""
 
     quantity: Quantity
     near: str
@@ -214,10 +211,7 @@ class Setup(Struct, frozen=True):
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
-        """Return a curve. `rate` is the turn rate without skidding, rad/s.
-
-        If `metres` is negative, the robot drives backwards.
-        """
+        """Return a curve at `rate`, rad/s without skidding; backwards if `metres` is negative."""
         straight = self.ahead(metres)
         return Move(straight.seconds, straight.linear, self.command(rate))
 

@@ -375,10 +375,7 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve from the middle of the floor and the same curve backwards.
-
-    The curve stays on the floor whatever the robot's heading is.
-    """
+    """Return a curve there and back, which stays on the floor whatever the robot's heading is."""
     metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 

@@ -164,10 +164,7 @@ class Recorder:
 
 
 def times(samples: Sequence[Sample]) -> Floats:
-    """Return the times of the samples of one stream by this computer's clock, s.
-
-    They are the times of arrival unless every sample has a stamp.
-    """
+    """Return the times by this computer's clock, s; those of arrival if a stamp is missing."""
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
     return came if not len(came) or np.isnan(made).any() else on_arrival_clock(came, made)

@@ -47,10 +47,7 @@ from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig
 
 SKIDDING = 0.015
-"""Standard deviation of the heading by skidding after 1 m of rolling, rad.
-
-It grows with the square root of the distance.
-"""
+"""Standard deviation of the heading by skidding, rad for each square root of a metre of rolling."""
 
 SKIDDING_LENGTH = 0.002
 """Standard deviation of a distance by skidding, as a fraction of the distance."""
@@ -254,10 +251,7 @@ CREDIBLE = 0.85, 3.0
 """Credible ratios of effective track to wheel separation. Outside them, a reading must be wrong."""
 
 Answers = dict[tuple[str, str], float]
-"""The person's answers in m and rad, keyed by the names of leg and question.
-
-The name of the leg is "" for questions that were asked before the first leg.
-"""
+"""The answers in m and rad by leg and question. The leg is "" before the first leg."""
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
