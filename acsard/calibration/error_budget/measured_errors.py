@@ -331,7 +331,7 @@ class Rounding(Struct, frozen=True):
 
 
 def rounding(speeds: Floats, period: float) -> Rounding:
-    """Estimate the rounding errors of `speeds`, rad/s. Each row is a line, which covers `period` s."""
+    """Estimate the rounding errors of `speeds`, rad/s. A row is a line, which covers `period` s."""
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
     alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
