@@ -379,8 +379,12 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     jacobian[:, SCALE_ERROR] = by_wheels
     gyro = by_wheels * (1 + parameters[SCALE_ERROR]) + parameters[BIAS_ERROR] * rows.seconds
     residual = rows.turned - gyro
-    usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
-    return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
+    return of_rows(jacobian, residual, _weight(rows, residual, by_wheels), rows.block, blocks)
+
+
+def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
+    """Return the weight of each row. `by_wheels` is its turn according to the wheels, rad."""
+    return huber(residual / np.hypot(NOISE * rows.seconds, SHARE * by_wheels), 1.0)
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
@@ -389,10 +393,9 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
     `by_wheels` is the turn of each row according to the wheels, rad.
     """
     seconds, found = rows.seconds, 0.0
+    off = rows.turned - by_wheels
     for _ in range(10):
-        off = rows.turned - by_wheels
-        usual = np.hypot(NOISE * seconds, SHARE * by_wheels)
-        weight = huber((off - found * seconds) / usual, 1.0)
+        weight = _weight(rows, off - found * seconds, by_wheels)
         found = float((weight * seconds) @ off / ((weight * seconds) @ seconds))
     return found
 
@@ -409,8 +412,7 @@ def first(rows: Rows, base: Base) -> Floats:
         root = np.sqrt(weight)[:, None]
         found = np.asarray(np.linalg.lstsq(columns * root, rows.turned * root[:, 0], rcond=None)[0])
         by_wheels = columns @ found
-        usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
-        weight = huber((rows.turned - by_wheels) / usual, 1.0)
+        weight = _weight(rows, rows.turned - by_wheels, by_wheels)
     return found
 
 

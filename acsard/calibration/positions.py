@@ -55,6 +55,11 @@ SPEED_S = 0.05
 """Half of the interval from which the speed along the path is computed, s."""
 
 
+def extent(places: Complexes) -> float:
+    """Return the extent of these places: the sum of both sides of the box around them, m."""
+    return float(np.ptp(places.real) + np.ptp(places.imag))
+
+
 class Segment(Struct, frozen=True):
     """The positions of a block between two jumps of their source."""
 
@@ -345,7 +350,7 @@ def search(
 
 
 def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
-    reach = [float(np.ptp(s.place.real) + np.ptp(s.place.imag)) for s in segments]
+    reach = [extent(s.place) for s in segments]
     kept = [segments[i] for i in sorted(np.argsort(reach)[::-1][:most])]
     return [
         replace(s, t=s.t[:: 1 + len(s.t) // MOST_POINTS],

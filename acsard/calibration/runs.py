@@ -70,7 +70,6 @@ NOTED, APART = 0.15, 0.8
 Above `NOTED` it is reported, above `APART` the log is refused.
 """
 
-
 GAP_S, GAP_PERIODS = 0.3, 5.0
 """Interval between two samples above which there is a gap: in s, and in usual periods.
 
@@ -94,7 +93,6 @@ Without it, the speeds of a coarse encoder would be 0 in some samples and far to
 
 LEAST_TURN = 0.2
 """Angle of the faster side's wheels, rad, below which a block is not used."""
-
 
 MOST_JITTER_S = 5.0
 """Largest variation of the delay between stamp and arrival, s. Beyond it, stamps are not used."""

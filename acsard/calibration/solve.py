@@ -394,10 +394,7 @@ def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
             yield _own(headings.source)
     if made.segments:
         along = [positions.path(steps, base, fitted.parameters) for steps in made.steps]
-        reach = max(
-            float(np.ptp(segment.place.real) + np.ptp(segment.place.imag))
-            for segment in made.segments
-        )
+        reach = max(positions.extent(segment.place) for segment in made.segments)
         if positions.spread(made.segments, along, fitted.parameters) < PERFECT * reach:
             yield _own("the positions")
 

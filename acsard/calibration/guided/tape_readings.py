@@ -41,7 +41,7 @@ from acsard.calibration.improvement import (
 from acsard.calibration.log_table import Floats, RefusedError
 from acsard.calibration.multipliers import configured, multipliers
 from acsard.calibration.plausibility import in_range, remarks, unsure
-from acsard.calibration.positions import WheelSteps, path, wheel_steps
+from acsard.calibration.positions import WheelSteps, extent, path, wheel_steps
 from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig
@@ -142,7 +142,7 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
     if quantity != "distance":
         # A heading error on the way displaces the end by the error times the distance that is still
         # to go. The mean square of this distance is a third of the span squared.
-        span = float(np.ptp(driven.place.real) + np.ptp(driven.place.imag))
+        span = extent(driven.place)
         variance += heading_variance * span**2 / 3
     return Predicted(float((np.conj(along) * place).real), derivatives, variance)
 
