@@ -106,24 +106,12 @@ def report(
     A check has passed only if the board answered, every step was reached and judged, and none
     failed.
     """
-    ended = not any(finding.name == REST for finding in findings)
-    judged = ended and not lateness.unjudged(findings)
-    passed = answered(findings) and judged and not failed(findings)
+    judged = answered(findings) and not lateness.unjudged(findings)
+    passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)
     toml = "\n".join(excerpt(changes))
     return Report(
-        port,
-        passed,
-        findings,
-        changes,
-        toml,
-        written or None,
-        error or None,
-        withheld or None,
+        port, passed, findings, changes, toml, written or None, error or None, withheld or None
     )
-
-
-def failed(findings: Sequence[Finding]) -> bool:
-    return any(finding.verdict == "FAIL" for finding in findings)
 
 
 def summary(found: Report, where: str) -> str:
