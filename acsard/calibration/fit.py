@@ -138,10 +138,7 @@ USUAL = {TRACK_GROWTH: 0.06, DELAY: 1.0, SENSOR_X: 0.5, SENSOR_Y: 0.5}
 """Prior standard deviations of the parameters that a log may not determine, in their units."""
 
 GYRO_SCALE = 0.005
-"""Prior standard deviation of a gyro's scale, a fraction, for a usual MEMS gyro.
-
-If the log has no positions, nothing in it shows this error.
-"""
+"""Prior standard deviation of a MEMS gyro's scale, a fraction. Only positions show this error."""
 
 HELD = 1e9
 """Weight that holds a combination of parameters: the mean radius if no sensor measures it."""

@@ -35,10 +35,7 @@ from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
-"""Shortest rest in which the gyro bias is measured, and the margin cut off at both of its ends, s.
-
-The robot may still shake within the margin.
-"""
+"""Shortest rest for the bias, and the margin at both ends in which the robot may shake, s."""
 
 TURNED_BY_HAND = 0.05
 """Deviation from the usual bias, rad/s, above which a resting robot is being turned by hand."""
@@ -187,10 +184,7 @@ def _in_degrees(run: Run, gain: float) -> bool:
 
 
 Rests = tuple[Floats, Floats, Floats]
-"""The gyro bias in the rests of a run: times of their middles, biases and variances of the biases.
-
-They are in s, rad/s and rad2/s2.
-"""
+"""Times (s), gyro biases (rad/s) and their variances (rad2/s2) in the rests of a run."""
 
 
 def _biases(run: Run) -> Rests:
@@ -388,10 +382,7 @@ def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the sensor's turn rate minus that of the wheels, rad/s, by robust least squares.
-
-    `by_wheels` is the turn of each row according to the wheels, rad.
-    """
+    """Return the turn rate of the sensor minus that of the turns `by_wheels` (rad), rad/s."""
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
     for _ in range(10):

@@ -51,32 +51,20 @@ LEAST_SQUARE = 1e-9
 
 
 class Improvement(Struct, frozen=True):
-    """Odometry errors before and after the calibration.
-
-    The error after the calibration is measured on data that the fit did not use.
-    """
+    """Odometry errors before, and after the calibration on data that the fit did not use."""
 
     turn: BeforeAfter
     """Heading error after a turn of 360 deg, deg."""
     straight: BeforeAfter
-    """Heading error after 10 m straight ahead, deg.
-
-    It comes from turns that the wheels do not show.
-    """
+    """Heading error after 10 m straight ahead, deg, by turns that the wheels do not show."""
     heading: BeforeAfter
     """RMS error of the heading over whole drives, deg. Each drive is rotated to fit best."""
     place: BeforeAfter
     """RMS error of the position over whole drives, m. Each drive is shifted and rotated to fit."""
     gain: float = np.inf
-    """Logarithm of the error before divided by the error after, over whole drives.
-
-    Heading and position are added.
-    """
+    """Logarithm of the error before over that after, of whole drives: heading plus position."""
     chance: float = 0.0
-    """Standard deviation of `gain`, from the differences between the drives.
-
-    It is that of Student's t, because the drives are few.
-    """
+    """Standard deviation of `gain` by the differences of the drives, as that of Student's t."""
 
     @property
     def sure(self) -> bool:

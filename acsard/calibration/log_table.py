@@ -115,10 +115,7 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that are far above `usual` and above both neighbours.
-
-    The neighbour of a value is the next one that is not NaN.
-    """
+    """Return a mask of the values far above `usual` and above both neighbours that are not NaN."""
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)

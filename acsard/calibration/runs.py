@@ -126,10 +126,7 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def rolled(self) -> tuple[Floats, Floats]:
-        """The angles of the left and of the right wheels at the times `t`, rad.
-
-        They are integrated from the speeds by the trapezoidal rule. Gaps add nothing.
-        """
+        """The angles of the left and the right wheels at the times `t`, rad. Gaps add nothing."""
         steps = np.diff(self.t)
         steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
         left, right = (cumulative((v[1:] + v[:-1]) / 2 * steps) for v in (self.left, self.right))

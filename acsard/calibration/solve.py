@@ -164,10 +164,7 @@ class Prepared(Struct, frozen=True):
 def prepared(
     driven: Sequence[Run], headings: Headings | None, base: Base, length: float
 ) -> Prepared:
-    """Cut the runs into blocks of about `length` s, check them, and return them.
-
-    Raises `RefusedError` if the log cannot be used.
-    """
+    """Cut the runs into blocks of about `length` s, and check them. Raises `RefusedError`."""
     parts = blocks(driven, length)
     plausibility.drives_enough(parts)
     count, start = len(parts), base.start()

@@ -51,10 +51,7 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
 
 def withheld(simulated: bool, config: Config) -> str:
-    """Return why the findings do not apply to this configuration, or "" if they do.
-
-    Findings about the simulator do not apply to the configuration of a real robot.
-    """
+    """Return why findings about the simulator do not apply to this configuration, or ""."""
     if not simulated or config.mcu.simulated:
         return ""
     return (

@@ -46,10 +46,7 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send every kind of damaged line and report whether a motor obeyed one.
-
-    `motors` are motors that turn as commanded. They stand before and after this test.
-    """
+    """Send every kind of damaged line to standing `motors`, and report whether one obeyed."""
     if not motors:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)

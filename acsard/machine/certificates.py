@@ -183,10 +183,7 @@ def _password() -> str:
 
 
 def _writable(directory: Path) -> None:
-    """Raise `MendableError` unless the directory can be created or written to.
-
-    Nothing is created yet.
-    """
+    """Raise `MendableError` unless the directory can be created or written to. Create nothing."""
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     if not there.is_dir():
         raise MendableError(f"{there} is not a directory; use --directory")

@@ -92,10 +92,7 @@ class Running(Struct, frozen=True):
 
 
 def asked(config: Config, address: Address) -> Running:
-    """Ask the daemon at this address. `config` is the configuration in the file.
-
-    Raises an `AcsardError` if it cannot be asked.
-    """
+    """Ask the daemon at this address. `config` is the file's. Raises an `AcsardError`."""
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
@@ -299,10 +296,7 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the daemon that was reached and asked, or the finding that explains the failure.
-
-    Raises `UsageError` if the address is not an endpoint.
-    """
+    """Return the reached daemon, or a finding. Raises `UsageError` if it is not an endpoint."""
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):

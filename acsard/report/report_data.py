@@ -322,10 +322,7 @@ class ReportData:
         self._number = step.number
 
     def end(self, ending: str = "") -> None:
-        """Finish the data after the last step.
-
-        `ending` says how the recording ended other than by an ordinary end of the daemon.
-        """
+        """Finish the data. `ending` says how the recording ended unless the daemon ended it."""
         t = self.seconds
         for entry in self._timeline.end(ending) if self.began is not None else ():
             self.marks.add(self._mark(entry, t))
@@ -408,10 +405,7 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Add the status to the bands, if it has changed or the last sample is old enough.
-
-        `refused` is true if this step changed which sources are refused.
-        """
+        """Sample the status if it or the refused sources changed, or the last sample is old."""
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:
             return

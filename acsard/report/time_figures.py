@@ -364,10 +364,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw several parts above each other, with one time axis and one legend.
-
-        `px` is the height of each part.
-        """
+        """Draw parts of `px` height above each other, with one time axis and one legend."""
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}

@@ -72,13 +72,9 @@ class LineTimes(Struct, frozen=True):
 
 
 def line_times(t: Floats, sent: Floats) -> LineTimes:
-    """Estimate the delays of feedback lines.
+    """Estimate the delays of at least 3 lines from their stamps, s, and the daemon's lines, s.
 
     Both kinds of boards are tried, and the estimate with the smaller delays is returned.
-
-    Args:
-        t: the stamps of at least 3 feedback lines, s.
-        sent: the times at which the daemon sent lines, s.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -203,14 +199,11 @@ class Motion(Struct, frozen=True):
 
 
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
-    """Compute the motion of a drive and its errors.
+    """Compute the motion of a drive of at least 3 lines, and its errors.
 
-    Args:
-        lines: at least 3 feedback lines.
-        sent: the times at which the daemon sent lines to the microcontroller, s.
-        kinematics: the geometry of the robot.
-        whole: whether every line of the daemon arrived here. If not, a missing line may have been
-            lost between the daemon and this program, so it does not count as lost.
+    `sent` has the times of the daemon's own lines, s. `whole` says that every line of the daemon
+    arrived here. If not, a missing line may have been lost between the daemon and this program, so
+    it does not count as lost.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)

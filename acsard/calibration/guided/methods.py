@@ -71,10 +71,7 @@ def _at_the_edge(setup: Setup) -> str:
 
 
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
-    """Return the leg in which the robot turns to the left until the person presses a key.
-
-    `until` ends the sentence that begins with "Press SPACE".
-    """
+    """Return the leg of a turn to the left that a key ends. `until` follows "Press SPACE"."""
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.drive.wheel_separation_multiplier
     words = f"The robot turns to the left on the spot. Press SPACE {until}"

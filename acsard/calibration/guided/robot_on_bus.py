@@ -68,10 +68,7 @@ class Sensor:
         self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
 
     def receive(self, take: Take, now: float) -> int:
-        """Pass the messages that have arrived to `take`, and return their number.
-
-        Raises `GuideError` if a message cannot be decoded.
-        """
+        """Pass the messages to `take`, return their number. Raises `GuideError` for a bad one."""
         count = 0
         while (sample := self._samples.try_recv()) is not None:
             take(self._decoded(sample), now)

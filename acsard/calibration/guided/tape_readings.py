@@ -242,10 +242,7 @@ def _held_out_residual(
 
 
 READ_M = 0.002
-"""Standard deviation of a measured distance of a few decimetres, m.
-
-The standard deviation with which a person places the robot on a line is the same.
-"""
+"""Standard deviation of a measured distance, and of a robot placed on a line by hand, m."""
 
 CREDIBLE = 0.85, 3.0
 """Credible ratios of effective track to wheel separation. Outside them, a reading must be wrong."""
@@ -255,10 +252,7 @@ Answers = dict[tuple[str, str], float]
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
-    """Return the reading that the answers after a leg give.
-
-    Raises `RefusedError` if the answers are impossible.
-    """
+    """Return the reading that the answers give. Raises `RefusedError` if they are impossible."""
     driven = tuple(rides[name] for name in measure.over or (leg,))
     if isinstance(measure, Mean):
         numbers = [answers[leg, name] for name in measure.answers]
@@ -297,12 +291,9 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
 def slant(near: float, far: float, apart: float) -> float:
     """Return the angle in rad between the robot and a line, positive after a turn to the left.
 
-    Args:
-        near: the distance from the line to the point that a turn to the left moves towards it, m.
-        far: the distance from the line to the point that a turn to the left moves away from it, m.
-        apart: the distance between both points, m.
-
-    Raises `RefusedError` if the distances are impossible.
+    `near` and `far` are the distances, m, from the line to two points of the robot, `apart` m from
+    each other. A turn to the left moves the near one towards the line. Raises `RefusedError` if the
+    distances are impossible.
     """
     sine = (far - near) / apart
     if abs(sine) > 0.98:
@@ -329,10 +320,7 @@ The heading error of a drive in between belongs to neither.
 
 
 def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Calibration:
-    """Return the calibration that the readings give. Raises `RefusedError`.
-
-    `tool` names the tool of the measurements in words.
-    """
+    """Return the calibration by the readings of `tool`, in words. Raises `RefusedError`."""
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
     fit = fit_readings(readings, base)
@@ -359,10 +347,7 @@ def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Ca
 
 
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
-    """Return the errors of the readings with the configured and with the found parameters.
-
-    The error after the calibration is that of a fit without the reading itself.
-    """
+    """Return the errors before and after. An error after is that of a fit without its reading."""
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
     present[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
