@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard.calibration.fit import SEPARATION
-from acsard.calibration.prepared import RATIO, TRACK
+from acsard.calibration.multipliers import SEPARATION
+from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt
@@ -100,13 +100,9 @@ class Report(Struct, frozen=True):
 
 
 def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
-    """Return the report of a calibration.
+    """Return the report of a calibration from a log, or from the guided drive of this name.
 
-    Args:
-        log: the name of the log, or of the guided drive.
-        calibration: the calibration.
-        drive: the geometry that the multipliers belong to.
-        written: the name of the file that now contains the multipliers, or "".
+    `written` is the name of the file that now contains the multipliers, or "".
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()

@@ -1,10 +1,22 @@
-"""Fits the parameters to the evidence of all sensors, and converts them to multipliers.
+"""Fits the parameters of the calibration to the evidence of all sensors.
 
-The fit is a Gauss-Newton fit on sums over blocks. The standard deviations come from a jackknife
-over the blocks (Quenouille and Tukey): each block is left out in turn, and the changes of the
-parameters show the effect of chance. This is right even if the errors within a block are
-correlated. The change is computed by one linear step. If there are few blocks, the standard
-deviation is widened to that of Student's t.
+The parameters are an array of nine numbers. Their indices are:
+
+- LEFT, RIGHT: radius of the left and the right wheels, as ratios to the configured wheel radius.
+- INVERSE_TRACK: ratio of the wheel separation to the effective track. The parameter is this inverse
+  because the turns of the robot are linear in it.
+- TRACK_GROWTH: fraction by which the effective track grows with each rad/s of turn rate.
+- DELAY: delay of the positions behind the wheels, s.
+- SENSOR_X, SENSOR_Y: the place on the robot whose positions are measured, m ahead and m to the
+  left.
+- BIAS_ERROR: error of the gyro's bias, rad/s.
+- SCALE_ERROR: error of the gyro's scale, a fraction.
+
+The evidence of a sensor is the normal equations that it contributes. The fit is a Gauss-Newton fit
+on sums over blocks. The standard deviations come from a jackknife over the blocks (Quenouille and
+Tukey): each block is left out in turn, and the changes of the parameters show the effect of chance.
+This is right even if the errors within a block are correlated. The change is computed by one linear
+step. If there are few blocks, the standard deviation is widened to that of Student's t.
 """
 
 from __future__ import annotations
@@ -15,22 +27,105 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.evidence import (
-    BIAS_ERROR,
-    COUNT,
-    DELAY,
-    INVERSE_TRACK,
-    LEFT,
-    RIGHT,
-    SCALE_ERROR,
-    SENSOR_X,
-    SENSOR_Y,
-    TRACK_GROWTH,
-    Base,
-    Evidence,
-)  # fmt: skip
-from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats
+from acsard.calibration.runs import Complexes, Mask
+from acsard.core.config.settings import DriveConfig
+
+LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH, DELAY, SENSOR_X, SENSOR_Y, BIAS_ERROR, SCALE_ERROR = (
+    range(9)
+)
+COUNT = 9
+
+HUBER = 2.0
+"""Size of a residual, in usual sizes, above which its weight falls (Huber's weight)."""
+
+
+class Base(Struct, frozen=True):
+    """The configured geometry, which the parameters are relative to. Lengths are in m."""
+
+    radius: float
+    separation: float
+    left: float
+    """Configured multiplier of the left wheels' radius."""
+    right: float
+    """Configured multiplier of the right wheels' radius."""
+    track: float
+    """Configured multiplier of the wheel separation."""
+
+    @classmethod
+    def of(cls, drive: DriveConfig) -> Base:
+        """Return the geometry of a configuration."""
+        return cls(
+            drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
+            drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
+        )  # fmt: skip
+
+    def start(self) -> Floats:
+        """Return the parameters that agree with the configured multipliers."""
+        return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - TRACK_GROWTH)])
+
+    @property
+    def gain(self) -> float:
+        """Wheel radius divided by wheel separation.
+
+        If the first three parameters are 1, the robot turns by `gain` times the angle by which the
+        right wheels rolled further than the left wheels.
+        """
+        return self.radius / self.separation
+
+
+class Evidence(Struct, frozen=True):
+    """The weighted normal equations of one sensor, block by block.
+
+    With Jacobian J (derivatives of the predictions with respect to the parameters), residuals r and
+    weights W: `normal` is J^T W J, and `score` is J^T W r. `fit` gives each sensor its noise.
+    """
+
+    normal: Floats
+    """Left-hand sides, shape (blocks, COUNT, COUNT)."""
+    score: Floats
+    """Right-hand sides, shape (blocks, COUNT)."""
+    squares: Floats
+    """Sum of squared residuals per block."""
+    counts: Floats
+    """Number of independent residuals per block."""
+
+
+def of_rows(
+    jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
+) -> Evidence:
+    """Return the evidence of rows, summed by block.
+
+    Each row has the derivatives of its prediction (`jacobian`, shape (rows, COUNT)), its measured
+    minus its predicted value (`residual`), its weight and the number of its block.
+    """
+    normal = np.zeros((blocks, COUNT, COUNT))
+    score = np.zeros((blocks, COUNT))
+    weighted = jacobian * weight[:, None]
+    np.add.at(normal, block, weighted[:, :, None] * jacobian[:, None, :])
+    np.add.at(score, block, weighted * residual[:, None])
+    squares = np.bincount(block, weight * residual**2, blocks).astype(np.float64)
+    counts = np.bincount(block, minlength=blocks).astype(np.float64)
+    return Evidence(normal, score, squares, counts)
+
+
+def condition(normal: Floats) -> float:
+    """Return the condition number apart from units. It is infinite if a parameter is missing."""
+    size = np.sqrt(np.diag(normal))
+    if not np.all(size > 0.0):
+        return np.inf
+    return float(np.linalg.cond(normal / np.outer(size, size)))
+
+
+def huber(residuals: Floats | Complexes, least: float) -> Floats:
+    """Return Huber's weight of each residual: 1 for a usual one, and less for an outlier.
+
+    The usual size is the standard deviation that the median suggests, and at least `least`.
+    """
+    size = np.abs(residuals)
+    scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
+    return np.asarray(np.minimum(1.0, HUBER * scale / np.maximum(size, 1e-300)))
+
 
 Source = Callable[[Floats], Evidence]
 """Function from parameters to the evidence of one sensor."""
@@ -43,10 +138,7 @@ USUAL = {TRACK_GROWTH: 0.06, DELAY: 1.0, SENSOR_X: 0.5, SENSOR_Y: 0.5}
 """Prior standard deviations of the parameters that a log may not determine, in their units."""
 
 GYRO_SCALE = 0.005
-"""Prior standard deviation of a gyro's scale, a fraction, for a usual MEMS gyro.
-
-If the log has no positions, nothing in it shows this error.
-"""
+"""Prior standard deviation of a MEMS gyro's scale, a fraction. Only positions show this error."""
 
 HELD = 1e9
 """Weight that holds a combination of parameters: the mean radius if no sensor measures it."""
@@ -57,11 +149,14 @@ Held = tuple[Floats, float]
 MANY = 16
 """Number of blocks from which on the jackknife also leaves out pairs of neighbouring blocks."""
 
-LEAST_FREE = 3.0
-"""Smallest degrees of freedom for Student's t, whose standard deviation is infinite at 2."""
-
 LEAST_BLOCKS = 5
 """Smallest number of blocks. Fewer do not show how much blocks differ."""
+
+
+def student_factor(free: Floats | float) -> Floats:
+    """Return the variance of Student's t for at least 3 degrees of freedom; at 2 it is infinite."""
+    free = np.maximum(3.0, free)
+    return np.asarray(free / (free - 2))
 
 
 class Fit(Struct, frozen=True):
@@ -80,7 +175,7 @@ class Fit(Struct, frozen=True):
     usual: Mapping[int, float]
     """Prior standard deviation of each parameter that has one."""
 
-    def without(self, blocks: npt.NDArray[np.bool_]) -> Floats:
+    def without(self, blocks: Mask) -> Floats:
         """Return the parameters of a fit without the blocks of this mask, by one linear step."""
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
@@ -124,10 +219,9 @@ class Fit(Struct, frozen=True):
         # If a few groups cause most of a variance, the variance has only that many degrees of
         # freedom.
         squares = np.maximum(change**2, 1e-150)
-        free = np.maximum(LEAST_FREE, squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0))
-        student = np.sqrt(free / (free - 2))
+        wider = np.sqrt(student_factor(squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0)))
         covariance = (1 - 1 / len(change)) * change.T @ change
-        return np.asarray(covariance * np.outer(student, student))
+        return np.asarray(covariance * np.outer(wider, wider))
 
 
 def fit(
@@ -139,8 +233,7 @@ def fit(
     Args:
         sources: the sensors.
         start: the parameters to start from, which must be nearly right.
-        places: whether positions are among the sources.
-        gyro: whether a gyro is among the sources.
+        places, gyro: whether positions and a gyro are among the sources.
         bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not depend
             on the bias.
         held: combinations of parameters that the fit does not change.
@@ -206,13 +299,7 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[int, float]
 ) -> tuple[Floats, Floats]:
-    """Return the prior information as normal equations.
-
-    Args:
-        parameters: the present parameters.
-        held: the combinations of parameters that do not change.
-        usual: the prior standard deviation of each parameter that has one.
-    """
+    """Return the prior information at the present parameters as normal equations."""
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
@@ -227,98 +314,3 @@ def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
     """Solve for the active parameters. All others keep their value."""
     part = normal[np.ix_(active, active)]
     return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])
-
-
-SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
-"""Indices into `values` and `covariance` of `Multipliers`."""
-
-TURNING = 0.05
-"""Turn rate below which a row counts as straight, rad/s."""
-
-FASTEST = 0.95
-"""Fraction of the turned angle that was turned more slowly than `Rates.fastest`."""
-
-
-class Rates(Struct, frozen=True):
-    """The turn rates of a log, rad/s."""
-
-    mean: float
-    """Mean, weighted by the turned angle."""
-    fastest: float
-
-
-class Multipliers(Struct, frozen=True):
-    """The multipliers of wheel separation, left and right wheel radius, and their covariance."""
-
-    values: Floats
-    covariance: Floats
-
-    @property
-    def std(self) -> Floats:
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    @property
-    def ratio_std(self) -> float:
-        """Standard deviation of the ratio of both radii, as a fraction."""
-        shares = self.covariance / np.outer(self.values, self.values)
-        apart = np.array([0.0, 1.0, -1.0])
-        return float(np.sqrt(max(0.0, apart @ shares @ apart)))
-
-    def own(self) -> tuple[Floats, float]:
-        """Return four standard deviations, as the settings of `[odometry]` declare them.
-
-        The first three belong to one multiplier each. The fourth belongs to the common scale of all
-        multipliers, as a fraction. The odometry treats the four errors as independent.
-
-        Let d be the relative variance of the difference of both radii. Each radius then has its own
-        variance d / 2, which contributes d / 4 to the variance of their mean. This d / 4 is
-        subtracted from the variances of the mean radius (the scale) and of the track relative to
-        the mean radius (the track).
-        """
-        shares = self.covariance / np.outer(self.values, self.values)
-        mean, track, apart = (
-            float(row @ shares @ row)
-            for row in np.array([[0.0, 0.5, 0.5], [1.0, -0.5, -0.5], [0.0, 1.0, -1.0]])
-        )
-        own = np.sqrt(np.maximum(0.0, [track - apart / 4, apart / 2, apart / 2]))
-        return self.values * own, float(np.sqrt(max(0.0, mean - apart / 4)))
-
-
-def configured(base: Base) -> Multipliers:
-    """Return the configured multipliers, with a covariance of zero because it is unknown."""
-    return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
-
-
-def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of these rows; `by_wheels` has their turns from the wheels, rad."""
-    turned = np.abs(by_wheels)
-    rate = turned / rows.seconds
-    turning = rate > TURNING
-    if not turning.any():
-        return Rates(0.0, 0.0)
-    order = np.argsort(rate[turning])
-    share = np.cumsum(turned[turning][order]) / turned[turning].sum()
-    fastest = rate[turning][order][int(np.searchsorted(share, FASTEST))]
-    mean = float(rate[turning] @ turned[turning] / turned[turning].sum())
-    return Rates(mean, float(fastest))
-
-
-def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
-    """Return the multipliers that fit best at the turn rates of the log.
-
-    The variance of the track is that of the best constant track there. The turns that
-    skid more or less than usual belong to the noise of the odometry.
-
-    Args:
-        parameters: the parameters of a fit.
-        covariance: the covariance of the parameters.
-        rate: the turn rates of the log.
-    """
-    inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
-    slower = 1.0 - growth * rate.mean
-    values = np.array([1 / (inverse * slower), parameters[LEFT], parameters[RIGHT]])
-    jacobian = np.zeros((3, len(parameters)))
-    jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
-    jacobian[SEPARATION, INVERSE_TRACK] = -values[SEPARATION] / inverse
-    jacobian[SEPARATION, TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
-    return Multipliers(values, jacobian @ covariance @ jacobian.T)

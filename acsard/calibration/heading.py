@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.evidence import (
+from acsard.calibration.fit import (
     BIAS_ERROR,
     COUNT,
     INVERSE_TRACK,
@@ -32,14 +32,10 @@ from acsard.calibration.evidence import (
     of_rows,
 )  # fmt: skip
 from acsard.calibration.log_table import Floats, LogError
-from acsard.calibration.runs import Run
-from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative, gaps, inside, rests
+from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
-"""Shortest rest in which the gyro bias is measured, and the margin cut off at both of its ends, s.
-
-The robot may still shake within the margin.
-"""
+"""Shortest rest for the bias, and the margin at both ends in which the robot may shake, s."""
 
 TURNED_BY_HAND = 0.05
 """Deviation from the usual bias, rad/s, above which a resting robot is being turned by hand."""
@@ -95,6 +91,13 @@ class Headings(Struct, frozen=True):
     """
 
 
+TURNING = 0.05
+"""Turn rate below which a row counts as straight, rad/s."""
+
+FASTEST = 0.95
+"""Fraction of the turned angle that was turned more slowly than `Rates.fastest`."""
+
+
 class Rows(Struct, frozen=True):
     """The motion of the robot in intervals of about a second."""
 
@@ -114,7 +117,15 @@ class Rows(Struct, frozen=True):
     """Length of each interval, s."""
 
 
-def of_gyro(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Headings | None:
+class Rates(Struct, frozen=True):
+    """The turn rates of a log, rad/s."""
+
+    mean: float
+    """Mean, weighted by the turned angle."""
+    fastest: float
+
+
+def of_gyro(driven: Sequence[Run]) -> Headings | None:
     """Return the headings by the column yaw_rate, or None if no run has it.
 
     Raises `LogError` if the yaw rate never changes.
@@ -138,12 +149,12 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Headings | 
         found.append(Heading(run.gyro_t, _sums(rate, steps), holes))
     seconds = [float(run.t[-1]) for run in driven]
     return Headings(
-        "yaw_rate", tuple(found), offset(found, angles), usual, bias_unknown=not len(all_biases),
+        "yaw_rate", tuple(found), offset(found, driven), usual, bias_unknown=not len(all_biases),
         bias_std=_bias_std(rested, seconds) if len(all_biases) else 0.0,
     )  # fmt: skip
 
 
-def of_yaw(driven: Sequence[Run], angles: Sequence[WheelAngles], gain: float) -> Headings | None:
+def of_yaw(driven: Sequence[Run], gain: float) -> Headings | None:
     """Return the headings by the column yaw, or None if no run has it.
 
     Raises `LogError` if the yaw is in degrees, because jumps of 360 would not be recognized as
@@ -152,31 +163,28 @@ def of_yaw(driven: Sequence[Run], angles: Sequence[WheelAngles], gain: float) ->
     if not any(len(run.yaw) for run in driven):
         return None
     found = []
-    for run, wheels in zip(driven, angles, strict=True):
-        if _in_degrees(run, wheels, gain):
+    for run in driven:
+        if _in_degrees(run, gain):
             raise LogError("yaw is in degrees, but must be in radians: multiply it by pi / 180")
         angle = np.asarray(np.unwrap(run.yaw)) if len(run.yaw) else run.yaw
         found.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
-    return Headings("yaw", tuple(found), offset(found, angles), 0.0, bias_unknown=False)
+    return Headings("yaw", tuple(found), offset(found, driven), 0.0, bias_unknown=False)
 
 
-def _in_degrees(run: Run, wheels: WheelAngles, gain: float) -> bool:
+def _in_degrees(run: Run, gain: float) -> bool:
     if len(run.yaw) < 2 or np.ptp(run.yaw) < 3 * np.pi:
         return False
     steps = np.diff(run.yaw)
     if np.any((np.abs(steps) > 300.0) & (np.abs(steps) < 400.0)):
         return True
-    left, right = wheels.angles(run.yaw_t)
+    left, right = run.angles(run.yaw_t)
     by_wheels = gain * np.diff(right - left)
     small = np.abs(steps) < 100.0
     return float(np.sum(np.abs(steps[small]))) > DEGREES * float(np.sum(np.abs(by_wheels[small])))
 
 
 Rests = tuple[Floats, Floats, Floats]
-"""The gyro bias in the rests of a run: times of their middles, biases and variances of the biases.
-
-They are in s, rad/s and rad2/s2.
-"""
+"""Times (s), gyro biases (rad/s) and their variances (rad2/s2) in the rests of a run."""
 
 
 def _biases(run: Run) -> Rests:
@@ -233,7 +241,7 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
     return cumulative((rate[1:] + rate[:-1]) / 2 * steps) if len(rate) else rate
 
 
-def offset(found: Sequence[Heading], angles: Sequence[WheelAngles]) -> float:
+def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
     The turns of the wheels are the differences of both sides. If the sign of one side is wrong,
@@ -241,11 +249,11 @@ def offset(found: Sequence[Heading], angles: Sequence[WheelAngles]) -> float:
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
-    for heading, wheels in zip(found, angles, strict=True):
-        grid = np.arange(wheels.t[0], wheels.t[-1], GRID_S)
+    for heading, run in zip(found, driven, strict=True):
+        grid = np.arange(run.t[0], run.t[-1], GRID_S)
         if len(heading.t) < 2 or len(grid) < 4:
             continue
-        left, right = wheels.angles(grid)
+        left, right = run.angles(grid)
         sensor = np.diff(np.interp(grid, heading.t, heading.angle))
         sensor[~inside(grid[:-1], grid[1:], heading.gaps)] = 0.0
         sensor -= sensor.mean()
@@ -264,27 +272,16 @@ def offset(found: Sequence[Heading], angles: Sequence[WheelAngles]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Return the correlation of two series of equal length for shifts from -reach to reach.
-
-    A positive shift means that `later` lags behind `earlier`.
-    """
+    """Return the correlation for shifts from -reach to reach. At a positive one `later` lags."""
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
     return np.concatenate((whole[-reach:], whole[: reach + 1]))
 
 
-def rows(
-    headings: Headings | None,
-    driven: Sequence[Run],
-    angles: Sequence[WheelAngles],
-    parts: Sequence[Block],
-) -> Rows:
-    """Return the rows of all blocks in which the heading sensor has samples.
-
-    If `headings` is None, return the rows of all blocks, with the wheels alone.
-    """
-    fast = [_fast(run, wheels) for run, wheels in zip(driven, angles, strict=True)]
+def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
+    """Return the rows of all blocks with samples of the sensor; of all blocks without a sensor."""
+    fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
         count = max(1, round((part.end - part.begin) / ROW_S))
@@ -297,7 +294,7 @@ def rows(
             angle = np.interp(seen, heading.t, heading.angle)
             whole = inside(seen[:-1], seen[1:], heading.gaps)
             whole &= (seen[:-1] >= heading.t[0]) & (seen[1:] <= heading.t[-1])
-        left, right = angles[part.run].angles(edges)
+        left, right = driven[part.run].angles(edges)
         squares = np.interp(edges, driven[part.run].t, fast[part.run])
         series = (angle, left, right, squares, edges)
         found.append((np.full(count, number)[whole], *(np.diff(sums)[whole] for sums in series)))
@@ -305,6 +302,20 @@ def rows(
         return Rows(np.zeros(0, dtype=np.int64), *[np.zeros(0)] * 5)
     block, *columns = (np.concatenate(column) for column in zip(*found, strict=True))
     return Rows(block.astype(np.int64), *columns)
+
+
+def rates(rows: Rows, by_wheels: Floats) -> Rates:
+    """Return the turn rates of these rows; `by_wheels` has their turns from the wheels, rad."""
+    turned = np.abs(by_wheels)
+    rate = turned / rows.seconds
+    turning = rate > TURNING
+    if not turning.any():
+        return Rates(0.0, 0.0)
+    order = np.argsort(rate[turning])
+    share = np.cumsum(turned[turning][order]) / turned[turning].sum()
+    fastest = rate[turning][order][int(np.searchsorted(share, FASTEST))]
+    mean = float(rate[turning] @ turned[turning] / turned[turning].sum())
+    return Rates(mean, float(fastest))
 
 
 def level(rows: Rows) -> Rows:
@@ -320,8 +331,8 @@ def level(rows: Rows) -> Rows:
     return Rows(rows.block, turned, left, right, fast, rows.seconds)
 
 
-def _fast(run: Run, wheels: WheelAngles) -> Floats:
-    apart = wheels.speed_difference(run.t)
+def _fast(run: Run) -> Floats:
+    apart = run.speed_difference(run.t)
     steps = np.minimum(np.diff(run.t), ROW_S)
     return _sums(np.abs(apart) * apart, steps)
 
@@ -362,20 +373,20 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     jacobian[:, SCALE_ERROR] = by_wheels
     gyro = by_wheels * (1 + parameters[SCALE_ERROR]) + parameters[BIAS_ERROR] * rows.seconds
     residual = rows.turned - gyro
-    usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
-    return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
+    return of_rows(jacobian, residual, _weight(rows, residual, by_wheels), rows.block, blocks)
+
+
+def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
+    """Return the weight of each row. `by_wheels` is its turn according to the wheels, rad."""
+    return huber(residual / np.hypot(NOISE * rows.seconds, SHARE * by_wheels), 1.0)
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the sensor's turn rate minus that of the wheels, rad/s, by robust least squares.
-
-    `by_wheels` is the turn of each row according to the wheels, rad.
-    """
+    """Return the turn rate of the sensor minus that of the turns `by_wheels` (rad), rad/s."""
     seconds, found = rows.seconds, 0.0
+    off = rows.turned - by_wheels
     for _ in range(10):
-        off = rows.turned - by_wheels
-        usual = np.hypot(NOISE * seconds, SHARE * by_wheels)
-        weight = huber((off - found * seconds) / usual, 1.0)
+        weight = _weight(rows, off - found * seconds, by_wheels)
         found = float((weight * seconds) @ off / ((weight * seconds) @ seconds))
     return found
 
@@ -392,14 +403,10 @@ def first(rows: Rows, base: Base) -> Floats:
         root = np.sqrt(weight)[:, None]
         found = np.asarray(np.linalg.lstsq(columns * root, rows.turned * root[:, 0], rcond=None)[0])
         by_wheels = columns @ found
-        usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
-        weight = huber((rows.turned - by_wheels) / usual, 1.0)
+        weight = _weight(rows, rows.turned - by_wheels, by_wheels)
     return found
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the robot's turn in each row, rad, computed from the wheels.
-
-    `sides` has the factors of left and right that `first` returns.
-    """
+    """Return the turn of each row by the wheels, rad, with the factors `sides` of `first`."""
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

@@ -14,13 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.evidence import INVERSE_TRACK, TRACK_GROWTH, Base
-from acsard.calibration.fit import LEAST_FREE, TURNING, Fit, Rates
-from acsard.calibration.heading import Rows, turned
+from acsard.calibration.fit import INVERSE_TRACK, TRACK_GROWTH, Base, Fit, student_factor
+from acsard.calibration.heading import TURNING, Rates, Rows, turned
 from acsard.calibration.log_table import Floats
 from acsard.calibration.positions import Segment, WheelSteps, path, segments, spread
-from acsard.calibration.runs import Run
-from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative
+from acsard.calibration.runs import Block, Mask, Run, cumulative
 
 FOLDS = 5
 LEAST_RUNS = 3
@@ -53,32 +51,20 @@ LEAST_SQUARE = 1e-9
 
 
 class Improvement(Struct, frozen=True):
-    """Odometry errors before and after the calibration.
-
-    The error after the calibration is measured on data that the fit did not use.
-    """
+    """Odometry errors before, and after the calibration on data that the fit did not use."""
 
     turn: BeforeAfter
     """Heading error after a turn of 360 deg, deg."""
     straight: BeforeAfter
-    """Heading error after 10 m straight ahead, deg.
-
-    It comes from turns that the wheels do not show.
-    """
+    """Heading error after 10 m straight ahead, deg, by turns that the wheels do not show."""
     heading: BeforeAfter
     """RMS error of the heading over whole drives, deg. Each drive is rotated to fit best."""
     place: BeforeAfter
     """RMS error of the position over whole drives, m. Each drive is shifted and rotated to fit."""
     gain: float = np.inf
-    """Logarithm of the error before divided by the error after, over whole drives.
-
-    Heading and position are added.
-    """
+    """Logarithm of the error before over that after, of whole drives: heading plus position."""
     chance: float = 0.0
-    """Standard deviation of `gain`, from the differences between the drives.
-
-    It is that of Student's t, because the drives are few.
-    """
+    """Standard deviation of `gain` by the differences of the drives, as that of Student's t."""
 
     @property
     def sure(self) -> bool:
@@ -93,7 +79,7 @@ class Fold(Struct, frozen=True):
     """A drive that is left out, as a mask of blocks, and the parameters without these blocks."""
 
     drive: Block
-    blocks: npt.NDArray[np.bool_]
+    blocks: Mask
     parameters: Floats
 
 
@@ -109,21 +95,16 @@ def drives(driven: Sequence[Run]) -> list[Block]:
     return found
 
 
-def positions_of(
-    drive: Block, driven: Sequence[Run], angles: Sequence[WheelAngles]
-) -> list[Segment]:
+def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
     """Return the positions of a drive, split at jumps and at gaps of the wheels."""
-    gaps = angles[drive.run].gaps
+    gaps = driven[drive.run].gaps
     edges = np.concatenate(([drive.begin], gaps.ravel(), [drive.end])).clip(drive.begin, drive.end)
     pieces = [Block(drive.run, float(a), float(b)) for a, b in edges.reshape(-1, 2)]
-    return segments(driven, angles, [piece for piece in pieces if piece.end > piece.begin])
+    return segments(driven, [piece for piece in pieces if piece.end > piece.begin])
 
 
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
-    """Return the folds of the cross-validation, one for each drive that has blocks.
-
-    A block is left out with each drive that it overlaps.
-    """
+    """Return a fold for each drive that has blocks. It leaves out each block that it overlaps."""
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
     )
@@ -176,21 +157,30 @@ def improvement(
     squares += [_of_positions(held, configured, base, places, steps)] if steps else []
     gain, chance = _gain(squares)
     of_heading, of_place = (
-        _rms(squares[0]) if measured.any() else NOTHING,
-        _rms(squares[-1]) if steps else NOTHING,
+        rms(squares[0].sum(axis=0)) if measured.any() else NOTHING,
+        rms(squares[-1].sum(axis=0)) if steps else NOTHING,
     )
     return Improvement(
-        _per_amount(before, after, block_and_side, turning, 360.0, angle),
-        _per_amount(before, after, rows.block, straight, np.degrees(10.0), metres),
+        per_amount(_by_group(before, after, block_and_side, turning, angle), 360.0),
+        per_amount(_by_group(before, after, rows.block, straight, metres), np.degrees(10.0)),
         of_heading, of_place, gain, chance,
     )  # fmt: skip
 
 
-def _rms(squares: Floats) -> BeforeAfter:
-    before, after, count = squares.sum(axis=0).tolist()
+def rms(sums: Floats) -> BeforeAfter:
+    """Return the errors of these sums of squares before and after, and their number."""
+    before, after, count = sums.tolist()
     if not count:
         return NOTHING
     return BeforeAfter(float(np.sqrt(before / count)), float(np.sqrt(after / count)))
+
+
+def per_amount(sums: Floats, unit: float) -> BeforeAfter:
+    """Return the errors for `unit` of these sums: errors before and after, and amount driven."""
+    before, after, amount = sums.tolist()
+    if not amount:
+        return NOTHING
+    return BeforeAfter(float(unit * before / amount), float(unit * after / amount))
 
 
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
@@ -203,7 +193,7 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     if not np.any(drives):
         return 0.0, np.inf
 
-    def gain(left: npt.NDArray[np.bool_]) -> float:
+    def gain(left: Mask) -> float:
         sums = [squares[left].sum(axis=0) + LEAST_SQUARE for squares in kinds]
         return float(sum(np.log(before / after) for before, after, _ in sums) / 2)
 
@@ -211,20 +201,16 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     alone = [gain(drives & (np.arange(len(drives)) != at)) for at in np.flatnonzero(drives)]
     if count == 1:
         return gain(drives), np.inf
-    free = max(LEAST_FREE, count - 1.0)
-    chance = float(np.sqrt((count - 1) * free / (free - 2)) * np.std(alone))
+    chance = float(np.sqrt((count - 1) * student_factor(count - 1.0)) * np.std(alone))
     return gain(drives), chance
 
 
-def _per_amount(
-    before: Floats, after: Floats, group: npt.NDArray[np.int64], among: npt.NDArray[np.bool_],
-    unit: float, amount: float,
-) -> BeforeAfter:  # fmt: skip
-    """Return the sums of the absolute errors of the groups, times `unit / amount`."""
-    if amount <= 0.0:
-        return BeforeAfter(None, None)
-    sums = [np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after)]
-    return BeforeAfter(*(float(unit * total / amount) for total in sums))
+def _by_group(
+    before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
+) -> Floats:
+    """Return the sums of the absolute errors of the groups, before and after, and `amount`."""
+    sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
+    return np.array([*sums, amount])
 
 
 def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:

@@ -14,7 +14,7 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -115,10 +115,7 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that are far above `usual` and above both neighbours.
-
-    The neighbour of a value is the next one that is not NaN.
-    """
+    """Return a mask of the values far above `usual` and above both neighbours that are not NaN."""
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)
@@ -158,6 +155,10 @@ class LogError(AcsardError):
     """A log that cannot be used. The text names the place and the fault, and says what to do."""
 
 
+class RefusedError(AcsardError):
+    """The log cannot be used for a calibration. The text says why and what to do."""
+
+
 def noted(error: Exception, notes: Iterable[str]) -> None:
     """Add the notes about a log to an error, because they may explain it."""
     for note in notes:
@@ -175,6 +176,21 @@ class Table(Struct, frozen=True):
     """Names of the runs, by number."""
     notes: tuple[str, ...]
     """Sentences about data that was left out."""
+
+    @classmethod
+    def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
+        """Return the table of one run in which each sample of each sensor is a row, by time.
+
+        Each sensor has the column "t", and columns of its own.
+        """
+        ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
+        columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
+        for begin, sensor in zip(ends, sensors, strict=False):
+            for name, values in sensor.items():
+                columns[name][begin : begin + len(values)] = values
+        order = np.argsort(columns["t"], kind="stable")
+        columns = {name: values[order] for name, values in columns.items()}
+        return cls(columns, np.zeros(len(order), dtype=np.int64), ("",), ())
 
 
 def read(data: bytes) -> Table:

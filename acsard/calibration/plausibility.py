@@ -1,21 +1,52 @@
-"""Checks whether a log and its calibration are plausible: signs, sides, units and times.
+"""Checks whether a log and its calibration are plausible, and whether the robot moved enough.
 
-A log with an error that would spoil the calibration is refused, and the message names the probable
-cause. Unusual facts that the calibration corrects or tolerates are reported as remarks.
+A log with an error that would spoil the calibration is refused: a wrong sign, side, unit or time,
+or sensors that contradict the wheels. The message names the probable cause. If a log does not
+contain enough movement, the message says what to drive. Unusual facts that the calibration corrects
+or tolerates are reported as remarks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from acsard.calibration import heading
-from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.fit import (
+    INVERSE_TRACK,
+    LEAST_BLOCKS,
+    LEFT,
+    RIGHT,
+    Base,
+    Fit,
+    condition,
+)  # fmt: skip
 from acsard.calibration.heading import Rows
-from acsard.calibration.log_table import Floats
-from acsard.calibration.search import StartingPoint
-from acsard.core.values import AcsardError
+from acsard.calibration.log_table import Floats, RefusedError
+from acsard.calibration.multipliers import Multipliers
+from acsard.calibration.positions import StartingPoint
+from acsard.calibration.runs import Block
+
+LEAST_ANGLE = 2 * np.pi
+"""Smallest total turn of the robot, rad."""
+
+LEAST_ROLL = 3.0
+"""Smallest angle by which the wheels must roll in all, together and against each other, rad."""
+
+ALIKE = 0.98
+"""Squared correlation of the sides' mean and difference from which all is one same curve."""
+
+WORST = 0.2, 0.03
+"""Largest useful standard deviations, as fractions: of the track, and of the ratio of the radii."""
+
+WORST_CONDITION = 1e4
+"""Largest condition number of the normal equations at which radii and track can be separated."""
+
+DRIVE = (
+    "drive 60 s: stand 3 s, 2 m straight ahead and back, three full turns to the left and three to "
+    "the right, some of them slow and some fast, then curves both ways"
+)
 
 UNLIKE = 0.5
 """Largest fraction of the sum of a sensor's squared motions that the wheels may not explain."""
@@ -36,15 +67,12 @@ Between it and 1 / `UNITS`, the wheel speeds have a wrong unit.
 """
 
 FASTEST_TURN = 12.0
-"""Fastest credible turn rate, rad/s.
-
-A higher rate is in degrees, since no robot turns twice a second.
-"""
+"""Fastest credible turn rate, rad/s. No robot turns twice a second, so a higher one is in deg/s."""
 
 LEAST_CHI = 0.4
 """Smallest ratio of effective track to wheel separation.
 
-WheelAngles that skid make the effective track larger, and nothing makes it this much smaller.
+Wheels that skid make the effective track larger, and nothing makes it this much smaller.
 """
 
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
@@ -57,10 +85,7 @@ LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which it is reported."""
 
 ONE_SIDED = 0.1
-"""Ratio of the turns to the rarer side to all turns to the other side.
-
-Below it, the report says that turns to one side are missing.
-"""
+"""Ratio of the turns to both sides below which the report says that one side is missing."""
 
 ODD_SIZE = 1.25
 """Ratio of the measured radius to the configured one from which it is reported."""
@@ -69,20 +94,79 @@ LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 """Ratios of effective track to wheel separation that are usual. Others are reported."""
 
 
-class RefusedError(AcsardError):
-    """The log cannot be used for a calibration. The text says why and what to do."""
+def drives_enough(parts: Sequence[Block]) -> None:
+    """Raise `RefusedError` if the log has too few blocks in which the wheels turn."""
+    if len(parts) < LEAST_BLOCKS:
+        seconds = sum(part.end - part.begin for part in parts)
+        raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
 
 
-def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
+def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
+    """Raise `RefusedError` if the wheels lack a movement that the fit needs.
+
+    Both sides must roll in opposite directions and in the same direction, and the proportion of the
+    two movements must vary. If `spins` is true, turns on the spot are enough.
+    """
+    together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
+    for rolled, what in ((together, "ahead or back"), (against, "against each other")):
+        if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
+            if spins and what == "ahead or back":
+                continue
+            raise RefusedError(
+                f"the wheels roll {turns:.1f} turns {what} in all, which is too little to measure "
+                f"their size, the ratio of left to right and the effective track: {DRIVE}"
+            )
+        cross = float(together @ against) ** 2
+        if cross > ALIKE * float(together @ together) * float(against @ against):
+            raise RefusedError(
+                f"the robot always drives the same curve, which does not separate the wheels from "
+                f"the track: {DRIVE}"
+            )
+
+
+def turns_enough(turned: Floats) -> None:
+    """Raise `RefusedError` if the robot hardly turns. `turned` is the turn of each row, rad."""
+    if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
+        raise RefusedError(
+            f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
+            f"effective track: {DRIVE}"
+        )
+
+
+TRACK, RATIO = "the effective track", "the ratio of left to right"
+"""Names of the two quantities that a log may leave unsure."""
+
+
+def unsure(
+    found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
+) -> dict[str, float]:
+    """Return the relative standard deviations that are too large to be useful, by name.
+
+    The names are `TRACK` and `RATIO`, and `worst` has the limits in this order. `track_std` is the
+    standard deviation of the track as a fraction. It leaves out that the track itself varies with
+    the turn rate and from block to block.
+    """
+    deviations = {TRACK: track_std, RATIO: found.ratio_std}
+    return {
+        name: deviation
+        for (name, deviation), most in zip(deviations.items(), worst, strict=True)
+        if not deviation <= most
+    }
+
+
+def separates_track(fitted: Fit) -> bool:
+    """Return whether the log separates the radii from the track."""
+    return condition(fitted.marginal()) <= WORST_CONDITION
+
+
+def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
 
-    Args:
-        source: the name of the heading sensor.
-        turned: the turn of each row according to the sensor, rad.
-        by_wheels: the turn of each row from the wheels, rad, scaled to fit the sensor best.
+    `sides` is the result of `heading.first`, which fits the wheels to the sensor best.
     """
-    spread = float(turned @ turned)
-    if not spread or float(np.sum((turned - by_wheels) ** 2)) > UNLIKE * spread:
+    spread = float(rows.turned @ rows.turned)
+    off = rows.turned - heading.by_sides(rows, base, sides)
+    if not spread or float(off @ off) > UNLIKE * spread:
         raise RefusedError(
             f"{source} does not follow the wheels. Check that it is the yaw axis (not roll or "
             "pitch), that it is from the same drive, that its clock agrees within 2 s, that the "
@@ -102,22 +186,15 @@ def positions_follow(begun: StartingPoint) -> None:
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
     """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
 
-    Args:
-        source: the name of the heading sensor.
-        sides: the result of `heading.first`, or None without a heading sensor.
-        begun: the best starting point that the positions give, or None without positions.
+    `sides` is the result of `heading.first`, and `begun` that of `search`. They are None without
+    the sensor.
     """
-    left = right = 1.0
+    by_places = by_heading = ""
     if begun is not None:
-        left, right = np.sign(begun.parameters[[LEFT, RIGHT]] * begun.parameters[INVERSE_TRACK])
-    by_places = {(1.0, 1.0): "", (-1.0, -1.0): "turn", (-1.0, 1.0): "left"}.get(
-        (left, right), "right"
-    )
-    by_heading = by_places
+        turn = begun.parameters[INVERSE_TRACK]
+        by_places = by_heading = _wrong_sign(begun.parameters[[LEFT, RIGHT]] * turn)
     if sides is not None:
-        by_heading = {(True, True): "", (False, False): "turn", (False, True): "left"}.get(
-            (bool(sides[0] > 0), bool(sides[1] > 0)), "right"
-        )
+        by_heading = _wrong_sign(sides)
     for side in ("left", "right"):
         if side in (by_heading, by_places):
             raise RefusedError(
@@ -150,9 +227,17 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
         )
 
 
-def turns_like_the_wheels(source: str, turned: Floats, rows: Rows, base: Base) -> None:
+def _wrong_sign(sides: Floats) -> str:
+    """Return which sign is wrong: that of the "left" or "right" wheels, of each "turn", or ""."""
+    left, right = (sides > 0.0).tolist()
+    if left:
+        return "" if right else "right"
+    return "left" if right else "turn"
+
+
+def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
     """Raise `RefusedError` if the sensor shows nearly no turns while the wheels turn the robot."""
-    shown = float(np.abs(turned).sum())
+    shown = float(np.abs(rows.turned).sum())
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
     if shown < LEAST_TURN * by_wheels:
         raise RefusedError(
@@ -164,18 +249,13 @@ def turns_like_the_wheels(source: str, turned: Floats, rows: Rows, base: Base) -
         )
 
 
-def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
+def turn_rates(source: str, rows: Rows) -> None:
     """Raise `RefusedError` if the turns are in degrees, because no robot turns this fast.
 
     The wheels are not compared here: if their speeds are in degrees too, both errors hide each
     other.
-
-    Args:
-        source: the name of the heading sensor.
-        turned: the turn of each row by the sensor, rad.
-        seconds: the length of each row, s.
     """
-    rate = float(np.percentile(np.abs(turned) / seconds, 90))
+    rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > FASTEST_TURN:
         raise RefusedError(
             f"{source} is in degrees (multiply by pi / 180): it shows turns of {rate:.0f} rad/s; "
@@ -256,7 +336,7 @@ def remarks(
         delays: the delay of each sensor behind the wheels, s.
         bias: the gyro bias, rad/s.
         turned: the turn of each row, rad, positive to the left.
-        values: the multipliers of the track, the left and the right radius.
+        values: the multipliers, as in `Multipliers.values`.
         base: the configured geometry.
         sized: whether the size of the wheels was measured.
     """

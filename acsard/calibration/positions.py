@@ -3,16 +3,25 @@
 The path of each block is first shifted and rotated so that it fits the positions best. The
 residuals of this alignment are the evidence, so no start pose, frame or yaw is needed. Places are
 complex numbers x + iy in m.
+
+`search` finds parameters from which the fit to positions can start, because the fit needs a track
+that is nearly right. The search tries tracks from a tenth to thirty times the configured one, with
+turns to either side and with one side of the wheels reversed. For each of them, the size of the
+path gives the radius. A turn on the spot moves no position. Positions therefore often determine
+such a turn only up to whole turns: 90 deg to the left end like 270 deg to the right. If several
+starting points explain the positions about as well, the one of the more usual robot is chosen.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
-from acsard.calibration.evidence import (
+from acsard.calibration.fit import (
     COUNT,
     DELAY,
     INVERSE_TRACK,
@@ -23,11 +32,11 @@ from acsard.calibration.evidence import (
     TRACK_GROWTH,
     Base,
     Evidence,
+    fit,
     huber,
 )  # fmt: skip
 from acsard.calibration.log_table import Floats
-from acsard.calibration.runs import Complexes, Run
-from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative
+from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
 LEAST_POINTS = 5
 """Smallest number of positions in a block, which has three unknowns: shift (two) and rotation."""
@@ -44,6 +53,11 @@ source has relocalized.
 
 SPEED_S = 0.05
 """Half of the interval from which the speed along the path is computed, s."""
+
+
+def extent(places: Complexes) -> float:
+    """Return the extent of these places: the sum of both sides of the box around them, m."""
+    return float(np.ptp(places.real) + np.ptp(places.imag))
 
 
 class Segment(Struct, frozen=True):
@@ -109,11 +123,9 @@ class Path(Struct, frozen=True):
         return np.interp(t, self.t, self.place) + lever * ahead, ahead
 
 
-def segments(
-    driven: Sequence[Run], angles: Sequence[WheelAngles], parts: Sequence[Block]
-) -> list[Segment]:
+def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
     """Return the positions of each block, split at jumps."""
-    edges = [jumps(run, wheels) for run, wheels in zip(driven, angles, strict=True)]
+    edges = [jumps(run) for run in driven]
     found = []
     for number, part in enumerate(parts):
         run = driven[part.run]
@@ -125,12 +137,12 @@ def segments(
     return found
 
 
-def jumps(run: Run, wheels: WheelAngles) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Return the indices of the positions before which the source jumped."""
     steps = np.abs(np.diff(run.place))
     if len(steps) < LEAST_POINTS:
         return np.zeros(0, dtype=np.int64)
-    left, right = wheels.angles(run.place_t)
+    left, right = run.angles(run.place_t)
     rolled = np.maximum(np.abs(np.diff(left)), np.abs(np.diff(right)))
     moving = rolled > 0.25 * float(np.max(rolled))
     per_rad = float(np.median(steps[moving] / rolled[moving])) if moving.any() else 0.0
@@ -139,21 +151,18 @@ def jumps(run: Run, wheels: WheelAngles) -> np.ndarray[tuple[int], np.dtype[np.i
     return np.flatnonzero(beyond > JUMP * usual + JUMP_M) + 1
 
 
-def wheel_steps(run: Run, wheels: WheelAngles, fine_s: float = FINE_S) -> WheelSteps:
+def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
     """Return the wheel steps of a run, each of about `fine_s` s or one sample."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
-    t, left, right = run.t[kept], wheels.left[kept], wheels.right[kept]
-    apart, steps = wheels.speed_difference((t[1:] + t[:-1]) / 2), np.diff(t)
+    t, left, right = run.t[kept], *(angles[kept] for angles in run.rolled)
+    apart, steps = run.speed_difference((t[1:] + t[:-1]) / 2), np.diff(t)
     return WheelSteps(t, np.diff(left), np.diff(right), np.abs(apart) * apart * steps)
 
 
 def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
-    """Return the path of the robot, which starts at the origin with heading 0.
-
-    Each step is an exact arc.
-    """
+    """Return the path of the robot from the origin with heading 0. Each step is an exact arc."""
     left, right, turn, rate = parameters[[LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]]
     gain = base.gain * turn
     mean = gain * (left + right) / 2
@@ -176,10 +185,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the place of the robot at the times of the steps, like `Path.place` but faster.
-
-    The track does not change with the turn rate here.
-    """
+    """Return the places as in `Path.place`, but faster, for a track that does not change."""
     left, right = parameters[LEFT] * steps.left, parameters[RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
@@ -217,10 +223,7 @@ class Aligned(Struct, frozen=True):
 
 
 def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
-    """Align the path of each segment with its positions, and yield the result.
-
-    Outliers have a smaller weight.
-    """
+    """Align the path of each segment with its positions. Outliers have a smaller weight."""
     for segment in segments:
         place, derivatives = paths[segment.run].at(segment.t, parameters)
         weight = np.ones(len(place))
@@ -264,3 +267,187 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
         squares += float(np.sum(np.abs(part.residual) ** 2))
         count += len(part.residual)
     return float(np.sqrt(squares / max(1, count)))
+
+
+TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
+"""Ratios of configured to true track that are tried. They are finer in the usual range."""
+
+DELAYS = np.arange(-1.5, 1.55, 0.1)
+"""Delays of the positions that are tried, s."""
+
+MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
+"""Numbers of segments that are used to try and to refine: those with the longest reach."""
+
+MOST_POINTS = 80
+"""Approximate number of positions per segment that are used, evenly spaced."""
+
+MOST_REFINED, FAR_WORSE = 4, 20.0
+"""Number of starting points to refine, and how many times worse than the best each may be."""
+
+USUAL_TURN = 0.31, 1.25
+"""Usual ratios of the robot's turn to the turn by its wheels and the wheel separation.
+
+The lowest is that of a robot that skids much, the highest that of a robot that does not skid.
+"""
+
+NEAR_HEADING = 0.8, 1.25
+"""Usual ratios of the robot's turn by positions to the turn by a heading sensor."""
+
+WRONG_WAY = 4.0
+"""Factor by which the unexplained part of an unusual robot is multiplied.
+
+Such a robot has one side reversed, or turns to the other side than its wheels.
+"""
+
+NOTHING = 1e-3
+"""Part of the positions' spread below which differences between starting points mean nothing.
+
+It is the noise of positions, which no starting point explains.
+"""
+
+STRAYED = 1.3
+"""Factor by which the turn may change during refinement. Beyond it, the refinement is not used."""
+
+COARSE_S = 0.1
+"""Time step in which paths are summed during the search, s."""
+
+
+class StartingPoint(Struct, frozen=True):
+    """Parameters from which a fit can start."""
+
+    parameters: Floats
+    unexplained: float
+    """Part of the positions' spread, as squares, that the path of the wheels leaves unexplained."""
+
+
+def search(
+    segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
+) -> StartingPoint:
+    """Return the best starting point. `sides` is the result of `heading.first`, or None."""
+    kept = _furthest(segments, MOST_SEGMENTS)
+    needed = sorted({segment.run for segment in kept})
+    steps = {run: wheel_steps(driven[run], COARSE_S) for run in needed}
+    points: list[StartingPoint] = []
+    for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
+        points += _local_minima(
+            [_tried(kept, steps, base, (left, way * turn, 0.0)) for turn in TURNS]
+        )
+    if sides is not None:
+        left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
+        points.append(_tried(kept, steps, base, (float(left), float(way), 0.0)))
+
+    def badness(point: StartingPoint) -> float:
+        return (point.unexplained + NOTHING) * _penalty(point, sides)
+
+    points.sort(key=badness)
+    few, worst = _furthest(kept, REFINED_SEGMENTS), FAR_WORSE * badness(points[0])
+    refined = [
+        _refined(_timed(point, few, steps, base), few, steps, base)
+        for point in points[:MOST_REFINED]
+        if badness(point) <= worst
+    ]
+    return min(refined, key=badness)
+
+
+def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
+    reach = [extent(s.place) for s in segments]
+    kept = [segments[i] for i in sorted(np.argsort(reach)[::-1][:most])]
+    return [
+        replace(s, t=s.t[:: 1 + len(s.t) // MOST_POINTS],
+                place=s.place[:: 1 + len(s.t) // MOST_POINTS])
+        for s in kept
+    ]  # fmt: skip
+
+
+def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
+    """Return the starting points that leave no more unexplained than both of their neighbours."""
+    left = [np.inf, *(point.unexplained for point in tried), np.inf]
+    return [p for at, p in enumerate(tried) if p.unexplained <= min(left[at], left[at + 2])]
+
+
+def _penalty(point: StartingPoint, sides: Floats | None) -> float:
+    """Return a factor of at least 1, which is larger for a less usual robot."""
+    signed = point.parameters[[LEFT, RIGHT]] * point.parameters[INVERSE_TRACK]
+    turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
+    like = np.ones(2)
+    if sides is not None:
+        turn, like = turn / max(1e-9, float(np.abs(sides).mean())), np.sign(sides)
+        least, most = NEAR_HEADING
+    beyond = max(0.0, np.log(least / turn), np.log(turn / most))
+    return (1.0 if np.array_equal(np.sign(signed), like) else WRONG_WAY) * float(1.0 + 2.0 * beyond)
+
+
+def _turn(parameters: Floats) -> float:
+    """Return the robot's turn for a roll of the right wheels alone, relative to `Base.gain`."""
+    return float(parameters[INVERSE_TRACK] * parameters[RIGHT])
+
+
+def _timed(
+    point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
+) -> StartingPoint:
+    """Return the starting point with the delay of the positions that suits it best."""
+    parameters = point.parameters
+    shape = float(np.sign(parameters[LEFT])), float(parameters[INVERSE_TRACK] * parameters[RIGHT])
+    tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
+    return min([point, *tried], key=lambda point: point.unexplained)
+
+
+def _tried(
+    kept: Sequence[Segment],
+    steps: dict[int, WheelSteps],
+    base: Base,
+    shape: tuple[float, float, float],
+) -> StartingPoint:
+    """Return the starting point for a shape of the path.
+
+    `shape` has the sign of the left side, the ratio of configured to true track, and the delay of
+    the positions in s.
+    """
+    parameters = base.start()
+    parameters[[LEFT, RIGHT, INVERSE_TRACK, DELAY]] = shape[0], 1.0, shape[1], shape[2]
+    paths = {run: place(of_run, base, parameters) for run, of_run in steps.items()}
+    cross = squares = size = 0.0
+    for segment in kept:
+        along = np.interp(segment.t - shape[2], steps[segment.run].t, paths[segment.run])
+        centred, centred_path = segment.place - segment.place.mean(), along - along.mean()
+        # Each path is rotated in the best way; all share one scale.
+        cross += abs(complex(np.vdot(centred_path, centred)))
+        size += float(np.sum(np.abs(centred_path) ** 2))
+        squares += float(np.sum(np.abs(centred) ** 2))
+    if not size or not squares:
+        return StartingPoint(parameters, np.inf)
+    scale = cross / size
+    parameters[[LEFT, RIGHT]] *= scale
+    parameters[INVERSE_TRACK] /= scale
+    return StartingPoint(parameters, 1.0 - cross**2 / (size * squares))
+
+
+def _refined(
+    point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
+) -> StartingPoint:
+    """Return the starting point after a fit to a few segments.
+
+    The fit also finds where on the robot the positions are measured, and outliers count less.
+    """
+    segments = [replace(segment, block=number) for number, segment in enumerate(few)]
+
+    def source(parameters: Floats) -> Evidence:
+        return evidence(segments, paths(parameters), parameters, len(segments))
+
+    def paths(parameters: Floats) -> dict[int, Path]:
+        return {run: path(of_run, base, parameters) for run, of_run in steps.items()}
+
+    def unexplained(parameters: Floats) -> float:
+        squares = sum(float(np.sum(np.abs(s.place - s.place.mean()) ** 2)) for s in segments)
+        off = spread(segments, paths(parameters), parameters)
+        return off**2 * sum(len(s.t) for s in segments) / squares if squares else np.inf
+
+    before = StartingPoint(point.parameters, unexplained(point.parameters))
+    if not np.isfinite(before.unexplained):
+        return point
+    parameters = fit([source], point.parameters, places=True).parameters
+    moved = _turn(parameters) / _turn(point.parameters)
+    if not 1 / STRAYED < moved < STRAYED:
+        return before  # the data does not determine the turn there
+    after = StartingPoint(parameters, unexplained(parameters))
+    return min([before, after], key=lambda point: point.unexplained)

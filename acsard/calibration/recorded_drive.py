@@ -9,18 +9,18 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from mcap.exceptions import EndOfFile
-from mcap.records import Channel, Header, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.reader import NonSeekingReader
 from msgspec.structs import replace
 
 from acsard.calibration import ros_bag_log
 from acsard.calibration.log_table import AS_CSV, LogError, Table, noted, read
+from acsard.calibration.multipliers import Tape
 from acsard.calibration.ros_bag_log import PAGE, Choice, RosMessage
 from acsard.calibration.runs import runs
 from acsard.calibration.solve import Calibration, calibrate
-from acsard.calibration.tape_distance import Tape
 from acsard.core.config.settings import Config
 from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import measured
@@ -34,7 +34,7 @@ MOST_RECORD_BYTES = 1 << 28
 """Size of the largest record of a bag that is read. A chunk of rosbag2 has less than 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
-"""Exceptions for a damaged bag: those of MCAP, of LZ4, and of a message without its channel."""
+"""Exceptions for a damaged bag: those of MCAP, of LZ4, and of a channel without its schema."""
 
 OTHER_BAGS = {
     ".db3": (b"SQLite format 3\0", "in SQLite: convert it to MCAP with `ros2 bag convert`"),
@@ -45,15 +45,9 @@ OTHER_BAGS = {
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
-    """Return the calibration from a recorded drive.
+    """Return the calibration from a recorded drive: a file, or the directory of a bag.
 
     Raises `LogError`, `RefusedError`, and `MendableError` for a file that cannot be read.
-
-    Args:
-        log: the file, or the directory of a bag.
-        config: the robot.
-        tape: a distance that was measured by tape, or None.
-        choice: the topics of a bag that the user chose.
     """
     try:
         table = _table(log, config, choice)
@@ -105,10 +99,13 @@ def _is_ours(log: Path) -> bool:
     """Return whether an MCAP file is a recording of acsard, as far as its beginning shows."""
     with log.open("rb") as stream:
         try:
-            first = next(StreamReader(stream, record_size_limit=MOST_RECORD_BYTES).records)
+            return _reader(stream).get_header().profile == "acsard"
         except (*DAMAGE, StopIteration):
             return True  # the reader of recordings names the damage
-        return not isinstance(first, Header) or first.profile == "acsard"
+
+
+def _reader(stream: IO[bytes]) -> NonSeekingReader:
+    return NonSeekingReader(stream, record_size_limit=MOST_RECORD_BYTES)
 
 
 def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
@@ -128,22 +125,12 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
     If the bag is cut off or damaged, the messages before that place are yielded, and a sentence is
     added to `notes`.
     """
-    types: dict[int, str] = {}
-    channels: dict[int, Channel] = {}
     with file.open("rb") as stream:
         try:
-            for record in StreamReader(stream, record_size_limit=MOST_RECORD_BYTES).records:
-                match record:
-                    case Schema():
-                        types[record.id] = record.name
-                    case Channel():
-                        channels[record.id] = record
-                    case Message():
-                        channel = channels[record.channel_id]
-                        yield RosMessage(
-                            channel.topic, types.get(channel.schema_id, ""),
-                            channel.message_encoding, record.log_time, record.data,
-                        )  # fmt: skip
+            for schema, channel, one in _reader(stream).iter_messages(log_time_order=False):
+                type_ = "" if schema is None else schema.name
+                encoding = channel.message_encoding
+                yield RosMessage(channel.topic, type_, encoding, one.log_time, one.data)
         except EndOfFile:
             notes.append(f"{file.name} has no end: the messages before the cut are used")
         except BAG_DAMAGE as error:

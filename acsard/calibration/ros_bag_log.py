@@ -20,11 +20,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
-from acsard.calibration.guided.leg_recorder import on_arrival_clock
 from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table, bounded, spikes
-from acsard.calibration.runs import RESTART_S
-from acsard.calibration.wheel_angles import cumulative, gaps
+from acsard.calibration.runs import RESTART_S, cumulative, gaps, on_arrival_clock
 from acsard.core.formatting import many, printable
 from acsard.core.messages.encodings import DecodeError, decode_cdr
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Quaternion
@@ -276,7 +275,9 @@ class _Log:
         roles = [f"the wheels from {wheels}"]
         roles += [f"the turn rates from {gyro} about its {self._axis} axis"] if gyro else []
         roles += [f"the positions from {places}"] if places else []
-        return _joined(parts, (f"used: {', '.join(roles)}", *self._notes))
+        table = Table.joined(parts)
+        notes = (f"used: {', '.join(roles)}", *self._notes, *bounded(table.columns))
+        return replace(table, notes=notes)
 
     # Choice of the topics
 
@@ -537,16 +538,3 @@ def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats])
         if float(off @ off) <= OWN**2 * float(turned @ turned):
             return True
     return False
-
-
-def _joined(parts: Sequence[dict[str, Floats]], notes: Sequence[str]) -> Table:
-    """Return the table in which each sample of each sensor is a row, in order of time."""
-    counts = [len(part["t"]) for part in parts]
-    columns = {name: np.full(sum(counts), math.nan) for part in parts for name in part}
-    for begin, part in zip(np.cumsum([0, *counts]), parts, strict=False):
-        for name, values in part.items():
-            columns[name][begin : begin + len(values)] = values
-    order = np.argsort(columns["t"], kind="stable")
-    columns = {name: values[order] for name, values in columns.items()}
-    runs = np.zeros(len(order), dtype=np.int64)
-    return Table(columns, runs, ("",), (*notes, *bounded(columns)))

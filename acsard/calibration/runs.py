@@ -1,12 +1,18 @@
-"""Splits the table of a log into runs. A run has the samples of one drive, sensor by sensor.
+"""Splits the table of a log into runs, and runs into blocks. A run has the samples of one drive.
 
 The times of a log may have any origin. Within a run they begin at 0. Rows that are out of order are
 sorted. If the times start again, or the wheels have no sample for a minute, a new run begins.
+
+A block is a few seconds of driving. Every estimate of the calibration is a sum over blocks, and the
+standard deviations come from the differences between blocks. The errors within a block are
+correlated, because a wheel skids throughout a turn. The errors of different blocks are nearly
+independent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +22,7 @@ from msgspec import Struct
 from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table
 
 Complexes = npt.NDArray[np.complex128]
+Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 RESTART_S = 1.0
@@ -63,8 +70,35 @@ NOTED, APART = 0.15, 0.8
 Above `NOTED` it is reported, above `APART` the log is refused.
 """
 
+GAP_S, GAP_PERIODS = 0.3, 5.0
+"""Interval between two samples above which there is a gap: in s, and in usual periods.
 
-class Run(Struct, frozen=True):
+A gap exceeds both. The motion within a gap is unknown.
+"""
+
+STILL = 0.02
+"""Speed below which a wheel stands, rad/s."""
+
+BLOCKS = 16
+"""Number of blocks that a log should have. Their length is limited by `LONGEST_S`."""
+
+LONGEST_S = 12.0
+"""Longest block, s, unless the caller asks for longer ones."""
+
+SMOOTH_S = 0.3
+"""Time over which a wheel speed is averaged before it is squared, s.
+
+Without it, the speeds of a coarse encoder would be 0 in some samples and far too large in others.
+"""
+
+LEAST_TURN = 0.2
+"""Angle of the faster side's wheels, rad, below which a block is not used."""
+
+MOST_JITTER_S = 5.0
+"""Largest variation of the delay between stamp and arrival, s. Beyond it, stamps are not used."""
+
+
+class Run(Struct, frozen=True, dict=True):
     """The samples of one drive. Times are in s since `start`, in order, and each occurs once."""
 
     name: str
@@ -84,6 +118,36 @@ class Run(Struct, frozen=True):
     place_t: Floats
     place: Complexes
     """Positions x + iy in m, relative to the first one."""
+
+    @cached_property
+    def gaps(self) -> Floats:
+        """The gaps of the wheels, one row (begin, end) each, in s."""
+        return gaps(self.t)
+
+    @cached_property
+    def rolled(self) -> tuple[Floats, Floats]:
+        """The angles of the left and the right wheels at the times `t`, rad. Gaps add nothing."""
+        steps = np.diff(self.t)
+        steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
+        left, right = (cumulative((v[1:] + v[:-1]) / 2 * steps) for v in (self.left, self.right))
+        return left, right
+
+    @cached_property
+    def moving(self) -> Mask:
+        """Mask of the wheel samples at which a wheel turns."""
+        return np.asarray((np.abs(self.left) > STILL) | (np.abs(self.right) > STILL))
+
+    def angles(self, t: Floats) -> tuple[Floats, Floats]:
+        """Return the angles of the left and the right wheels at these times, rad."""
+        left, right = self.rolled
+        return np.interp(t, self.t, left), np.interp(t, self.t, right)
+
+    def speed_difference(self, t: Floats) -> Floats:
+        """Return the right minus the left wheels' speed, rad/s, each averaged over `SMOOTH_S`."""
+        begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
+        (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
+        turned = far_right - right - (far_left - left)
+        return np.asarray(turned / np.maximum(end - begin, 1e-9))
 
 
 class Notes:
@@ -301,9 +365,6 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
             streams[what] = tuple(column[~again] for column in streams[what])
 
 
-Mask = npt.NDArray[np.bool_]
-
-
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
     """Return masks of the rows that repeat the value above, and of those while the wheels turn."""
     t, *values = streams[what]
@@ -317,10 +378,7 @@ def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
 def _stream(
     columns: dict[str, Floats], rows: Rows, names: Iterable[str], notes: Notes
 ) -> tuple[Floats, ...]:
-    """Return the times and values of a sensor, sorted, with one row for each time.
-
-    Rows in which one of its columns is empty are left out.
-    """
+    """Return a sensor's sorted times and values, without rows in which one of them is empty."""
     held = [columns.get(name) for name in names]
     if any(values is None for values in held):
         return (np.zeros(0),) * (1 + len(held))
@@ -342,3 +400,93 @@ def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
     yield times
     for values in stream[1:]:
         yield values[order][first]
+
+
+class Block(Struct, frozen=True):
+    """A part of a run."""
+
+    run: int
+    """Number of the run."""
+    begin: float
+    """Time in s, like `end`."""
+    end: float
+
+
+def gaps(t: Floats) -> Floats:
+    """Return the gaps between sample times, one row (begin, end) each."""
+    steps = np.diff(t)
+    if not len(steps):
+        return np.zeros((0, 2))
+    wide = steps > max(GAP_S, GAP_PERIODS * float(np.median(steps)))
+    return np.column_stack((t[:-1][wide], t[1:][wide]))
+
+
+def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
+    """Return a mask of the intervals from `begin` to `end` that touch none of the gaps `holes`."""
+    after = np.searchsorted(holes[:, 1], begin, side="right")
+    before = np.searchsorted(holes[:, 0], end, side="left")
+    return np.asarray(after == before)
+
+
+def cumulative(steps: Floats) -> Floats:
+    """Return 0 and the cumulative sums of `steps`: one element more than `steps` has."""
+    return np.concatenate((np.zeros(1), np.cumsum(steps)))
+
+
+def rests(run: Run, least_s: float, edge_s: float) -> Floats:
+    """Return the rests of a run, one row (begin, end) each, in s. All wheels stand in a rest.
+
+    A margin of `edge_s` is cut off at both ends. Rests of which less than `least_s` remains are
+    left out.
+    """
+    moving = np.concatenate(([True], run.moving, [True])).astype(np.int8)
+    changes = np.flatnonzero(np.diff(moving))
+    spans = [(run.t[a], run.t[b - 1]) for a, b in changes.reshape(-1, 2)]
+    found = [(a + edge_s, b - edge_s) for a, b in spans if b - a >= least_s + 2 * edge_s]
+    return np.array(found, dtype=np.float64).reshape(-1, 2)
+
+
+def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
+    """Return the blocks of all runs, without those in which the robot hardly moved.
+
+    A block is `shortest_s` long, or longer if the log would otherwise have over `BLOCKS` blocks.
+    """
+    moved = sum(float(np.minimum(np.diff(r.t), GAP_S) @ r.moving[1:]) for r in driven)
+    length = float(np.clip(moved / BLOCKS, shortest_s, max(LONGEST_S, shortest_s)))
+    found = []
+    for number, run in enumerate(driven):
+        ends = np.concatenate((run.gaps[:, 0], run.t[-1:]))
+        begins = np.concatenate((run.t[:1], run.gaps[:, 1]))
+        for begin, end in zip(begins, ends, strict=True):
+            count = max(1, round((end - begin) / length))
+            edges = np.linspace(begin, end, count + 1)
+            left, right = run.angles(edges)
+            for at in range(count):
+                a, b = edges[at], edges[at + 1]
+                if b > a and _turned(run, a, b, left[at : at + 2], right[at : at + 2]):
+                    found.append(Block(number, float(a), float(b)))
+    return found
+
+
+def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
+    """Return whether the wheels turned enough from `begin` to `end`, back and forth included.
+
+    `left` and `right` are the angles at both times.
+    """
+    if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
+        return True
+    a, b = np.searchsorted(run.t, (begin, end))
+    speed = max(float(np.sum(np.abs(v[a:b]))) for v in (run.left, run.right))
+    return bool(speed * (end - begin) / max(1, b - a) >= LEAST_TURN)
+
+
+def on_arrival_clock(came: Floats, made: Floats) -> Floats:
+    """Return the times of the samples of one stream by the clock of their arrival, s.
+
+    If the delays between the stamps `made` by the sender's clock and the times of arrival `came`
+    vary little, the times are the stamps plus the smallest delay. Otherwise they are `came`.
+    """
+    delay = came - made
+    if float(np.ptp(delay)) > MOST_JITTER_S:
+        return came
+    return np.asarray(made + float(delay.min()))

@@ -1,6 +1,7 @@
 """Computes the calibration from a log: prepares it, fits, checks the result and evaluates it.
 
-If a log gives no calibration, an error says why and what to do.
+To prepare a log means to cut it into blocks, to check it and to find parameters to start from. If a
+log gives no calibration, an error says why and what to do.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration import heading, positions
-from acsard.calibration.evidence import (
+from acsard.calibration import heading, plausibility, positions
+from acsard.calibration.fit import (
     BIAS_ERROR,
     COUNT,
     DELAY,
@@ -22,21 +23,12 @@ from acsard.calibration.evidence import (
     SCALE_ERROR,
     TRACK_GROWTH,
     Base,
-)
-from acsard.calibration.fit import (
-    LEFT_RADIUS,
-    RIGHT_RADIUS,
-    SEPARATION,
     Fit,
     Held,
-    Multipliers,
-    Rates,
-    configured,
+    Source,
     fit,
-    multipliers,
-    rates,
-)  # fmt: skip
-from acsard.calibration.heading import Headings, Rows
+)
+from acsard.calibration.heading import Headings, Rates, Rows, rates
 from acsard.calibration.improvement import (
     UNMEASURED,
     Improvement,
@@ -46,21 +38,22 @@ from acsard.calibration.improvement import (
     no_better,
     positions_of,
 )
-from acsard.calibration.log_table import Floats, noted
-from acsard.calibration.plausibility import RefusedError, in_range, remarks
-from acsard.calibration.prepared import (
-    DRIVE,
-    RATIO,
-    TRACK,
-    Prepared,
-    prepared,
-    separates_track,
-    turns_enough,
-    unsure,
-)
-from acsard.calibration.runs import Log, Run
-from acsard.calibration.tape_distance import Extent, Follow, Tape, scaled
-from acsard.calibration.wheel_angles import WheelAngles, angles_of
+from acsard.calibration.log_table import Floats, RefusedError, noted
+from acsard.calibration.multipliers import (
+    LEFT_RADIUS,
+    RIGHT_RADIUS,
+    SEPARATION,
+    Extent,
+    Follow,
+    Multipliers,
+    Tape,
+    configured,
+    multipliers,
+    scaled,
+)  # fmt: skip
+from acsard.calibration.plausibility import DRIVE, RATIO, TRACK
+from acsard.calibration.positions import Segment, WheelSteps, search
+from acsard.calibration.runs import Block, Log, Run, blocks
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import AcsardError
 
@@ -137,22 +130,95 @@ class Calibration(Struct, frozen=True):
 def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
     """Return the calibration of the robot that recorded this log.
 
-    Args:
-        log: the recorded runs.
-        drive: the geometry that the multipliers belong to, and the present multipliers.
-        tape: a distance that was measured by tape, or None.
-
-    Raises:
-        LogError: a sensor of the log cannot be used.
-        RefusedError: the log gives no calibration.
-
-    The notes of the log are added to each of these errors.
+    `drive` has the geometry that the multipliers belong to, and the present multipliers. Raises
+    `LogError` if a sensor of the log cannot be used, and `RefusedError` if the log gives no
+    calibration, both with the notes of the log.
     """
     try:
         return _calibrated(log, drive, tape)
     except AcsardError as error:
         noted(error, log.notes)
         raise
+
+
+class Prepared(Struct, frozen=True):
+    """A log that was cut into blocks of one length, and the evidence that it gives."""
+
+    runs: Sequence[Run]
+    headings: Headings | None
+    """The headings by a sensor."""
+    base: Base
+    """The configured geometry."""
+    parts: list[Block]
+    rows: Rows
+    """The turns. If the robot never rested, those of the gyro still contain the gyro's bias."""
+    segments: list[Segment]
+    """The positions; empty if the log has none."""
+    steps: list[WheelSteps]
+    """The wheel steps of each run; empty if the log has no positions."""
+    sources: list[Source]
+    start: Floats
+    """The parameters from which the fit starts."""
+
+
+def prepared(
+    driven: Sequence[Run], headings: Headings | None, base: Base, length: float
+) -> Prepared:
+    """Cut the runs into blocks of about `length` s, and check them. Raises `RefusedError`."""
+    parts = blocks(driven, length)
+    plausibility.drives_enough(parts)
+    count, start = len(parts), base.start()
+    every = rows = heading.rows(headings, driven, parts)
+    if headings is not None and headings.bias_unknown and len(every.turned):
+        rows = heading.level(every)
+    if headings is not None and not len(rows.turned):
+        raise RefusedError(
+            f"{headings.source} has no samples while the wheels turn: record both at the same "
+            "time, with times of one clock"
+        )
+    segments = positions.segments(driven, parts)
+    plausibility.rolls_enough(rows, spins=headings is not None and not segments)
+    steps = [positions.wheel_steps(run) for run in driven] if segments else []
+    sources: list[Source] = []
+    sides = by_positions = None
+    if headings is not None and len(rows.turned):
+        plausibility.turns_like_the_wheels(headings.source, rows, base)
+        plausibility.turns_enough(rows.turned)
+        sides = heading.first(rows, base)
+        plausibility.heading_follows(headings.source, rows, base, sides)
+        sources.append(lambda p: heading.evidence(rows, base, p, count))
+    if segments:
+        by_positions = search(segments, driven, base, sides)
+        plausibility.positions_follow(by_positions)
+        sources.append(
+            lambda p: positions.evidence(
+                segments, [positions.path(g, base, p) for g in steps], p, count
+            )
+        )
+        start = by_positions.parameters.copy()
+    if not sources:
+        raise RefusedError(
+            "there are no positions or turn rates while the robot drives: record both at the same "
+            "time, with times of one clock"
+        )
+    plausibility.turns_the_right_way(headings.source if headings else "", sides, by_positions)
+    if sides is not None:
+        mean, size = float(sides.mean()), float(start[[LEFT, RIGHT]].mean())
+        start[[LEFT, RIGHT]] = size * sides / mean
+        start[INVERSE_TRACK] = mean / size
+    if headings is not None:
+        plausibility.turn_rates(headings.source, rows)
+    _check_units(headings, start, base, by_positions is not None)
+    return Prepared(driven, headings, base, parts, every, segments, steps, sources, start)
+
+
+def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:
+    size, configured = float(start[[LEFT, RIGHT]].mean()), base.start()
+    if sized:
+        plausibility.distance_units(size, base)
+    bare = size * float(start[INVERSE_TRACK])
+    turn = bare / float(configured[[LEFT, RIGHT]].mean() * configured[INVERSE_TRACK])
+    plausibility.turn_units(headings.source if headings else "", turn, bare, base)
 
 
 class Candidate(Struct, frozen=True):
@@ -167,24 +233,20 @@ class Candidate(Struct, frozen=True):
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """Quantities that stay as configured, `TRACK` and `RATIO`.
-
-    The value is the relative standard deviation to which the log determines the quantity.
-    """
+    """`TRACK` or `RATIO` if it stays as configured, with its relative deviation by the log."""
 
 
 def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
     base = Base.of(drive)
-    angles = [angles_of(run) for run in log.runs]
-    headings = heading.of_gyro(log.runs, angles) or heading.of_yaw(log.runs, angles, base.gain)
+    headings = heading.of_gyro(log.runs) or heading.of_yaw(log.runs, base.gain)
     candidates: list[Candidate] = []
     refusals: list[RefusedError] = []
     for length in LENGTHS_S[headings is not None]:
         try:
-            made = prepared(log.runs, angles, headings, base, length)
+            made = prepared(log.runs, headings, base, length)
             if candidates and len(made.parts) < ENOUGH_BLOCKS:
                 break
-            candidates += _candidates(log.runs, angles, headings, base, made)
+            candidates += _candidates(made)
         except RefusedError as error:
             refusals.append(error)  # coarse positions may still follow the wheels in longer blocks
     if not candidates:
@@ -198,22 +260,20 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
             best, result=configured(base), kept={TRACK: np.inf, RATIO: np.inf},
             improvement=UNMEASURED,
         )  # fmt: skip
-    return _calibration(log, angles, headings, base, tape, best)
+    return _calibration(log, tape, best)
 
 
-def _candidates(
-    driven: Sequence[Run], angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
-    made: Prepared,
-) -> list[Candidate]:  # fmt: skip
+def _candidates(made: Prepared) -> list[Candidate]:
     """Return the fit of all parameters, or the fits that keep what this one leaves unsure.
 
     Raises `RefusedError` if every fit leaves something unsure.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
+    headings = made.headings
     gyro = headings is not None and headings.source == "yaw_rate"
     bias_std = headings.bias_std if headings is not None else 0.0
-    for kept, held in _held(base).items():
+    for kept, held in _held(made.base).items():
         if found and not found[0].kept:
             break
         fitted = fit(
@@ -221,13 +281,13 @@ def _candidates(
             held=held,
         )  # fmt: skip
         if fitted.converged:
-            candidate = _candidate(driven, angles, headings, base, made, fitted)
+            candidate = _candidate(made, fitted)
             track = float(np.sqrt(fitted.covariance()[INVERSE_TRACK, INVERSE_TRACK]))
             track /= abs(float(fitted.parameters[INVERSE_TRACK]))
-            too_wide = unsure(candidate.result, track)
+            too_wide = plausibility.unsure(candidate.result, track)
             if not kept:
                 deviations = {TRACK: track, RATIO: candidate.result.ratio_std}
-                if not separates_track(fitted):
+                if not plausibility.separates_track(fitted):
                     too_wide[RATIO] = deviations[RATIO] = np.inf
             if not too_wide:
                 unsure_by = {kept: deviations.get(kept, np.inf)} if kept else {}
@@ -250,16 +310,14 @@ def _held(base: Base) -> dict[str, list[Held]]:
     return {"": [], RATIO: [(ratio, 0.0)], TRACK: [(track, 1 / base.track), (growth, 0.0)]}
 
 
-def _candidate(
-    driven: Sequence[Run], angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
-    made: Prepared, fitted: Fit,
-) -> Candidate:  # fmt: skip
+def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     """Return a fit to these blocks with its improvement. Raises `RefusedError`."""
+    headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
     gyro_scale = 1 + float(fitted.parameters[SCALE_ERROR])
     bias_error = float(fitted.parameters[BIAS_ERROR])
     if headings is None:
-        turns_enough(by_wheels)
+        plausibility.turns_enough(by_wheels)
     elif headings.bias_unknown:
         bias_error = heading.bias(rows, by_wheels * gyro_scale)
     gyro_bias = (headings.bias if headings is not None else 0.0) + bias_error
@@ -267,36 +325,36 @@ def _candidate(
     rate = rates(rows, by_wheels)
     present = fitted.parameters.copy()
     present[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
-    held = folds(fitted, made.parts, drives(driven), rate)
-    places = [positions_of(fold.drive, driven, angles) if made.segments else [] for fold in held]
+    held = folds(fitted, made.parts, drives(made.runs), rate)
+    places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in held]
     better = improvement(held, present, base, rows, places, made.steps)
     result = multipliers(fitted.parameters, fitted.covariance(), rate)
     return Candidate(made, fitted, rows, rate, gyro_bias, result, better, {})
 
 
-def _calibration(
-    log: Log, angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
-    tape: Tape | None, best: Candidate,
-) -> Calibration:  # fmt: skip
+def _calibration(log: Log, tape: Tape | None, best: Candidate) -> Calibration:
     """Return the calibration that the best fit gives, after checks of the result."""
     made, fitted, rows, rate = best.made, best.fitted, best.rows, best.rate
+    headings, base = made.headings, made.base
     by_wheels, result = heading.turned(rows, base, fitted.parameters), best.result
     delays = {headings.source: headings.delay} if headings is not None else {}
     if made.segments:
         delays["positions"] = float(fitted.parameters[DELAY])
     scale, notes = ["positions"] if made.segments else [], list(log.notes)
     if tape is not None:
-        follow = _follow(log.runs, angles, base, fitted, rate)
+        follow = _follow(made, fitted, rate)
         names = [run.name for run in log.runs]
         result, name = scaled(result, tape, names, follow, known=bool(made.segments))
         scale.append("distance")
         notes.append(f"the distance of {tape.metres:g} m is used for run {name}")
-    in_range(result.values)
+    plausibility.in_range(result.values)
     totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)
     notes += [_stays(name, deviation) for name, deviation in best.kept.items()]
-    notes += _cuts(log.runs, angles)
-    notes += _too_good(headings, made, fitted, base)
-    notes += remarks(delays, best.gyro_bias, by_wheels, result.values, base, sized=bool(scale))
+    notes += _cuts(log.runs)
+    notes += _too_good(made, fitted)
+    notes += plausibility.remarks(
+        delays, best.gyro_bias, by_wheels, result.values, base, sized=bool(scale)
+    )
     return Calibration(
         reference=" and ".join(delays), drives=totals, configured=configured(base),
         multipliers=result, scale=" and ".join(scale),
@@ -312,21 +370,20 @@ def _stays(name: str, deviation: float) -> str:
     return f"{name} stays as configured, because this log does not improve it{known}"
 
 
-def _cuts(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Iterator[str]:
+def _cuts(driven: Sequence[Run]) -> Iterator[str]:
     """Yield a sentence about the gaps of the wheels, and one about the jumps of the positions."""
-    if gaps := sum(len(wheels.gaps) for wheels in angles):
+    if gaps := sum(len(run.gaps) for run in driven):
         yield f"the wheel speeds have {gaps} gaps: the tool uses no data across them"
-    pairs = zip(driven, angles, strict=True)
-    if jumps := sum(len(positions.jumps(run, turned)) for run, turned in pairs):
+    if jumps := sum(len(positions.jumps(run)) for run in driven):
         yield (
             f"the positions jump {jumps} times (outliers, or a source that corrected "
             "itself): the tool uses no data across the jumps"
         )
 
 
-def _too_good(headings: Headings | None, made: Prepared, fitted: Fit, base: Base) -> Iterator[str]:
+def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
     """Yield a sentence for each sensor that agrees with the wheels better than a true one can."""
-    rows = made.rows
+    rows, headings, base = made.rows, made.headings, made.base
     if headings is not None:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)
         off -= np.median(off / rows.seconds) * rows.seconds
@@ -334,10 +391,7 @@ def _too_good(headings: Headings | None, made: Prepared, fitted: Fit, base: Base
             yield _own(headings.source)
     if made.segments:
         along = [positions.path(steps, base, fitted.parameters) for steps in made.steps]
-        reach = max(
-            float(np.ptp(segment.place.real) + np.ptp(segment.place.imag))
-            for segment in made.segments
-        )
+        reach = max(positions.extent(segment.place) for segment in made.segments)
         if positions.spread(made.segments, along, fitted.parameters) < PERFECT * reach:
             yield _own("the positions")
 
@@ -350,9 +404,7 @@ def _own(what: str) -> str:
     )
 
 
-def _follow(
-    driven: Sequence[Run], angles: Sequence[WheelAngles], base: Base, fitted: Fit, rate: Rates
-) -> Follow:
+def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
     """Return a function from multipliers and the number of a run to the extent of its path.
 
     The track changes with the turn rate as the fit found.
@@ -364,9 +416,8 @@ def _follow(
         parameters[INVERSE_TRACK] = 1 / (
             values[SEPARATION] * (1 - parameters[TRACK_GROWTH] * rate.mean)
         )
-        place = positions.path(
-            positions.wheel_steps(driven[number], angles[number]), base, parameters
-        ).place
+        steps = positions.wheel_steps(made.runs[number])
+        place = positions.path(steps, made.base, parameters).place
         return Extent(float(abs(place[-1])), float(np.abs(np.diff(place)).sum()))
 
     return follow

@@ -9,9 +9,9 @@ restarts. The wire and the operator are the two parts outside the check.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import ceil
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
@@ -51,10 +51,7 @@ class Wire(Protocol):
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Wait until this time and return the received pieces with their times, ns.
-
-        Raises `WireLostError`.
-        """
+        """Return the pieces received until then with their times, ns. Raises `WireLostError`."""
 
 
 class Operator(Protocol):
@@ -77,17 +74,8 @@ FAREWELL = 5
 """Number of times that the last zeros are sent, in each form."""
 
 
-class Known(NamedTuple):
-    """Results of earlier steps that later steps use. `Board` describes each of them."""
-
-    comma: bool
-    latched: bool
-    sealed: bool
-    sampled: bool
-    own_clock: bool
-    gap_s: float
-    paced: bool
-    lost: float
+KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
+"""The attributes of `Board` with results of earlier steps that later steps use."""
 
 
 class Board:
@@ -190,13 +178,13 @@ class Board:
         return self.wire.now_ns() / NS_PER_S
 
     @property
-    def known(self) -> Known:
+    def known(self) -> dict[str, object]:
         """The results so far. The check restores them before it repeats a check step."""
-        return Known(*(getattr(self, name) for name in Known._fields))
+        return {name: getattr(self, name) for name in KNOWN}
 
     @known.setter
-    def known(self, known: Known) -> None:
-        for name, value in known._asdict().items():
+    def known(self, known: Mapping[str, object]) -> None:
+        for name, value in known.items():
             setattr(self, name, value)
 
     @property
@@ -213,12 +201,7 @@ class Board:
     # Sending
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
-        """Return the command for these speeds.
-
-        Args:
-            motors: speeds of motors a to d, rad/s.
-            comma: whether the line ends in a comma; None uses the form in force.
-        """
+        """Return the line for these speeds, rad/s. A `comma` of None is the form in force."""
         line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
             return line

@@ -20,10 +20,7 @@ Changes = dict[str, object]
 """New values by dotted key, in the order of the file."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
-"""Keys that improve the link but are not necessary.
-
-They are left out if the wire has no room for the longer lines.
-"""
+"""Keys that only improve the link. They go if the wire has no room for the longer lines."""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
@@ -32,10 +29,7 @@ def answered(findings: Iterable[Finding]) -> bool:
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
-    """Return the keys that should differ from the configuration.
-
-    `port` is included if it is not "" and a board answered there.
-    """
+    """Return the keys to change, with the `port` if one is given and a board answered there."""
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
         wanted |= finding.keys
@@ -57,10 +51,7 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
 
 def withheld(simulated: bool, config: Config) -> str:
-    """Return why the findings do not apply to this configuration, or "" if they do.
-
-    Findings about the simulator do not apply to the configuration of a real robot.
-    """
+    """Return why findings about the simulator do not apply to this configuration, or ""."""
     if not simulated or config.mcu.simulated:
         return ""
     return (
@@ -112,24 +103,12 @@ def report(
     A check has passed only if the board answered, every step was reached and judged, and none
     failed.
     """
-    ended = not any(finding.name == REST for finding in findings)
-    judged = ended and not lateness.unjudged(findings)
-    passed = answered(findings) and judged and not failed(findings)
+    judged = answered(findings) and not lateness.unjudged(findings)
+    passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)
     toml = "\n".join(excerpt(changes))
     return Report(
-        port,
-        passed,
-        findings,
-        changes,
-        toml,
-        written or None,
-        error or None,
-        withheld or None,
+        port, passed, findings, changes, toml, written or None, error or None, withheld or None
     )
-
-
-def failed(findings: Sequence[Finding]) -> bool:
-    return any(finding.verdict == "FAIL" for finding in findings)
 
 
 def summary(found: Report, where: str) -> str:

@@ -12,17 +12,11 @@ from acsard.core.link.checksum import seal
 from acsard.core.link.codec import LETTERS
 
 WHOLE = {"over-long", "garbage before it"}
-"""Kinds of damage that leave the four values intact.
-
-Firmware that accepts them is lenient, but not dangerous.
-"""
+"""Kinds of damage that leave the values intact. Firmware that accepts them is not dangerous."""
 
 
 def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
-    """Return every kind of damaged line, with its name, in the dialect of the firmware.
-
-    All motors except `motors` are at zero.
-    """
+    """Return every kind of damaged line with its name. Other motors than `motors` are at zero."""
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
         for motor, letter in enumerate(LETTERS)
@@ -52,10 +46,7 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send every kind of damaged line and report whether a motor obeyed one.
-
-    `motors` are motors that turn as commanded. They stand before and after this test.
-    """
+    """Send every kind of damaged line to standing `motors`, and report whether one obeyed."""
     if not motors:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)

@@ -54,10 +54,7 @@ def _knock(board: Board, seconds: float) -> bool:
 
 
 def identity(board: Board) -> Finding:
-    """Ask for the board's identification.
-
-    Ends the check if the answer is an echo of the question.
-    """
+    """Ask for the board's identification. Ends the check if the answer is an echo."""
     board.others.clear()
     for _ in range(3):  # the question or its answer may be lost
         board.restarts.asked(board.now_s)
@@ -77,10 +74,7 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Check whether the board answers the configured form of line.
-
-    Returns None if it does, or if that cannot be determined.
-    """
+    """Check the configured form of line. Returns None if the board answers it, or if unknown."""
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
     if _answers(board, board.comma):
@@ -107,10 +101,7 @@ def comma(board: Board, dead: bool) -> Finding:
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
-    """Return the finding that the configured form is wrong.
-
-    `board.comma` is already the right one.
-    """
+    """Return the finding that the configured form is wrong; `board.comma` is the right one."""
     return outcomes.find(
         f"trailing comma: {how}",
         {"mcu.trailing_comma": board.comma},
@@ -134,10 +125,7 @@ def replies(board: Board) -> Finding:
 
 
 def check(board: Board) -> Finding:
-    """Find out whether the board knows the checked link and the sample fields.
-
-    From here on the check uses the forms that the board knows.
-    """
+    """Find out whether the board knows the checked link and the samples, and use what it knows."""
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True
     if not any(reply.reading for reply in _answers(board, board.comma)):

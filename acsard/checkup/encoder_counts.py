@@ -18,10 +18,7 @@ MOST_COUNTS = 100_000
 
 
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Return the counts per turn of these motors, relative to the reported speeds.
-
-    Returns None if the motors turned too little.
-    """
+    """Return the counts per turn by the reported speeds, None if the motors turned too little."""
     counts = angle = 0.0
     for step in steps(replies):
         for motor in motors if step.counts and step.mcu_s <= GLANCE_S else ():
@@ -34,10 +31,7 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Judge `mcu.encoder_counts` by the identification or a measurement.
-
-    `motors` are motors that have turned as commanded.
-    """
+    """Judge `mcu.encoder_counts` by the identification, or by motors that turned as commanded."""
     if not board.sampled:
         return outcomes.find("encoder counts: none")
     if board.lost > line_loss.MOST:

@@ -20,10 +20,7 @@ SPOILS_S = motion.PERIOD_S
 """Lateness from which on a fault may be this computer's, s: a whole line was late."""
 
 PAUSE_S = motion.WATCHDOG_LEAST_S
-"""Lateness from which on even a good result is doubtful, s.
-
-The motors may have stopped meanwhile by the MCU's watchdog.
-"""
+"""Lateness, s, from which even a good result is doubtful: the watchdog may have cut motors."""
 
 
 LATE = "late: not judged"

@@ -71,26 +71,23 @@ def finding(board: Board) -> Finding:
         board.drive(ZERO, 0.5, _period_s(board))
     board.lost = count.share
     if board.lost <= MOST:
-        return _sound(count, silent_s)
-    last = printable_bytes(board.others[-1], SHOWN) if count.damaged else ""
-    seen = {"share": board.lost, "lines": count.lines, "damaged": count.damaged, "last": last}
-    if not count.damaged:
-        return outcomes.find(
-            f"lost lines: {'silent' if board.own_clock else 'either'}", None, **seen
-        )
+        outcome = "late" if silent_s else "few" if count.lost else "none"
+    elif not count.damaged:
+        outcome = "silent" if board.own_clock else "either"
+    else:
+        outcome = "back" if 2 * count.damaged > count.lost else "both"
     found = outcomes.find(
-        f"lost lines: {'back' if 2 * count.damaged > count.lost else 'both'}", None, **seen
+        f"lost lines: {outcome}",
+        lines=count.lines,
+        lost=count.lost,
+        share=board.lost,
+        silent=silent_s * 1000,
+        damaged=count.damaged,
+        last=printable_bytes(board.others[-1], SHOWN) if count.damaged else "",
     )
-    if not board.sealed:
+    if outcome in ("back", "both") and not board.sealed:
         raise StoppedError(found)
     return found
-
-
-def _sound(count: Count, silent_s: float) -> Finding:
-    if silent_s:
-        return outcomes.find("lost lines: late", lines=count.lines, silent=silent_s * 1000)
-    outcome = "few" if count.lost else "none"
-    return outcomes.find(f"lost lines: {outcome}", lines=count.lines, lost=count.lost)
 
 
 def _period_s(board: Board) -> float:
@@ -135,10 +132,7 @@ def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
 
 
 PULSE_S = 0.08
-"""Time for which a single line turns the motors, s.
-
-It is long enough to see and shorter than the watchdog.
-"""
+"""Time for which a single line turns the motors, s: long enough to see, below the watchdog's."""
 
 TOLD, PULSES_S = 8, 20.0
 """Number of unanswered pulses that shows the direction, and longest time to wait for them, s."""
@@ -177,19 +171,16 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
     if ways is None:
         return outcomes.find("lost where: untold")
     if ways.there + ways.back < FEW:
-        return outcomes.find("lost where: not seen", sent=ways.sent)
-    outcome = "there" if ways.there > ways.back else "back"
-    if min(ways.there, ways.back) >= FEW:
+        outcome = "not seen"
+    elif min(ways.there, ways.back) >= FEW:
         outcome = "both"
-    seen = {"sent": ways.sent, "there": ways.there, "back": ways.back}
-    return outcomes.find(f"lost where: {outcome}", None, **seen)
+    else:
+        outcome = "there" if ways.there > ways.back else "back"
+    return outcomes.find(f"lost where: {outcome}", sent=ways.sent, there=ways.there, back=ways.back)
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
-    """Send pulses to these standing motors and count the losses.
-
-    Returns None if the motors are too slow or too coarse to tell.
-    """
+    """Send pulses to standing motors and count the losses; None if the motors cannot tell."""
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
     # A board that reports by its own clock answers no line, so nothing has shown any loss yet.
     end_s = board.now_s + (10.0 if board.own_clock else PULSES_S)

@@ -108,11 +108,7 @@ def steps(replies: Sequence[Reply]) -> Iterator[Step]:
 
 
 def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
-    """Return the angle by which each encoder moved since then, rad.
-
-    It is computed from the counts if `per_turn`, the counts per turn, is given, and otherwise from
-    the speeds.
-    """
+    """Return the encoders' angles since then, rad, by the counts if `per_turn` is given."""
 
     def angle(step: Step, motor: int) -> float:
         if per_turn and step.counts:

@@ -225,10 +225,7 @@ class _Steps:
                 board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
-        """Return the finding of a step.
-
-        If the board is silent then, wait for it to report a restart.
-        """
+        """Return the finding of a step, after a silent board had time to report a restart."""
         try:
             finding = step()
         except StoppedError:

@@ -40,10 +40,7 @@ SILENT_S = 0.25
 """Silence of this host that a watchdog may take for the host's end, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Outcome for each cause that the reference firmware names after booting.
-
-"unknown" is not among them.
-"""
+"""Outcome for each cause except "unknown" that the reference firmware names after booting."""
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
 """Pattern of a printed text. It occurs in no reply, whether whole or damaged."""
@@ -105,10 +102,7 @@ class Restarts:
             self._turned, self._turned_s = motors, at_s
 
     def look(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
-        """Return the restart that a received line shows, or None.
-
-        `reply` is its decoded form, or None.
-        """
+        """Return the restart that a line shows, or None. `reply` is its decoded form, or None."""
         sign = ""
         if reply is not None:
             sign = self._clock_sign(reply)
@@ -147,10 +141,7 @@ class Restarts:
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of a restart that these lines name, or "".
-
-    The reference firmware names it.
-    """
+    """Return the cause of a restart that the reference firmware names in these lines, or ""."""
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 

@@ -30,10 +30,7 @@ FEEDING = ("a wrong letter", "neither p nor n", "cut short")
 """Kinds of damaged lines that may feed a watchdog."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Fractions of full speed.
-
-From `TURNING` on the motors have not slowed down, and below `STOPPED` they stand.
-"""
+"""Fractions of full speed above which motors have not slowed down, and below which they stand."""
 
 UNKNOWN = math.inf
 
@@ -141,10 +138,7 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
 
 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
-    """Bring the motors to speed, be silent for `length_s` s, and stop them.
-
-    During that time, the lines `instead` are sent if there are any.
-    """
+    """Bring the motors to speed, be silent or send `instead` for `length_s` s, and stop them."""
     began_s = board.now_s
     full = run_up(board, command(motors))
     if max(abs(full[motor]) for motor in motors) < motion.SPEED / 2:

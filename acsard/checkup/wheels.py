@@ -40,10 +40,7 @@ class Channel(Struct, frozen=True):
     forward: bool = True
     """Whether the operator saw the wheel turn forward first."""
     probed: bool = False
-    """Whether its own encoder did not follow a short probe.
-
-    The motor was then not turned further.
-    """
+    """Whether its own encoder did not follow a short probe, so that it was not turned further."""
     unsure: float = 0.0
     """Fraction by which the speeds may err because of a coarse encoder."""
     judged: bool = True
@@ -239,10 +236,7 @@ def channel(board: Board, motor: int) -> Channel:
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
-    """Return the movement of a motor, which turns only as far as its own encoder follows.
-
-    It stands afterwards.
-    """
+    """Turn a motor as far as its own encoder follows, stop it, and return its movement."""
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)

@@ -25,11 +25,10 @@ import msgspec
 
 from acsard.calibration.calibration_report import Refusal, keys, parts, report
 from acsard.calibration.guided.drive_plan import GuideError
-from acsard.calibration.log_table import LogError
-from acsard.calibration.plausibility import RefusedError
+from acsard.calibration.log_table import LogError, RefusedError
+from acsard.calibration.multipliers import Tape
 from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.ros_bag_log import AXES, Choice
-from acsard.calibration.tape_distance import Tape
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_drive_options, differing, guided
 from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus

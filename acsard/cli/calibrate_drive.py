@@ -10,8 +10,7 @@ from contextlib import ExitStack, contextmanager
 import msgspec
 import zenoh
 
-from acsard.calibration.guided.drive_plan import GuideError, setup
-from acsard.calibration.guided.equipment import NEEDS
+from acsard.calibration.guided.drive_plan import NEEDS, GuideError, setup
 from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
 from acsard.calibration.guided.runner import guide
 from acsard.calibration.solve import Calibration

@@ -11,8 +11,7 @@ from collections.abc import Iterable
 
 from acsard.host.errors import Exit, MendableError, NotPermittedError
 from acsard.machine import service_installation as service
-from acsard.machine.installation_steps import Step
-from acsard.machine.service_installation import misplaced
+from acsard.machine.service_installation import Step, misplaced
 from acsard.terminal.output import show, table
 
 

@@ -193,10 +193,7 @@ def main_renew(args: argparse.Namespace) -> int:
         print(f"{place} has a new certificate. Copy {files} to the place of the old ones.\n")
         print(TAKEN)
         return 0
-    names, warning = certificates.renew(args.directory, args.address, args.days)
-    print(_certified(names))
-    if warning:
-        print(f"{warning}\n")
+    print(_certified(certificates.renew(args.directory, args.address, args.days)))
     print(f"{args.directory / CERTIFICATE} is new.\n\n{TAKEN}")
     return 0
 

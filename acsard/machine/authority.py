@@ -82,17 +82,17 @@ class Authority:
             raise ValueError(f"{CA_KEY} is not a P-256 key")
         return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
 
-    @property
-    def limited(self) -> bool:
-        """Whether the authority may sign for some names only. An authority that an earlier version
-        made may sign for any name.
-        """
-        return bool(self._permitted())
-
     def permits(self, address: str) -> bool:
-        """Return whether a certificate for this host name or IP address would be valid."""
-        permitted = self._permitted()
-        if not permitted:
+        """Return whether a certificate for this host name or IP address would be valid.
+
+        An authority that another program made may sign for any name.
+        """
+        try:
+            constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
+        except x509.ExtensionNotFound:
+            return True
+        permitted = constraints.value.permitted_subtrees
+        if permitted is None:
             return True
         named = _general_name(address)
         if isinstance(named, x509.IPAddress):
@@ -106,17 +106,8 @@ class Authority:
             if isinstance(one, x509.DNSName)
         )
 
-    def _permitted(self) -> Sequence[x509.GeneralName]:
-        try:
-            found = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
-        except x509.ExtensionNotFound:
-            return ()
-        return found.value.permitted_subtrees or ()
-
     def names_in(self, directory: Path) -> list[str]:
-        """Return the host names and IP addresses in the certificate of `directory`, if it
-        exists.
-        """
+        """Return the names and addresses in the certificate of `directory`, if there is one."""
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
             names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value

@@ -62,9 +62,8 @@ def certificates(tls: str) -> Iterator[Finding]:
 def renewal(tls: str, whose: str) -> str:
     """Return the commands that replace a certificate which ends soon.
 
-    Args:
-        tls: the directory of this machine's certificate.
-        whose: the owner of the certificate that ends first, as in `expiry`.
+    `tls` is the directory of this machine's certificate, and `whose` the owner of the certificate
+    that ends first, as in `expiry`.
     """
     directory, name = Path(tls), common_name(tls)
     if whose == AUTHORITY:

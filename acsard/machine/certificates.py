@@ -33,13 +33,6 @@ CA_KEY = "ca-key.pem"
 OWN = "robot"
 """Common name of the certificate that `tls init` makes for the robot itself."""
 
-UNLIMITED = (
-    "The authority was made by an earlier version and may sign for any web site. If browsers trust "
-    "it, run `acsard tls init --force`, make all certificates again, and remove the old authority "
-    "from the phones."
-)
-"""Warning about an authority without name constraints."""
-
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 """Matches a host name or an IP address."""
 
@@ -49,10 +42,7 @@ HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
-    """Create an authority, the robot's certificate and one for each role.
-
-    Returns the robot's names.
-    """
+    """Create an authority and the first certificates. Returns the robot's names."""
     if (directory / CA).exists() and not force:
         raise MendableError(
             f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
@@ -102,18 +92,15 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
     return place
 
 
-def renew(directory: Path, addresses: Sequence[str], days: int) -> tuple[list[str], str]:
-    """Replace the robot's own certificate.
-
-    Returns its names and addresses, with those of the old one, and a warning or "".
-    """
+def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
+    """Replace the robot's own certificate. Returns its names, with those of the old one."""
     authority = _load(directory)
     _require_permitted(authority, addresses)
     known = _robot_names(authority.names_in(directory))
     # The machine may have another name or address than when the authority was made.
     names = [*filter(authority.permits, known), *addresses]
     authority.issue(directory, OWN, names, days)
-    return list(dict.fromkeys(names)), "" if authority.limited else UNLIMITED
+    return list(dict.fromkeys(names))
 
 
 def _names_of(name: str) -> list[str]:
@@ -196,10 +183,7 @@ def _password() -> str:
 
 
 def _writable(directory: Path) -> None:
-    """Raise `MendableError` unless the directory can be created or written to.
-
-    Nothing is created yet.
-    """
+    """Raise `MendableError` unless the directory can be created or written to. Create nothing."""
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     if not there.is_dir():
         raise MendableError(f"{there} is not a directory; use --directory")

@@ -1,26 +1,159 @@
-"""Examines the daemon: whether it can be reached, whether it runs, and its own reports.
+"""Asks the running daemon, and examines it: whether it can be reached, and its own reports.
 
-The counters of two `state` messages, a second apart, show how well the serial link works.
+It is asked for its configuration, and for its state twice, a second apart. The counters of the two
+states show how well the serial link works.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping
 
-from acsard.core.config.settings import Config
-from acsard.core.formatting import many
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.client import Client, connect
+from acsard.core.config.live import Difference, differences, live
+from acsard.core.config.parsing import from_builtins
+from acsard.core.config.settings import SIMULATOR, Config
+from acsard.core.config.validation import write
+from acsard.core.formatting import listed, many
 from acsard.core.link.link_diagnosis import BUSY, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
-from acsard.core.messages.schema import DiagnosticStatus
+from acsard.core.messages.schema import DiagnosticStatus, Info, LogEvent, RobotState
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.lifecycle import utc
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.zenoh_sessions import reachable
+from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.daemon.late_causes import cause_in
+from acsard.host import clock
 from acsard.host.errors import NoAnswerError
+from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
-from acsard.machine.running import Running, answers, asked
+
+SHOWN = 6
+"""Number of differing keys that are named one by one. More mean another file."""
+
+
+OPTIONS = (
+    "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
+    "ros.namespace",
+)  # fmt: skip
+"""Keys that `acsard run` takes as options, so that a different value is intended."""
+
+WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
+    (
+        lambda key: key in OPTIONS,
+        "ok",
+        "by its options (`acsard run --help`) or another file, or the file has changed since",
+        "to keep {which}, write into the file: {lines}",
+    ),
+    (
+        lambda key: key not in OPTIONS and live(key) is None,
+        "warning",
+        "by another file or its environment, or the file has changed since",
+        "if it runs with another file, name that with --config; otherwise write its values into "
+        "the file, or restart it. The following is about the running daemon",
+    ),
+    (
+        lambda key: live(key) is not None,
+        "warning",
+        "set while it ran, or by another file, or the file has changed since",
+        "its next start uses the file's values; `acsard set KEY VALUE --write` writes one into "
+        "the file",
+    ),
+)
+"""Reasons for a value that differs from the file's, by its key, and the remedy."""
+
+
+class Running(Struct, frozen=True):
+    """Reports of a daemon: its identity, its configuration, and two of its states."""
+
+    info: Info
+    config: Config
+    before: RobotState
+    state: RobotState
+    looked_ns: int
+    """Middle of the query of `state`, from request to answer, by this machine's wall clock, ns."""
+    trip_ns: int = 0
+    """Duration of that request, ns."""
+    rows: tuple[DiagnosticStatus, ...] = ()
+    """Rows of the daemon's diagnostics."""
+    here: bool = True
+    """Whether the daemon runs on this machine, as far as its processes can be seen.
+
+    A tunnel or a router may stand between.
+    """
+    events: tuple[LogEvent, ...] = ()
+    """The daemon's last events."""
+
+
+def asked(config: Config, address: Address) -> Running:
+    """Ask the daemon at this address. `config` is the file's. Raises an `AcsardError`."""
+    endpoint, robot_id, tls = address
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        info, before = robot.get("info"), robot.get("state")
+        time.sleep(1.0)  # about a hundred lines are counted meanwhile
+        rows, events = tuple(robot.get("diagnostics").status), tuple(robot.get("events").events)
+        runs, here = _configuration(robot, info, config), name_of(info.pid) == "acsard"
+        asked = clock.now()
+        state, answered = robot.get("state"), clock.now()
+        trip_ns = answered.mono_ns - asked.mono_ns
+        looked_ns = asked.wall_ns + trip_ns // 2
+        return Running(info, runs, before, state, looked_ns, trip_ns, rows, here, events)
+
+
+def _configuration(robot: Client, info: Info, file: Config) -> Config:
+    """Return the daemon's configuration.
+
+    A client that may not query it gets the file's, with the values that `info` contains.
+    """
+    try:
+        return from_builtins(robot.get("config"))
+    except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
+        mcu = replace(file.mcu, port=SIMULATOR if info.simulated else info.port)
+        bus = replace(file.bus, listen=tuple(info.listen), connect=tuple(info.connect))
+        return replace(file, robot=replace(file.robot, id=info.id), mcu=mcu, bus=bus)
+
+
+def compared(running: Running, file: Config) -> Iterator[Finding]:
+    """Yield findings about the agreement of the daemon's configuration with the file."""
+    info, others = running.info, differences(running.config, file)
+    who = f"acsard {info.version}, pid {info.pid}"
+    if not others:
+        yield Finding("configuration", "ok", f"the running daemon ({who}) has that of the file")
+        return
+    for belongs, level, how, mend in WAYS:
+        its = {key: one for key, one in others.items() if belongs(key)}
+        if not its:
+            continue
+        told = [one.words(key) for key, one in its.items()]
+        text = f"the running daemon ({who}) has other values ({how}): "
+        text += listed(told, SHOWN, "; ")
+        mend = mend.format(which="them" if len(its) > 1 else "it", lines=_tables(its))
+        yield Finding("configuration", level, text, mend)
+
+
+def _tables(its: Mapping[str, Difference]) -> str:
+    """Return the daemon's values as lines of the file."""
+    parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
+    return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
+
+
+def answers(endpoint: str) -> bool:
+    """Return whether a program listens there. Raises `UsageError` if it is not an endpoint."""
+    host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise no_endpoint(endpoint)
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
+
 
 LOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""
@@ -163,10 +296,7 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the daemon that was reached and asked, or the finding that explains the failure.
-
-    Raises `UsageError` if the address is not an endpoint.
-    """
+    """Return the reached daemon, or a finding. Raises `UsageError` if it is not an endpoint."""
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
@@ -200,24 +330,24 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from certificate(rows.get("acsard: certificate"), running.here)
     if state.counters.get("gateway_full"):
         text = "clients from the network took all connections at times: the log names them"
-        yield Finding(
-            "gateway",
-            "warning",
-            text,
-            "remove the client's certificate from [access], or end its program",
-        )
-    yield from latch_file(state.latch_file_error)
+        mend = "remove the client's certificate from [access], or end its program"
+        yield Finding("gateway", "warning", text, mend)
+    if state.latch_file_error:
+        mend = "free disk space, or name a writable directory: control.state_directory"
+        yield Finding("latch file", "warning", state.latch_file_error, mend)
     # On this machine `compared` has read the file itself.
-    yield from settings_file("" if running.here else state.settings_differ)
+    if state.settings_differ and not running.here:
+        mend = "its next start uses the file's values; set them again, or correct its file there"
+        text = f"the settings in force differ from the robot's file: {state.settings_differ}"
+        yield Finding("configuration", "warning", text, mend)
     yield from late(running)
 
 
 def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     """Yield a finding if a certificate that the daemon or its gateway uses ends soon.
 
-    Args:
-        row: the row of the daemon's diagnostics, None without TLS.
-        here: whether the daemon runs on this machine, where its files are examined too.
+    `row` is that of the daemon's diagnostics. `here` says that the daemon runs on this machine,
+    where its files are examined too.
     """
     if row is None or not row.level:
         return
@@ -231,21 +361,6 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
         )
     text = f"the daemon's certificate that ends first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
-
-
-def latch_file(trouble: str) -> Iterator[Finding]:
-    """Yield a warning if a stop would be lost at a restart; `trouble` is the reason."""
-    if trouble:
-        mend = "free disk space, or name a writable directory: control.state_directory"
-        yield Finding("latch file", "warning", trouble, mend)
-
-
-def settings_file(differ: str) -> Iterator[Finding]:
-    """Yield a warning if the settings of a daemon on another machine differ from its file."""
-    if differ:
-        mend = "its next start uses the file's values; set them again, or correct its file there"
-        text = f"the settings in force differ from the robot's file: {differ}"
-        yield Finding("configuration", "warning", text, mend)
 
 
 def late(running: Running) -> Iterator[Finding]:

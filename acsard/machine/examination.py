@@ -2,15 +2,13 @@
 
 This module itself examines the configuration, the machine and the serial port;
 `certificate_findings.py` examines the certificates, and `daemon_findings.py` the daemon and its
-link. The doctor opens no port and sends nothing to
-a robot. If a daemon runs, its own configuration is examined, because the file may have changed
-since and options may override it. For a daemon on another machine, only its own reports are
-examined: its port, files and gateway are there.
+link. The doctor opens no port and sends nothing to a robot. If a daemon runs, its own configuration
+is examined, because the file may have changed since and options may override it. For a daemon on
+another machine, only its own reports are examined: its port, files and gateway are there.
 """
 
 from __future__ import annotations
 
-import grp
 import os
 import stat
 import time
@@ -27,9 +25,8 @@ from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel
 from acsard.host.processes import holders, running
 from acsard.machine.certificate_findings import certificates, router_certificates
-from acsard.machine.daemon_findings import daemon, found, gateway, routers
+from acsard.machine.daemon_findings import Running, compared, daemon, found, gateway, routers
 from acsard.machine.finding import Finding, Level
-from acsard.machine.running import Running, compared
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
 REAL = (
@@ -141,18 +138,14 @@ def _hardware(name: str) -> Iterator[Finding]:
 def _permission(path: str) -> Finding:
     if os.access(path, os.R_OK | os.W_OK):
         return Finding("port", "ok", f"{path} may be read and written")
-    group = _group_of(os.stat(path).st_gid)
+    try:
+        group = Path(path).group()
+    except KeyError:
+        group = str(os.stat(path).st_gid)
     mend = f"sudo usermod -aG {group} $USER, then log in again (the service has the group itself)"
     return Finding(
         "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
     )
-
-
-def _group_of(number: int) -> str:
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
 
 
 def examine(

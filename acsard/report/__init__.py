@@ -4,7 +4,7 @@ All modules of this package are pure, except `page.drawn`, which replays the rec
 
 - `report_data` takes the steps one by one and keeps the data to draw. It thins the data while they
   arrive (`acsard.core.thinning`), so a day takes no more memory than a minute.
-- `command_sources`, `serial_counts` and `loop_lateness` keep parts of these data.
+- `command_sources` keeps the part of these data that shows which source drove.
 - `report_text` describes the recording in words.
 - `time_figures` and `path_figure` draw it, with the elements of `plot_elements`.
 - `page` assembles the file.

@@ -137,12 +137,7 @@ def page(
 ) -> str:
     """Return the text of the HTML file.
 
-    Args:
-        data: the data of the recording.
-        origin: the robot and the program that made the recording.
-        library: the code of plotly.
-        clock: formats the times.
-        offset_s: offset of the local time from UTC, s.
+    `library` is the code of plotly, and `offset_s` the offset of the local time from UTC, s.
     """
     figures = TimeFigures(data, offset_s).all()
     title = escaped(f"{origin.robot}, {clock(data.began or 0.0, True)}")

@@ -92,10 +92,7 @@ def numbers(values: Iterable[float]) -> dict[str, str]:
 
 
 def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
-    """Return a curve, or marks, through the points with the coordinates `x` and `y`.
-
-    `look` has plotly's attributes of the curve or of the marks.
-    """
+    """Return a curve or marks through these points; `look` has their attributes in plotly."""
     return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
 
 
@@ -121,10 +118,7 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """Return a heading inside a picture, where it needs no margin.
-
-    `x` is a fraction of the picture's width, and `y` a value of its y axis.
-    """
+    """Return a heading in a picture: `x` is a share of its width, `y` a value of its y axis."""
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
         "yanchor": "middle", "showarrow": False, "font": {"size": 13},

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Mapping
 
 from msgspec import Struct
 
@@ -15,13 +16,13 @@ from acsard.core.config.settings import Config
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.robot import Robot
 from acsard.core.ros.shapes import how_often
-from acsard.core.thinning import Band, Curve, Place, Track
+from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist
 from acsard.recording.recorded_steps import MICRO, Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
-from acsard.report.loop_lateness import Lateness
-from acsard.report.serial_counts import SerialCounts
+
+NS_PER_MS = 1_000_000
 
 MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
 """Modes of the robot. If short spans must be merged, the first of these modes wins."""
@@ -100,6 +101,141 @@ class Driven(Struct):
 
     seconds: float = 0.0
     metres: float = 0.0
+
+
+class Lateness:
+    """Delay of each period's step, relative to the step with the smallest delay.
+
+    The recording has the number of missed periods, so the number of each period is known. Its due
+    time is then known except for a constant offset. The step with the smallest delay gives this
+    offset.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = int(NS_PER_S / rate_hz)
+        self._curve = Curve()
+        self._number = 0
+        """Number of the last period."""
+        self._ahead = 0
+        """Number of lines since then that were sent at once, in place of a later period's line."""
+        self._began_ns: int | None = None
+        self._earliest = math.inf
+        """Smallest delay, ns."""
+        self.missed = 0
+        """Number of periods without a step."""
+
+    def at_once(self) -> None:
+        """Register a line that was sent at once, in place of the next period's line."""
+        self._ahead += 1
+
+    def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
+        """Take the step of a period.
+
+        `t` (s) and `now_ns` (monotonic, ns) are its time, and `missed` is the number of periods
+        since the previous tick that had no step. `known` is False if the recording lacks steps
+        before this one. Then the number of the period is computed from the clock.
+        """
+        period_ns, began_ns = self._period_ns, self._began_ns
+        if began_ns is None:
+            began_ns = self._began_ns = now_ns
+            missed = 0
+        elif known:
+            self._number += 1 + missed + self._ahead
+        else:
+            self._number, missed = round((now_ns - began_ns) / period_ns), 0
+        behind_ns = now_ns - began_ns - self._number * period_ns
+        if missed and self._ahead and behind_ns < self._earliest - period_ns / 2:
+            # The line that was sent at once took the place of a missed period.
+            self._number -= 1
+            behind_ns += period_ns
+        self._ahead = 0
+        self.missed += missed
+        self._earliest = min(self._earliest, behind_ns)
+        self._curve.add(t, (behind_ns + missed * period_ns) / NS_PER_MS)
+
+    def points(self) -> list[Point]:
+        """Return the delay in ms over the time in s."""
+        least = self._earliest / NS_PER_MS
+        return [Point(t, value - least) for t, value in self._curve.points()]
+
+    @property
+    def most_ms(self) -> float:
+        """Largest delay, ms."""
+        return max([point.value for point in self.points()], default=0.0)
+
+
+class LineCount:
+    """Number of lines of one kind, in each second and in all."""
+
+    def __init__(self) -> None:
+        self.curve, self.total = Curve(), 0
+
+    def add(self, t: float, count: int) -> None:
+        """Add the lines of the second around `t`."""
+        self.curve.add(t, count)
+        self.total += count
+
+
+class SerialCounts:
+    """Number of sent, accepted, dropped and unanswered lines in each second."""
+
+    def __init__(self) -> None:
+        self.sent, self.good = LineCount(), LineCount()
+        self.dropped, self.unanswered = LineCount(), LineCount()
+        self._second: int | None = None
+        self._sent = 0
+        """Lines sent in this second."""
+        self._base = 0
+        """Lines received before the first collected step."""
+        self._before = (0, 0)
+        """Good and dropped lines since the daemon's start, at the beginning of this second."""
+        self._now = (0, 0)
+        """Good and dropped lines since the daemon's start, at the last step."""
+        self._outstanding: int | None = None
+        """Smallest number of unanswered lines at any step of this second.
+
+        At another step the answer to the newest line may just not have arrived yet. The smallest
+        number counts only the lines whose answers are lost.
+        """
+        self._lost: int | None = None
+        """Largest `_outstanding` of all earlier seconds."""
+
+    def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
+        """Take a step at `t`, s, whether it sent a line, and the robot's counters after it."""
+        received = self._now = _received(counters)
+        if self._second is None:
+            self._second, self._before, self._base = int(t), received, sum(received)
+        elif int(t) != self._second:
+            self._end(received)
+            self._second = int(t)
+        outstanding = self.sent.total + self._sent - (sum(received) - self._base)
+        if self._outstanding is None or outstanding < self._outstanding:
+            self._outstanding = outstanding
+        self._sent += sent
+
+    def _end(self, received: tuple[int, int]) -> None:
+        """Finish a second. The next step may be many seconds later."""
+        t = float(self._second or 0) + 0.5
+        good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
+        outstanding = self._outstanding or 0
+        lost = outstanding if self._lost is None else max(outstanding, self._lost)
+        unanswered = 0 if self._lost is None else lost - self._lost
+        self.sent.add(t, self._sent)
+        self.good.add(t, good)
+        self.dropped.add(t, dropped)
+        self.unanswered.add(t, unanswered)
+        self._sent, self._before, self._lost, self._outstanding = 0, received, lost, None
+
+    def end(self) -> None:
+        """Finish the last second."""
+        if self._second is not None:
+            self._end(self._now)
+
+
+def _received(counters: Mapping[str, int]) -> tuple[int, int]:
+    """Return the number of accepted and dropped lines. An implausible line could be read, too."""
+    bad = sum(count for name, count in counters.items() if name.startswith("line_"))
+    return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
 
 class ReportData:
@@ -186,10 +322,7 @@ class ReportData:
         self._number = step.number
 
     def end(self, ending: str = "") -> None:
-        """Finish the data after the last step.
-
-        `ending` says how the recording ended other than by an ordinary end of the daemon.
-        """
+        """Finish the data. `ending` says how the recording ended unless the daemon ended it."""
         t = self.seconds
         for entry in self._timeline.end(ending) if self.began is not None else ():
             self.marks.add(self._mark(entry, t))
@@ -272,10 +405,7 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Add the status to the bands, if it has changed or the last sample is old enough.
-
-        `refused` is true if this step changed which sources are refused.
-        """
+        """Sample the status if it or the refused sources changed, or the last sample is old."""
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:
             return

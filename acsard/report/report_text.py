@@ -20,10 +20,7 @@ from acsard.daemon.late_causes import cause_in
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
-"""Function that formats a time in s since 1970 as local time.
-
-The text has the date if the second argument is true.
-"""
+"""Function from a time in s since 1970, and whether to add the date, to local time in words."""
 
 MAX_REASONS = 8
 """Largest number of rows in the table of reasons."""
@@ -190,10 +187,12 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
         yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
-    totals = data.serial.totals
-    shares = f"{totals.sent} lines sent, {totals.good} answers, {totals.dropped} dropped"
-    lost = "" if config.mcu.reply_period else f", {totals.unanswered} without an answer"
-    yield "Serial line", shares + lost
+    lines = data.serial
+    told = (
+        f"{lines.sent.total} lines sent, {lines.good.total} answers, {lines.dropped.total} dropped"
+    )
+    lost = "" if config.mcu.reply_period else f", {lines.unanswered.total} without an answer"
+    yield "Serial line", told + lost
     lateness = data.lateness
     yield (
         "Control loop",

@@ -235,15 +235,15 @@ class TimeFigures:
     def serial(self) -> Figure:
         """Draw the number of sent, answered and lost lines per second."""
         counts = self._data.serial
-        bad = [Line("dropped", COLOURS["error"], counts.dropped.points(), "hvh")]
+        bad = [Line("dropped", COLOURS["error"], counts.dropped.curve.points(), "hvh")]
         if not self._data.config.mcu.reply_period:
-            bad.append(Line("no answer", COMMANDED, counts.unanswered.points(), "hvh"))
+            bad.append(Line("no answer", COMMANDED, counts.unanswered.curve.points(), "hvh"))
         parts = [
             Part(
                 "lines per second",
                 [
-                    Line("sent", LIMITED, counts.sent.points(), "hvh", BENEATH),
-                    Line("answered", MEASURED, counts.good.points(), "hvh"),
+                    Line("sent", LIMITED, counts.sent.curve.points(), "hvh", BENEATH),
+                    Line("answered", MEASURED, counts.good.curve.points(), "hvh"),
                 ],
             ),
             Part("lost per second", bad),
@@ -364,10 +364,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw several parts above each other, with one time axis and one legend.
-
-        `px` is the height of each part.
-        """
+        """Draw parts of `px` height above each other, with one time axis and one legend."""
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}

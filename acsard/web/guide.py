@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 from msgspec import Struct
 
-from acsard.calibration.guided.equipment import NEEDS, SIMULATED
+from acsard.calibration.guided.drive_plan import NEEDS, SIMULATED
 from acsard.host import clock
 from acsard.host.child import acsard, running
 from acsard.host.errors import WORDS, Exit

@@ -11,7 +11,7 @@ from collections.abc import Collection
 
 from msgspec import Struct
 
-from acsard.calibration.guided.equipment import NEEDS
+from acsard.calibration.guided.drive_plan import NEEDS
 from acsard.web.frames import Begin, FrameError
 
 POSITIONS = "positions"

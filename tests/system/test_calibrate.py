@@ -23,8 +23,7 @@ import zenoh
 from acsard.calibration.guided import robot_on_bus
 from acsard.calibration.guided.drive_plan import GuideError, Leg, Move
 from acsard.calibration.guided.leg_driver import HELD_UP
-from acsard.calibration.guided.leg_recorder import Recorder, Sample
-from acsard.calibration.guided.robot_on_bus import POSITIONS, RobotOnBus, Sensor
+from acsard.calibration.guided.robot_on_bus import POSITIONS, Recorder, RobotOnBus, Sample, Sensor
 from acsard.client import Client
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, JointsConfig

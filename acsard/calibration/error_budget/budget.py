@@ -21,8 +21,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.error_budget.drive_log import Line, motion
-from acsard.calibration.error_budget.step_errors import Driving, Steps, rounding
+from acsard.calibration.error_budget.measured_errors import Driving, Line, Steps, motion, rounding
 from acsard.core.config.settings import Config, OdometryConfig
 from acsard.core.motion.error_model import DECIMAL, ErrorModel, TwistUncertainty, columns
 from acsard.core.motion.kinematics import Kinematics
@@ -52,10 +51,7 @@ MOST_STEPS = 20_000
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""A step straight ahead, m, and a step of a turn on the spot, rad.
-
-The errors of a robot that stands are computed for them.
-"""
+"""Steps straight ahead (m) and on the spot (rad), for the errors of a robot that stands."""
 
 
 class Share(Struct, frozen=True):
@@ -151,12 +147,9 @@ class Received(Struct, frozen=True):
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
-    """Return the error budget of a drive.
+    """Return the error budget of a drive, with the position error after `metres`.
 
-    Args:
-        received: the drive.
-        config: the configuration of the daemon.
-        metres: the distance after which the position error is given.
+    `config` is the configuration of the daemon.
     """
     model, lines = _Model(config, metres), received.lines
     still = _standing(received, config, model)
@@ -256,14 +249,10 @@ class _Model:
     ) -> Share:  # fmt: skip
         """Return the error of one cause.
 
-        Args:
-            cause: the cause.
-            basis: the source of the size of the error.
-            ahead: the steps that are repeated until the distance is driven.
-            left: the steps that are repeated until a whole turn is made.
-            only: the settings, without the errors of other causes.
-            counts: encoder counts per wheel turn; 0 if their resolution is not the cause.
-            scale: the relative standard deviation of the gyro's scale.
+        The steps `ahead` are repeated until the distance is driven, and the steps `left` until a
+        whole turn is made. `only` has the settings without the errors of other causes. `counts`
+        (encoder counts per wheel turn) and `scale` (relative standard deviation of the gyro's
+        scale) are 0 if they are not the cause.
         """
         if basis == "unknown":
             return Share(cause, None, None, basis)

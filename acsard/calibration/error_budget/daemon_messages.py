@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 
 from acsard.calibration.error_budget.budget import Budget, Received, budget
-from acsard.calibration.error_budget.drive_log import Line
+from acsard.calibration.error_budget.measured_errors import Line
 from acsard.client import Client, Subscription
 from acsard.client.follower import FIRST_S
 from acsard.client.synchronous import decoder
@@ -92,7 +92,7 @@ class Feed:
         self._config, self._first = config, first
         self._start_ns = first.stamp.to_ns()
         self._odom: dict[int, Odometry] = {}
-        self._lines: deque[tuple[int, Line]] = deque(maxlen=MOST)
+        self._lines: deque[Line] = deque(maxlen=MOST)
         self._sent: deque[int] = deque(maxlen=MOST)
         self._wheels: dict[int, JointState] = {}
         self._count = 0
@@ -110,11 +110,10 @@ class Feed:
 
     def received(self, last: RobotState, diagnostics: DiagnosticArray) -> Received:
         """Return the drive so far. `last` and `diagnostics` are the daemon's present values."""
-        lines, zero = [line for _, line in self._lines], self._start_ns
         learned, deviation, used = _learned(diagnostics)
         return Received(
-            lines,
-            [(at - zero) / NS_PER_S for at in self._sent],
+            list(self._lines),
+            [(at - self._start_ns) / NS_PER_S for at in self._sent],
             whole=self._whole(last),
             counted=self._config.mcu.wants_samples and _value(diagnostics, "check") == SAMPLED,
             gyro=last.gyro in ("used", "disagrees"),
@@ -124,10 +123,7 @@ class Feed:
         )
 
     def _join(self, stamp_ns: int) -> None:
-        """Combine the `odom` and the `wheel_states` message with this stamp to a feedback line.
-
-        If one of them has not arrived yet, do nothing.
-        """
+        """Combine the `odom` and the `wheel_states` message of this stamp, if both have arrived."""
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
         if odom is None or wheels is None:
             for waiting in (self._odom, self._wheels):
@@ -140,7 +136,7 @@ class Feed:
         e, f, g, h = wheels.position
         at = (stamp_ns - self._start_ns) / NS_PER_S
         yaw = 2 * math.atan2(q.z, q.w)
-        self._lines.append((stamp_ns, Line(at, (a, b, c, d), (e, f, g, h), yaw, covariance[35])))
+        self._lines.append(Line(at, (a, b, c, d), (e, f, g, h), yaw, covariance[35]))
         self._count += 1
 
     def _whole(self, last: RobotState) -> bool:

@@ -1,7 +1,8 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
 A method of calibration consists of questions to ask first and legs to drive in order. `methods.py`
-has the table of the methods, and `runner.py` leads a person through one of them.
+has the table of the methods, and `runner.py` leads a person through one of them. The command line
+and the page import this module to name the methods, so it does not load numpy.
 
 The robot stays within its limits and on a floor of 3 m x 3 m. How far it turns for a command is not
 known before the calibration: the plan must work for an effective track of 1 to 2.5 times the wheel
@@ -23,6 +24,23 @@ from msgspec import Struct
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.core.values import AcsardError
 from acsard.terminal.prompt import Ask
+
+NEEDS: dict[str, str] = {
+    "gyro": "a gyro on the key imu, and a tape measure",
+    "positions": "positions on a key",
+    "tape": "a tape measure and a straight line on the floor",
+    "wall": "a straight wall and a tape measure",
+    "umbmark": "a tape measure and marks",
+}
+"""Equipment by the name of the method, as `--method` takes it."""
+
+SIMULATED = (
+    "positions",
+    "On the simulator there is no floor to lay a tape on: use positions with sim/pose, the true "
+    "position, or gyro if [odometry] gyro is on, with its distance left empty. tape, wall and "
+    "umbmark are for a real robot.",
+)
+"""The method to use first on the simulator, and the reason."""
 
 
 class GuideError(AcsardError):
@@ -78,10 +96,7 @@ class Mean(Struct, frozen=True):
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn relative to a line or a wall.
-
-    The person measures the distances from the line to two points of the robot.
-    """
+    """A measurement of the robot's turn by the distances of two of its points from a line."""
 
     quantity: Quantity
     near: str
@@ -138,10 +153,7 @@ FASTEST_WHEEL = 0.5
 """Largest rolling speed of the wheels in a turn, m/s."""
 
 REACH = 0.75
-"""Distance from the robot's middle to its outermost point, in wheel separations.
-
-Half a wheel radius is added to it.
-"""
+"""Distance from the middle to the outermost point less half a wheel radius, in separations."""
 
 EDGE = 0.1
 """Margin between the robot and the edge of the floor, m."""
@@ -196,10 +208,7 @@ class Setup(Struct, frozen=True):
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
-        """Return a curve. `rate` is the turn rate without skidding, rad/s.
-
-        If `metres` is negative, the robot drives backwards.
-        """
+        """Return a curve at `rate`, rad/s without skidding; backwards if `metres` is negative."""
         straight = self.ahead(metres)
         return Move(straight.seconds, straight.linear, self.command(rate))
 

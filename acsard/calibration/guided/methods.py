@@ -23,7 +23,7 @@ from acsard.calibration.guided.drive_plan import (
     Setup,
     Slant,
 )  # fmt: skip
-from acsard.calibration.tape_distance import LEAST_M
+from acsard.calibration.multipliers import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
@@ -71,10 +71,7 @@ def _at_the_edge(setup: Setup) -> str:
 
 
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
-    """Return the leg in which the robot turns to the left until the person presses a key.
-
-    `until` ends the sentence that begins with "Press SPACE".
-    """
+    """Return the leg of a turn to the left that a key ends. `until` follows "Press SPACE"."""
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.drive.wheel_separation_multiplier
     words = f"The robot turns to the left on the spot. Press SPACE {until}"
@@ -375,10 +372,7 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve from the middle of the floor and the same curve backwards.
-
-    The curve stays on the floor whatever the robot's heading is.
-    """
+    """Return a curve there and back, which stays on the floor whatever the robot's heading is."""
     metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 

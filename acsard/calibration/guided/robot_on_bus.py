@@ -1,28 +1,36 @@
 """Connects a guided drive to the robot: sends the commands of a leg, and records the messages.
 
-`leg_driver.py` decides which command to send, and `leg_recorder.py` keeps the samples.
+`leg_driver.py` decides which command to send. `Recorder` keeps the samples of a leg in the form
+that a log has. Each sender stamps its messages with its own clock, or not at all, and the clocks
+need not agree. The stamps of one key give the intervals between its samples. The sample of a key
+with the smallest delay between stamp and arrival is taken to have arrived without delay. The fit
+finds the delays that remain.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import zenoh
+from msgspec import Struct
 
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
-from acsard.calibration.guided.leg_recorder import Recorder
-from acsard.calibration.runs import Run
+from acsard.calibration.log_table import Floats, Table
+from acsard.calibration.runs import Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_S
 from acsard.client.synchronous import Client
 from acsard.client.watch import Watch
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
-from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped
+from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time
 from acsard.core.messages.topics import by_key
+from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.terminal.prompt import Prompt
 
@@ -60,10 +68,7 @@ class Sensor:
         self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
 
     def receive(self, take: Take, now: float) -> int:
-        """Pass the messages that have arrived to `take`, and return their number.
-
-        Raises `GuideError` if a message cannot be decoded.
-        """
+        """Pass the messages to `take`, return their number. Raises `GuideError` for a bad one."""
         count = 0
         while (sample := self._samples.try_recv()) is not None:
             take(self._decoded(sample), now)
@@ -97,6 +102,69 @@ class Sensor:
             f"the messages on {self.key} cannot be read ({'; '.join(errors)}): do they have "
             "another type?"
         )
+
+
+STREAMS = {"wheels": ("left", "right"), "gyro": ("yaw_rate",), "places": ("x", "y")}
+"""Columns of the log by the source of their samples."""
+
+
+class Sample(Struct, frozen=True):
+    """The values of one message, with its time of arrival and its stamp."""
+
+    came: float
+    """Time of arrival by this computer's clock, s."""
+    made: float | None
+    """Stamp by the sender's clock, s; None if the message has no stamp."""
+    values: tuple[float, ...]
+    """Values in the order of `STREAMS`."""
+
+
+class Recorder:
+    """Collects the samples of one leg. `came` is a message's time of arrival, s."""
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._right = joints[0], joints[3]
+        self._left = joints[1], joints[2]
+        self.samples: dict[str, list[Sample]] = {name: [] for name in STREAMS}
+
+    def wheels(self, message: JointState, came: float) -> float:
+        """Add wheel speeds and return the speed of the fastest wheel, rad/s."""
+        speeds = dict(zip(message.name, message.velocity, strict=False))
+        left, right = (
+            (speeds[one] + speeds[other]) / 2 for one, other in (self._left, self._right)
+        )
+        self._add("wheels", message.header.stamp, came, (left, right))
+        return max(map(abs, speeds.values()))
+
+    def gyro(self, message: Imu, came: float) -> None:
+        """Add the turn rate of a gyro."""
+        self._add("gyro", message.header.stamp, came, (message.angular_velocity.z,))
+
+    def place(self, message: PoseStamped | Odometry, came: float) -> None:
+        """Add a position. Its heading, if it has one, is ignored."""
+        pose = message.pose if isinstance(message, PoseStamped) else message.pose.pose
+        spot = pose.position
+        self._add("places", message.header.stamp, came, (spot.x, spot.y))
+
+    def _add(self, stream: str, stamp: Time, came: float, values: tuple[float, ...]) -> None:
+        made = stamp.to_ns() / NS_PER_S if stamp.sec else None
+        self.samples[stream].append(Sample(came, made, values))
+
+    def run(self) -> Run:
+        """Return the leg as a run. Raises `LogError` if there are too few wheel samples."""
+        sensors: list[dict[str, Floats]] = []
+        for stream, names in STREAMS.items():
+            samples = self.samples[stream]
+            values = np.array([sample.values for sample in samples]).reshape(-1, len(names)).T
+            sensors.append({"t": times(samples)} | dict(zip(names, values, strict=True)))
+        return runs(Table.joined(sensors)).runs[0]
+
+
+def times(samples: Sequence[Sample]) -> Floats:
+    """Return the times by this computer's clock, s; those of arrival if a stamp is missing."""
+    came = np.array([sample.came for sample in samples])
+    made = np.array([math.nan if s.made is None else s.made for s in samples])
+    return came if not len(came) or np.isnan(made).any() else on_arrival_clock(came, made)
 
 
 class RobotOnBus:

@@ -6,14 +6,25 @@ from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 
-from acsard.calibration.guided.drive_plan import UNITS, DisturbedError, Leg, Setup, Slant
-from acsard.calibration.guided.equipment import NEEDS
+from acsard.calibration.guided.drive_plan import (
+    NEEDS,
+    UNITS,
+    DisturbedError,
+    Leg,
+    Setup,
+    Slant,
+)  # fmt: skip
 from acsard.calibration.guided.methods import METHODS, STRAIGHT
-from acsard.calibration.guided.tape_calibration import calibrated
-from acsard.calibration.guided.tape_readings import Answers, Reading, reading, track_ratio
+from acsard.calibration.guided.tape_readings import (
+    Answers,
+    Reading,
+    calibrated,
+    reading,
+    track_ratio,
+)  # fmt: skip
+from acsard.calibration.multipliers import LEAST_M, Tape
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import Calibration, calibrate
-from acsard.calibration.tape_distance import LEAST_M, Tape
 from acsard.terminal.prompt import Ask, Prompt
 
 MOST_REPEATS = 2
@@ -28,12 +39,8 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 
     A sensor measures each leg alone. Tape readings belong together from the leg for which a person
     sets the robot. A leg that is measured from the angle after the leg before it can begin again by
-    itself, if the person measures that angle anew.
-
-    Args:
-        legs: the legs of the method.
-        number: the index of the disturbed leg.
-        sensor: whether a sensor measures instead of a person.
+    itself, if the person measures that angle anew. `number` is the index of the disturbed leg, and
+    `sensor` says that a sensor measures instead of a person.
     """
     if sensor or angle_before(legs[number]):
         return number
@@ -51,14 +58,9 @@ def guide(
 ) -> Calibration:
     """Lead a person through a method of calibration, and return the result.
 
-    A leg that was disturbed is repeated, twice at most, after the person has set the robot back.
-
-    Args:
-        name: the name of the method, a key of `METHODS`.
-        setup: the robot and the speeds and lengths of its drive.
-        prompt: asks the person.
-        ride: drives one leg and returns its recording.
-        simulated: whether the robot is the built-in simulator.
+    `name` is a key of `METHODS`. `ride` drives one leg and returns its recording. A leg that was
+    disturbed is repeated, twice at most, after the person has set the robot back; on the built-in
+    simulator (`simulated`) more often.
 
     Raises:
         GuideError: the drive cannot continue.

@@ -1,4 +1,4 @@
-"""Computes wheel radii and effective track from tape readings.
+"""Computes a `Calibration` from tape readings: wheel radii, effective track and improvement.
 
 A reading is one measurement of the robot's motion since a person last placed it: a distance, a
 turn, or a displacement. The fit is a Gauss-Newton fit to all readings. `calibration/positions.py`
@@ -11,34 +11,43 @@ skidding on the way. If there are enough readings, their scatter shows how much 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.evidence import (
+from acsard.calibration import heading
+from acsard.calibration.fit import (
     COUNT,
     INVERSE_TRACK,
     LEFT,
     RIGHT,
     TRACK_GROWTH,
+    USUAL,
     Base,
     condition,
-)
-from acsard.calibration.fit import USUAL
+    student_factor,
+)  # fmt: skip
 from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Mean, Measure, Quantity
-from acsard.calibration.log_table import Floats
-from acsard.calibration.plausibility import RefusedError, in_range
-from acsard.calibration.positions import WheelSteps, path, wheel_steps
-from acsard.calibration.runs import Run
-from acsard.calibration.wheel_angles import angles_of
+from acsard.calibration.heading import Rates, rates
+from acsard.calibration.improvement import (
+    NOTHING,
+    Improvement,
+    per_amount,
+    rms,
+    with_constant_track,
+)
+from acsard.calibration.log_table import Floats, RefusedError
+from acsard.calibration.multipliers import configured, multipliers
+from acsard.calibration.plausibility import in_range, remarks, unsure
+from acsard.calibration.positions import WheelSteps, extent, path, wheel_steps
+from acsard.calibration.runs import Run, blocks
+from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig
 
 SKIDDING = 0.015
-"""Standard deviation of the heading by skidding after 1 m of rolling, rad.
-
-It grows with the square root of the distance.
-"""
+"""Standard deviation of the heading by skidding, rad for each square root of a metre of rolling."""
 
 SKIDDING_LENGTH = 0.002
 """Standard deviation of a distance by skidding, as a fraction of the distance."""
@@ -48,9 +57,6 @@ UNKNOWN = 1.0
 
 PRIOR_FREE = 4.0
 """Weight of the assumed skidding (`SKIDDING`, `SKIDDING_LENGTH`), as a number of readings."""
-
-LEAST_FREE = 3.0
-"""Smallest degrees of freedom for Student's t, whose standard deviation is infinite at 2."""
 
 MOST_STEPS = 50
 SMALL = 1e-9
@@ -66,7 +72,7 @@ PRECISE = 0.2
 """Largest standard deviation of a turn that the fit may start from, as a fraction of the turn."""
 
 
-class Reading(Struct, frozen=True):
+class Reading(Struct, frozen=True, dict=True):
     """A measurement of the motion over one or more rides, in rad or m."""
 
     rides: tuple[Run, ...]
@@ -75,6 +81,16 @@ class Reading(Struct, frozen=True):
     value: float
     deviation: float
     """Standard deviation of the measurement by tape or eye."""
+
+    @cached_property
+    def steps(self) -> WheelSteps:
+        """The wheel steps of all rides, as if they were one ride."""
+        return joined(self.rides)
+
+    def residual(self, prediction: float) -> float:
+        """Return the measured minus the predicted value."""
+        off = self.value - prediction
+        return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
 
 class Predicted(Struct, frozen=True):
@@ -100,7 +116,7 @@ class TapeFit(Struct, frozen=True):
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
     """Return the wheel steps of several rides as if they were one ride."""
-    parts = [wheel_steps(ride, angles_of(ride)) for ride in rides]
+    parts = [wheel_steps(ride) for ride in rides]
     ends = np.cumsum([0.0] + [float(part.t[-1]) for part in parts])
     later = [part.t[1:] + end for part, end in zip(parts, ends, strict=False)]
     t = np.concatenate([parts[0].t[:1], *later])
@@ -126,43 +142,39 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
     if quantity != "distance":
         # A heading error on the way displaces the end by the error times the distance that is still
         # to go. The mean square of this distance is a third of the span squared.
-        span = float(np.ptp(driven.place.real) + np.ptp(driven.place.imag))
+        span = extent(driven.place)
         variance += heading_variance * span**2 / 3
     return Predicted(float((np.conj(along) * place).real), derivatives, variance)
 
 
 def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     """Fit the parameters to the readings. Raises `RefusedError` if they contradict each other."""
-    steps = [joined(reading.rides) for reading in readings]
-    start = _starting_parameters(readings, steps, base)
-    parameters, normal = _solved(readings, steps, base, start)
+    parameters, normal = _solved(readings, base, _starting_parameters(readings, base))
     in_range(np.array([1 / parameters[INVERSE_TRACK], parameters[LEFT], parameters[RIGHT]]))
-    residuals, weights = _residuals(readings, steps, base, parameters)
+    compared = [(found, weight) for _, found, weight in _compared(readings, base, parameters)]
+    residuals, weights = np.array(compared).T
     # Combine the scatter of these readings with the assumed noise. If there are few readings, the
     # scatter is uncertain itself, so widen the deviation to that of Student's t.
     free = PRIOR_FREE + max(0.0, len(readings) - len(ACTIVE) + 1.0)
     scale = (PRIOR_FREE + float(weights @ residuals**2)) / free
-    free = max(LEAST_FREE, free)
     covariance = np.zeros((COUNT, COUNT))
     inner = np.linalg.inv(normal[np.ix_(ACTIVE, ACTIVE)])
-    covariance[np.ix_(ACTIVE, ACTIVE)] = inner * max(1.0, scale) * free / (free - 2)
+    covariance[np.ix_(ACTIVE, ACTIVE)] = inner * max(1.0, scale) * student_factor(free)
     held_out = np.array(
-        [_held_out_residual(n, readings, steps, base, parameters) for n in range(len(readings))]
+        [_held_out_residual(n, readings, base, parameters) for n in range(len(readings))]
     )
     return TapeFit(parameters, covariance, residuals, held_out)
 
 
-def _starting_parameters(
-    readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base
-) -> Floats:
+def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
     """Return starting parameters that agree with the first `turned` reading.
 
     They are near enough to the truth to find the number of whole turns of each `angle` reading.
     """
     start = base.start()
-    for reading, steps_ in zip(readings, steps, strict=True):
+    for reading in readings:
         if reading.quantity == "turned" and reading.deviation < PRECISE * abs(reading.value):
-            by_wheels = predicted(steps_, "turned", base, start).value
+            by_wheels = predicted(reading.steps, "turned", base, start).value
             if not 0.1 < by_wheels / reading.value < 10.0:
                 raise RefusedError(
                     f"the wheels report {math.degrees(by_wheels):.0f} deg, but you measured "
@@ -174,9 +186,17 @@ def _starting_parameters(
     return start
 
 
-def _solved(
-    readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base, start: Floats
-) -> tuple[Floats, Floats]:
+def _compared(
+    readings: Sequence[Reading], base: Base, parameters: Floats
+) -> Iterator[tuple[Predicted, float, float]]:
+    """Yield the prediction, the residual and the weight of each reading."""
+    for reading in readings:
+        prediction = predicted(reading.steps, reading.quantity, base, parameters)
+        weight = 1 / (reading.deviation**2 + prediction.variance)
+        yield prediction, reading.residual(prediction.value), weight
+
+
+def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
     """Return the parameters and the normal equations.
 
     Raises `RefusedError` if the readings do not determine the parameters.
@@ -184,11 +204,9 @@ def _solved(
     parameters, configured = start.copy(), base.start()
     for _ in range(MOST_STEPS):
         normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
-        for reading, steps_ in zip(readings, steps, strict=True):
-            prediction = predicted(steps_, reading.quantity, base, parameters)
-            weight = 1 / (reading.deviation**2 + prediction.variance)
+        for prediction, residual, weight in _compared(readings, base, parameters):
             normal += weight * np.outer(prediction.derivatives, prediction.derivatives)
-            score += weight * prediction.derivatives * _residual(reading, prediction.value)
+            score += weight * prediction.derivatives * residual
         normal[TRACK_GROWTH, TRACK_GROWTH] += USUAL[TRACK_GROWTH] ** -2
         score[TRACK_GROWTH] -= parameters[TRACK_GROWTH] * USUAL[TRACK_GROWTH] ** -2
         both = np.zeros(COUNT)
@@ -211,57 +229,30 @@ def _solved(
     )
 
 
-def _residual(reading: Reading, prediction: float) -> float:
-    off = reading.value - prediction
-    return math.remainder(off, 2 * math.pi) if reading.quantity == "angle" else off
-
-
-def _residuals(
-    readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base, parameters: Floats
-) -> tuple[Floats, Floats]:
-    """Return the residual and the weight of each reading."""
-    residuals, weights = [], []
-    for reading, steps_ in zip(readings, steps, strict=True):
-        prediction = predicted(steps_, reading.quantity, base, parameters)
-        residuals.append(_residual(reading, prediction.value))
-        weights.append(1 / (reading.deviation**2 + prediction.variance))
-    return np.array(residuals), np.array(weights)
-
-
 def _held_out_residual(
-    number: int, readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base, start: Floats
+    number: int, readings: Sequence[Reading], base: Base, start: Floats
 ) -> float:
     """Return the residual of one reading in the fit to all others, or NaN if that fit fails."""
-    kept = [n for n in range(len(readings)) if n != number]
     try:
-        parameters, _ = _solved([readings[n] for n in kept], [steps[n] for n in kept], base, start)
+        parameters, _ = _solved([*readings[:number], *readings[number + 1 :]], base, start)
     except RefusedError:
         return math.nan
-    prediction = predicted(steps[number], readings[number].quantity, base, parameters)
-    return _residual(readings[number], prediction.value)
+    ((_, residual, _),) = _compared([readings[number]], base, parameters)
+    return residual
 
 
 READ_M = 0.002
-"""Standard deviation of a measured distance of a few decimetres, m.
-
-The standard deviation with which a person places the robot on a line is the same.
-"""
+"""Standard deviation of a measured distance, and of a robot placed on a line by hand, m."""
 
 CREDIBLE = 0.85, 3.0
 """Credible ratios of effective track to wheel separation. Outside them, a reading must be wrong."""
 
 Answers = dict[tuple[str, str], float]
-"""The person's answers in m and rad, keyed by the names of leg and question.
-
-The name of the leg is "" for questions that were asked before the first leg.
-"""
+"""The answers in m and rad by leg and question. The leg is "" before the first leg."""
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
-    """Return the reading that the answers after a leg give.
-
-    Raises `RefusedError` if the answers are impossible.
-    """
+    """Return the reading that the answers give. Raises `RefusedError` if they are impossible."""
     driven = tuple(rides[name] for name in measure.over or (leg,))
     if isinstance(measure, Mean):
         numbers = [answers[leg, name] for name in measure.answers]
@@ -285,7 +276,7 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
-    by_wheels = predicted(joined(reading.rides), "turned", base, base.start()).value
+    by_wheels = predicted(reading.steps, "turned", base, base.start()).value
     track = by_wheels / reading.value
     least, most = CREDIBLE
     if not least < track < most:
@@ -300,12 +291,9 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
 def slant(near: float, far: float, apart: float) -> float:
     """Return the angle in rad between the robot and a line, positive after a turn to the left.
 
-    Args:
-        near: the distance from the line to the point that a turn to the left moves towards it, m.
-        far: the distance from the line to the point that a turn to the left moves away from it, m.
-        apart: the distance between both points, m.
-
-    Raises `RefusedError` if the distances are impossible.
+    `near` and `far` are the distances, m, from the line to two points of the robot, `apart` m from
+    each other. A turn to the left moves the near one towards the line. Raises `RefusedError` if the
+    distances are impossible.
     """
     sine = (far - near) / apart
     if abs(sine) > 0.98:
@@ -314,3 +302,74 @@ def slant(near: float, far: float, apart: float) -> float:
             f"{far * 1000:.0f} mm from the line: measure again from the start"
         )
     return math.asin(sine)
+
+
+WORST = 0.1, 0.02
+"""Largest useful standard deviations, as fractions: of the track, and of the ratio of radii."""
+
+ADVICE = (
+    "they contradict each other, or the robot skids much. Start again on even ground, place the "
+    "robot exactly, and measure to the millimetre"
+)
+
+TURNED, STRAIGHT = np.pi, 0.5
+"""A drive that turned by more than `TURNED` rad is a turn, by less than `STRAIGHT` rad a straight.
+
+The heading error of a drive in between belongs to neither.
+"""
+
+
+def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Calibration:
+    """Return the calibration by the readings of `tool`, in words. Raises `RefusedError`."""
+    base = Base.of(drive)
+    rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
+    fit = fit_readings(readings, base)
+    # No gyro is compared, so the blocks only have to be short enough to show the turn rates.
+    rows = heading.rows(None, rides, blocks(rides, 4.0))
+    by_wheels = heading.turned(rows, base, fit.parameters)
+    rate = rates(rows, by_wheels)
+    result = multipliers(fit.parameters, fit.covariance, rate)
+    inverse_track, std = fit.parameters[INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
+    chance = float(std[INVERSE_TRACK] / abs(inverse_track))
+    for name, deviation in unsure(result, chance, WORST).items():
+        raise RefusedError(
+            f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
+            f"{ADVICE}"
+        )
+    drives = Drives.of(rides, rows, by_wheels, base, result, rate)
+    notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
+    return Calibration(
+        reference=tool, drives=drives, configured=configured(base), multipliers=result,
+        scale="distance", growth=float(fit.parameters[TRACK_GROWTH]),
+        growth_std=float(std[TRACK_GROWTH]), improvement=_improvement(readings, base, fit, rate),
+        delays={}, gyro_bias=0.0, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
+    """Return the errors before and after. An error after is that of a fit without its reading."""
+    sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
+    present = fit.parameters.copy()
+    present[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
+    constant = with_constant_track(fit.parameters, rate)
+    for number, reading in enumerate(readings):
+        steps = reading.steps
+        fitted = predicted(steps, reading.quantity, base, fit.parameters).value
+        truth = fitted + fit.residuals[number]
+        before = truth - predicted(steps, reading.quantity, base, present).value
+        residual = fit.residuals[number] if np.isnan(fit.held_out[number]) else fit.held_out[number]
+        # The robot uses one track for all turn rates, unlike the fit.
+        after = residual - (predicted(steps, reading.quantity, base, constant).value - fitted)
+        turn = abs(predicted(steps, "turned", base, fit.parameters).value)
+        if reading.quantity in ("turned", "angle"):
+            if turn > TURNED:
+                sums["turn"] += abs(before), abs(after), turn
+            elif turn < STRAIGHT:
+                rolled = abs(predicted(steps, "distance", base, fit.parameters).value)
+                sums["straight"] += abs(before), abs(after), rolled
+        elif reading.quantity in ("ahead", "aside"):
+            sums["place"] += before**2, after**2, 1.0
+    return Improvement(
+        per_amount(sums["turn"], 360.0), per_amount(sums["straight"], math.degrees(10.0)),
+        NOTHING, rms(sums["place"]),
+    )  # fmt: skip

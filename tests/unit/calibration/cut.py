@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from msgspec import structs
 
-from acsard.calibration import prepared, solve, wheel_angles
 from acsard.calibration import runs as reading
-from acsard.calibration.evidence import Base
+from acsard.calibration import solve
+from acsard.calibration.fit import Base
 from acsard.calibration.heading import of_gyro
 from acsard.calibration.log_table import Table, bounded, read
-from acsard.calibration.prepared import Prepared
-from acsard.calibration.tape_distance import Tape
+from acsard.calibration.multipliers import Tape
+from acsard.calibration.solve import Prepared, prepared
 from acsard.core.config.settings import DriveConfig
 from tests.unit.calibration.robots import GUIDED, Drive, Plan, Robot, drive
 
@@ -40,22 +40,19 @@ def table(seen: Drive, *, gyro: bool = True, places: bool = True) -> Table:
 
     `test_a_table_is_that_of_the_written_log` compares both.
     """
-    counts = len(seen.t), len(seen.gyro_t) * gyro, len(seen.place_t) * places
-    ends = np.cumsum([0, *counts])
-    cells = np.full((6, ends[-1]), np.nan)
-    sensors = (
-        (seen.t, {1: seen.left, 2: seen.right}, 2),
-        (seen.gyro_t, {3: seen.gyro}, 6),
-        (seen.place_t, {4: seen.place.real, 5: seen.place.imag}, 4),
+    sensors = [
+        (seen.t, {"left": seen.left, "right": seen.right}, 2, True),
+        (seen.gyro_t, {"yaw_rate": seen.gyro}, 6, gyro),
+        (seen.place_t, {"x": seen.place.real, "y": seen.place.imag}, 4, places),
+    ]
+    made = Table.joined(
+        [
+            {"t": np.round(t[: len(t) * used], 6)}
+            | {name: np.round(sensed[: len(t) * used], decimals) for name, sensed in values.items()}
+            for t, values, decimals, used in sensors
+        ]
     )
-    for begin, count, (times, values, decimals) in zip(ends, counts, sensors, strict=False):
-        rows = slice(begin, begin + count)
-        cells[0, rows] = np.round(times[:count], 6)
-        for column, sensed in values.items():
-            cells[column, rows] = np.round(sensed[:count], decimals)
-    cells = cells[:, np.argsort(cells[0], kind="stable")]
-    columns = dict(zip(("t", "left", "right", "yaw_rate", "x", "y"), cells, strict=True))
-    return Table(columns, np.zeros(ends[-1], np.int64), ("",), tuple(bounded(columns)))
+    return structs.replace(made, notes=tuple(bounded(made.columns)))
 
 
 def log_of(log: str | Table) -> reading.Log:
@@ -72,8 +69,7 @@ def log_of_runs(drives: Iterable[Drive], *, gyro: bool = True, places: bool = Tr
 
 def ready(log: str | Table) -> Prepared:
     runs = log_of(log).runs
-    angles = [wheel_angles.angles_of(run) for run in runs]
-    return prepared.prepared(runs, angles, of_gyro(runs, angles), BASE, 4.0)
+    return prepared(runs, of_gyro(runs), BASE, 4.0)
 
 
 def calibrated(log: str | Table | reading.Log, tape: Tape | None = None) -> solve.Calibration:

@@ -1,21 +1,24 @@
-"""Tests of Gauss-Newton and the jackknife with a known answer, and of the settings of a fit."""
+"""Tests of Gauss-Newton and the jackknife with a known answer, of evidence and of multipliers."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from acsard.calibration.evidence import COUNT, INVERSE_TRACK, LEFT, RIGHT, Base, of_rows
 from acsard.calibration.fit import (
+    COUNT,
+    INVERSE_TRACK,
+    LEFT,
+    RIGHT,
     USUAL,
+    Base,
     Fit,
-    Multipliers,
-    Rates,
-    configured,
     fit,
-    multipliers,
-    rates,
-)
+    huber,
+    of_rows,
+)  # fmt: skip
+from acsard.calibration.heading import Rates, rates
+from acsard.calibration.multipliers import Multipliers, configured, multipliers
 from tests.unit.calibration.cut import BASE, ideal, ready, table
 
 START = np.array([1.0, 1.0, 1.0, *[0.0] * (COUNT - 3)])
@@ -132,3 +135,20 @@ def test_radii_that_are_the_least_known_are_no_scale_and_no_track() -> None:
     own, scale = Multipliers(values, shares * np.outer(values, values)).own()
     assert scale == pytest.approx(0.0, abs=1e-9)
     assert own / values == pytest.approx([0.01, 0.03, 0.03])
+
+
+def test_blocks_add_up_to_the_normal_equations_of_all_rows() -> None:
+    rng = np.random.default_rng(1)
+    jacobian, residual = rng.normal(size=(50, COUNT)), rng.normal(size=50)
+    weight, block = rng.uniform(size=50), rng.integers(0, 6, 50)
+    made = of_rows(jacobian, residual, weight, block, 7)
+    assert np.allclose(made.normal.sum(axis=0), jacobian.T @ np.diag(weight) @ jacobian)
+    assert np.allclose(made.score.sum(axis=0), jacobian.T @ (weight * residual))
+    assert made.squares.sum() == pytest.approx(float(weight @ residual**2))
+    assert made.counts[6] == 0
+
+
+def test_only_what_is_far_off_counts_less() -> None:
+    weights = huber(np.array([0.1, -0.5, 1.0, -20.0]), 1.0)
+    assert weights[:3].tolist() == [1.0, 1.0, 1.0]
+    assert weights[3] < 0.2

@@ -8,28 +8,27 @@ import numpy as np
 import pytest
 
 from acsard.calibration import heading
-from acsard.calibration.evidence import COUNT, DELAY, SENSOR_X, SENSOR_Y, huber
+from acsard.calibration.fit import COUNT, DELAY, SENSOR_X, SENSOR_Y, huber
 from acsard.calibration.heading import of_gyro, of_yaw, rows
 from acsard.calibration.log_table import LogError
-from acsard.calibration.wheel_angles import angles_of, blocks
+from acsard.calibration.runs import blocks
 from tests.unit.calibration.cut import BASE, ideal, log_of, ready, table, usual
 from tests.unit.calibration.robots import GUIDED, Drive, wander
 
 
 def headings_of(drive: Drive):  # type: ignore[no-untyped-def]
     runs = log_of(table(drive, places=False)).runs
-    angles = [angles_of(run) for run in runs]
-    return runs, angles, of_gyro(runs, angles)
+    return runs, of_gyro(runs)
 
 
 def test_the_bias_is_found_at_rest() -> None:
-    assert headings_of(usual())[2].bias == pytest.approx(0.01, abs=0.001)
+    assert headings_of(usual())[1].bias == pytest.approx(0.01, abs=0.001)
 
 
 def test_a_gyro_of_few_digits_tells_its_bias_between_them() -> None:
     drive = usual()
     coarse = replace(drive, gyro=np.round(drive.gyro - 0.006, 2))
-    assert headings_of(coarse)[2].bias == pytest.approx(0.004, abs=0.001)
+    assert headings_of(coarse)[1].bias == pytest.approx(0.004, abs=0.001)
 
 
 def test_a_slow_gyro_with_a_spike_in_a_short_rest_has_a_bias() -> None:
@@ -38,7 +37,7 @@ def test_a_slow_gyro_with_a_spike_in_a_short_rest_has_a_bias() -> None:
     slow = replace(drive, gyro=drive.gyro[::every].copy(), gyro_t=drive.gyro_t[::every])
     in_rest = int(np.searchsorted(slow.gyro_t, 12.0))
     slow.gyro[in_rest] += 0.02
-    headings = headings_of(slow)[2]
+    headings = headings_of(slow)[1]
     assert headings.bias == pytest.approx(0.01, abs=0.01)
     assert 0.0 < headings.bias_std < 0.1
 
@@ -52,7 +51,7 @@ def test_how_sure_the_bias_is_covers_the_truth(noise: float, walk: float) -> Non
         step = np.median(np.diff(drive.gyro_t))
         walked = np.cumsum(rng.normal(0, walk * np.sqrt(step), len(drive.gyro_t)))
         noisy = drive.gyro + walked + rng.normal(0, noise, len(walked))
-        _, _, headings = headings_of(replace(drive, gyro=noisy))
+        _, headings = headings_of(replace(drive, gyro=noisy))
         heading = headings.of[0]
         turned = np.interp(heading.t - 0.02, drive.t, drive.yaw)
         off = (heading.angle - turned)[[0, -1]] @ [-1, 1] / np.ptp(heading.t)
@@ -62,19 +61,19 @@ def test_how_sure_the_bias_is_covers_the_truth(noise: float, walk: float) -> Non
 
 def test_without_a_rest_the_bias_is_left_to_the_fit() -> None:
     moving = [part for part in GUIDED if part[1] or part[2]]
-    assert headings_of(usual(plan=moving))[2].bias_unknown
+    assert headings_of(usual(plan=moving))[1].bias_unknown
 
 
 @pytest.mark.parametrize("late", [-0.7, 0.0, 0.05, 1.2])
 def test_the_time_offset_is_found(late: float) -> None:
     drive = usual()
     shifted = replace(drive, gyro_t=drive.gyro_t + late)
-    assert headings_of(shifted)[2].delay == pytest.approx(late + 0.02, abs=0.005)
+    assert headings_of(shifted)[1].delay == pytest.approx(late + 0.02, abs=0.005)
 
 
 def test_a_reversed_side_does_not_hide_the_time_offset() -> None:
     drive = usual()
-    assert headings_of(replace(drive, left=-drive.left))[2].delay == pytest.approx(0.02, abs=0.02)
+    assert headings_of(replace(drive, left=-drive.left))[1].delay == pytest.approx(0.02, abs=0.02)
 
 
 def test_a_gyro_that_says_the_same_always_is_refused() -> None:
@@ -85,18 +84,16 @@ def test_a_gyro_that_says_the_same_always_is_refused() -> None:
 
 def test_rows_say_what_was_turned() -> None:
     drive = usual()
-    runs, angles, headings = headings_of(drive)
-    found = rows(headings, runs, angles, blocks(runs, angles, 4.0))
+    runs, headings = headings_of(drive)
+    found = rows(headings, runs, blocks(runs, 4.0))
     assert np.abs(found.turned).sum() == pytest.approx(np.abs(np.diff(drive.yaw)).sum(), rel=0.03)
 
 
 def test_no_row_spans_a_gap_of_the_gyro() -> None:
     drive = usual()
     kept = (drive.gyro_t < 30) | (drive.gyro_t > 40)
-    runs, angles, headings = headings_of(
-        replace(drive, gyro_t=drive.gyro_t[kept], gyro=drive.gyro[kept])
-    )
-    found = rows(headings, runs, angles, blocks(runs, angles, 4.0))
+    runs, headings = headings_of(replace(drive, gyro_t=drive.gyro_t[kept], gyro=drive.gyro[kept]))
+    found = rows(headings, runs, blocks(runs, 4.0))
     assert 61 <= found.seconds.sum() <= 74
 
 
@@ -109,7 +106,7 @@ def test_degrees_are_distinguished_from_radians(wrapped: bool) -> None:
              for t, a, b, w in zip(drive.t, drive.left, drive.right, yaw, strict=True)]  # fmt: skip
     runs = log_of("t,left,right,yaw\n" + "\n".join(lines)).runs
     with pytest.raises(LogError, match="degrees"):
-        of_yaw(runs, [angles_of(run) for run in runs], 0.05 / 0.3)
+        of_yaw(runs, 0.05 / 0.3)
 
 
 AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (COUNT - 4)])

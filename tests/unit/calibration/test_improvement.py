@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.fit import Rates, fit
+from acsard.calibration.fit import fit
+from acsard.calibration.heading import Rates
 from acsard.calibration.improvement import (
     UNMEASURED,
     Fold,
@@ -18,7 +19,7 @@ from acsard.calibration.improvement import (
     positions_of,
     with_constant_track,
 )
-from acsard.calibration.wheel_angles import Block, angles_of
+from acsard.calibration.runs import Block
 from tests.unit.calibration.cut import BASE, ideal, log_of, ready, table
 from tests.unit.calibration.robots import GUIDED, Drive
 
@@ -31,8 +32,7 @@ def held(seen: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
     made, runs = ready(log), log_of(log).runs
     fitted = fit(made.sources, made.start, places=places)
     found = folds(fitted, made.parts, drives(runs), RATE)
-    angles = [angles_of(run) for run in runs]
-    segments = [positions_of(fold.drive, runs, angles) for fold in found]
+    segments = [positions_of(fold.drive, runs) for fold in found]
     return found, improvement(found, BASE.start(), BASE, made.rows, segments, made.steps)
 
 
@@ -51,7 +51,7 @@ def test_positions_of_a_drive_are_cut_at_gaps_of_the_wheels() -> None:
     run = log_of(table(ideal())).runs[0]
     kept = (run.t < 20.0) | (run.t > 40.0)
     torn = replace(run, t=run.t[kept], left=run.left[kept], right=run.right[kept])
-    begin, end = positions_of(drives([torn] * 3)[0], [torn], [angles_of(torn)])
+    begin, end = positions_of(drives([torn] * 3)[0], [torn])
     assert begin.t[-1] < 20.0 < 40.0 < end.t[0]
 
 

@@ -1,4 +1,4 @@
-"""Tests of paths, their derivatives, and their alignment with positions."""
+"""Tests of paths, their alignment with positions, and the search for a start of the fit."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from acsard.calibration import positions
-from acsard.calibration.evidence import COUNT
-from acsard.calibration.wheel_angles import Block, angles_of
+from acsard.calibration.fit import COUNT, DELAY, INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.positions import StartingPoint, search, segments
+from acsard.calibration.runs import Block, blocks
 from tests.unit.calibration.cut import BASE, ideal, log_of, table, usual
-from tests.unit.calibration.robots import Drive
+from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 TRUE = np.array([0.998, 1.002, 1 / 1.6, 0.0, 0.0, 0.0, 0.0])
 OFF = np.array([1.05, 0.95, 0.7, 0.0, 0.03, 0.1, -0.05, 0.0, 0.0])
@@ -19,26 +20,25 @@ OFF = np.array([1.05, 0.95, 0.7, 0.0, 0.03, 0.1, -0.05, 0.0, 0.0])
 
 def of(drive: Drive):  # type: ignore[no-untyped-def]
     runs = log_of(table(drive, gyro=False)).runs
-    angles = [angles_of(run) for run in runs]
     parts = [Block(0, float(b), float(b) + 8) for b in np.arange(3, 75, 8)]
-    return runs, angles, positions.segments(runs, angles, parts)
+    return runs[0], positions.segments(runs, parts)
 
 
 def test_the_true_parameters_leave_nothing() -> None:
-    runs, angles, segments = of(ideal())
-    paths = [positions.path(positions.wheel_steps(runs[0], angles[0]), BASE, TRUE)]
+    run, segments = of(ideal())
+    paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
     assert positions.spread(segments, paths, TRUE) < 0.001
 
 
 def test_a_path_without_slopes_is_the_same_path() -> None:
-    runs, angles, _ = of(ideal())
-    steps = positions.wheel_steps(runs[0], angles[0])
+    run, _ = of(ideal())
+    steps = positions.wheel_steps(run)
     assert np.allclose(positions.place(steps, BASE, TRUE), positions.path(steps, BASE, TRUE).place)
 
 
 def test_slopes_are_those_of_where_the_sensor_is() -> None:
-    runs, angles, _ = of(ideal())
-    steps, t = positions.wheel_steps(runs[0], angles[0]), np.arange(5.0, 20.0, 0.7)
+    run, _ = of(ideal())
+    steps, t = positions.wheel_steps(run), np.arange(5.0, 20.0, 0.7)
     place, derivatives = positions.path(steps, BASE, OFF).at(t, OFF)
     for index in range(COUNT):
         more = OFF.copy()
@@ -51,24 +51,78 @@ def test_slopes_are_those_of_where_the_sensor_is() -> None:
 def test_a_jump_of_the_source_costs_no_more_than_its_block_s_alignment() -> None:
     drive = ideal()
     moved = drive.place + np.where(drive.place_t > 40, 30 - 20j, 0)
-    runs, angles, segments = of(replace(drive, place=moved))
-    assert len(positions.jumps(runs[0], angles[0])) == 1
-    paths = [positions.path(positions.wheel_steps(runs[0], angles[0]), BASE, TRUE)]
+    run, segments = of(replace(drive, place=moved))
+    assert len(positions.jumps(run)) == 1
+    paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
     assert positions.spread(segments, paths, TRUE) < 0.001
 
 
 def test_outliers_are_taken_out() -> None:
-    runs, angles, segments = of(usual())
-    assert len(positions.jumps(runs[0], angles[0])) >= 4
-    paths = [positions.path(positions.wheel_steps(runs[0], angles[0]), BASE, TRUE)]
+    run, segments = of(usual())
+    assert len(positions.jumps(run)) >= 4
+    paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
     assert positions.spread(segments, paths, TRUE) < 0.05
 
 
 def test_evidence_leads_to_the_truth() -> None:
-    runs, angles, segments = of(ideal())
+    run, segments = of(ideal())
     near = TRUE + np.array([0.002, -0.001, 0.002, 0, 0, 0, 0])
     made = positions.evidence(
-        segments, [positions.path(positions.wheel_steps(runs[0], angles[0]), BASE, near)], near, 9
+        segments, [positions.path(positions.wheel_steps(run), BASE, near)], near, 9
     )
     step = np.linalg.lstsq(made.normal.sum(axis=0)[:3, :3], made.score.sum(axis=0)[:3], rcond=None)
     assert near[:3] + step[0] == pytest.approx(TRUE[:3], abs=3e-4)
+
+
+def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> StartingPoint:
+    runs = log_of(table(seen, gyro=False)).runs
+    return search(segments(runs, blocks(runs, 8.0)), runs, base, sides)
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("separation", [0.15, 0.3, 0.9])
+@pytest.mark.parametrize("radius", [0.02, 0.05, 0.2])
+def test_it_begins_near_the_truth(separation: float, radius: float) -> None:
+    found = begun(usual(), Base(radius, separation, 1.0, 1.0, 1.0))
+    assert found.unexplained < 0.05
+    assert found.parameters[LEFT] == pytest.approx(0.05 / radius, rel=0.1)
+    assert found.parameters[INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
+
+
+def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
+    seen = usual()
+    left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())
+    found = begun(left).parameters
+    one = np.sign(found[[LEFT, RIGHT]] * found[INVERSE_TRACK])
+    assert one.tolist() == [-1.0, 1.0]
+    assert begun(mirrored).parameters[INVERSE_TRACK] < 0
+
+
+def test_late_positions_are_found() -> None:
+    seen = usual()
+    late = replace(seen, place_t=seen.place_t + 0.9)
+    assert begun(late).parameters[DELAY] == pytest.approx(0.9, abs=0.15)
+
+
+def squares(chi: float) -> Plan:
+    """Return a plan of squares to both sides.
+
+    The turns in place are 90 deg for a robot with this track ratio.
+    """
+    side = [(5, 0.4, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * chi / 4), (0.5, 0, 0)]
+    return [(3, 0, 0), *side * 8, *[(seconds, v, -w) for seconds, v, w in side * 8]]
+
+
+@pytest.mark.variations(2)
+@pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
+@pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
+def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: complex) -> None:
+    """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
+    robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
+    seen = drive(robot, squares(chi))
+    assert begun(seen).parameters[INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
+    mirrored = replace(seen, place=seen.place.conj())
+    sides = np.array([1.0, 1.0]) / chi
+    assert begun(mirrored, sides=-sides).parameters[INVERSE_TRACK] == pytest.approx(
+        -1 / chi, rel=0.05
+    )

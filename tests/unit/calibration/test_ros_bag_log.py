@@ -12,7 +12,6 @@ from acsard.calibration.log_table import LogError, Table
 from acsard.calibration.ros_bag_log import Choice, RosMessage, speeds_of, table, wheel_of
 from acsard.calibration.runs import runs
 from acsard.calibration.solve import Calibration, calibrate
-from acsard.calibration.wheel_angles import angles_of
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from tests.each import each
 from tests.unit.calibration.bags import (
@@ -95,7 +94,7 @@ def test_the_columns_follow_the_joints(names: tuple[str, ...], columns: set[str]
     bag = of(joint_states(SHORT, names=names), imu(SHORT))
     assert set(bag.columns) == {"t", "yaw_rate", *columns}
     found = runs(bag).runs[0]
-    angle = angles_of(found).right[-1]
+    angle = found.rolled[1][-1]
     assert angle == pytest.approx(SHORT.right.sum() * 0.01, abs=0.2)
 
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from acsard.calibration.calibration_report import keys
-from acsard.calibration.plausibility import RefusedError
-from acsard.calibration.prepared import RATIO, TRACK
+from acsard.calibration.log_table import RefusedError
+from acsard.calibration.multipliers import Tape
+from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.solve import Calibration, calibrate
-from acsard.calibration.tape_distance import Tape
 from acsard.core.config.settings import DriveConfig
 from tests.unit.calibration.cut import calibrated, log_of_runs, table, usual
 from tests.unit.calibration.robots import (

@@ -130,3 +130,5 @@ def test_where_lines_are_lost_no_counts_are_proposed_but_those_that_are_configur
         # a count that the board states itself needs no measurement
         board.identity = {"counts": "3200"}
         assert encoder_counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}
+        board.lost = 2 * line_loss.MOST
+        assert encoder_counts.finding(board, [0]).keys == {}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup import dialect, encoder_counts, line_loss
+from acsard.checkup import dialect, line_loss
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.core.config.settings import Config, SimConfig
@@ -97,17 +97,6 @@ def test_a_link_that_loses_lines_proposes_no_counts(fault: str) -> None:
     assert "lost lines" in checked.failed
     assert checked["encoder counts"].verdict == "SKIPPED"
     assert "mcu.encoder_counts" not in checked.changes
-
-
-def test_counts_are_measured_where_nothing_is_lost() -> None:
-    with Robot().board() as board:
-        known(board)
-        board.lost = line_loss.MOST
-        assert encoder_counts.finding(board, []).verdict == "SKIPPED"
-        board.identity = {"counts": "3200"}
-        assert encoder_counts.finding(board, []).keys == {"mcu.encoder_counts": 3200}
-        board.lost = 2 * line_loss.MOST
-        assert encoder_counts.finding(board, []).keys == {}
 
 
 ALL = [0, 1, 2, 3]

@@ -59,30 +59,20 @@ DIALECTS = pytest.mark.parametrize("faults", [(), ("no_sample",), ("plain_only",
 @pytest.mark.variations(3)
 @DIALECTS
 @pytest.mark.parametrize(("at_s", "when"), MOMENTS)
-def test_a_board_that_starts_anew_fails_by_that_and_nothing_else_is_blamed(
-    faults: tuple[str, ...], at_s: float, when: str
-) -> None:
-    checked = Checked(Restarting([at_s], *faults))
-    assert checked.failed == ["restarts"]
-    assert checked["restarts"].figure == "restarted"
-    assert f"while {when}" in checked["restarts"].text
-    assert "supply" in checked["restarts"].mend
-    assert "DTR" in checked["restarts"].mend
-    assert not checked.changes.keys() - {"mcu.link_check", "mcu.encoder_counts"}
-    assert not checked.left_turning
-
-
-@pytest.mark.variations(9)
-@DIALECTS
-@pytest.mark.parametrize(("at_s", "when"), MOMENTS)
-def test_all_else_is_found_as_if_it_had_not_started_anew(
+def test_a_board_that_starts_anew_fails_by_that_and_all_else_is_found_as_before(
     faults: tuple[str, ...], at_s: float, when: str
 ) -> None:
     checked, sound = Checked(Restarting([at_s], *faults)), check(*faults)
+    assert checked.failed == ["restarts"]
     assert [(one.name, one.verdict) for one in checked.findings if one.name != "restarts"] == (
         [(one.name, one.verdict) for one in sound.findings]
     )
     assert checked.changes == sound.changes
+    assert checked["restarts"].figure == "restarted"
+    assert f"while {when}" in checked["restarts"].text
+    assert "supply" in checked["restarts"].mend
+    assert "DTR" in checked["restarts"].mend
+    assert not checked.left_turning
 
 
 @DIALECTS

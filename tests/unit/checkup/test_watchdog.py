@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import pytest
 
 from acsard.checkup import dialect, watchdog
+from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED
 from acsard.checkup.watchdog import UNKNOWN, Between, run
@@ -24,15 +28,22 @@ class ByItsOwnClock(Robot):
         self.mcu._speeds = lambda now_ns: list(self.mcu.vehicle.speeds)  # type: ignore[method-assign]
 
 
-def measured(robot: Robot, *motors: int) -> tuple[str, str]:
+@contextmanager
+def turned(robot: Robot) -> Iterator[Board]:
+    """Yield the board after the steps that come before the watchdog's; the motors stand at last."""
     with robot.board() as board:
         dialect.rate(board)
         dialect.check(board)
-        for motor in range(4):
+        for motor in ALL:
             turn(board, motor, 3.0)
             board.rest()
-        finding = watchdog.finding(board, motors or ALL)
+        yield board
         assert board.turning() == []
+
+
+def measured(robot: Robot) -> tuple[str, str]:
+    with turned(robot) as board:
+        finding = watchdog.finding(board, ALL)
     assert robot.later() == [0.0] * 4
     return finding.verdict, finding.figure
 
@@ -132,15 +143,8 @@ SLACK_S = 0.02
 
 
 def silence(robot: Robot) -> Between:
-    with robot.board() as board:
-        dialect.rate(board)
-        dialect.check(board)
-        for motor in ALL:
-            turn(board, motor, 3.0)
-            board.rest()
-        found = watchdog.measured(board, ALL, run(board, ALL, 0.0))
-        assert board.turning() == []
-    return found
+    with turned(robot) as board:
+        return watchdog.measured(board, ALL, run(board, ALL, 0.0))
 
 
 @pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])

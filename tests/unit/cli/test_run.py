@@ -10,7 +10,7 @@ from acsard.cli import parser, run
 from acsard.cli.common import tables
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
-from acsard.machine.running import OPTIONS
+from acsard.machine.daemon_findings import OPTIONS
 from tests.each import each
 
 

@@ -31,7 +31,6 @@ from acsard.core.config.parsing import parse
 from acsard.daemon.bus import tls as bus_tls
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
-from acsard.machine.authority import Authority
 from tests.each import each
 
 ROLES = ("viewer", "operator", "maintainer")
@@ -588,16 +587,6 @@ def test_renew_leaves_out_a_name_of_the_machine_that_the_authority_may_not_sign(
     monkeypatch.setattr("acsard.machine.certificates.own_addresses", lambda: ["203.0.113.99"])
     assert tls("renew", "--directory", str(own)) == 0
     assert "203.0.113.99" not in names_of(own)
-
-
-def test_renew_warns_of_an_authority_that_may_sign_for_any_site(
-    own: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert tls("renew", "--directory", str(own)) == 0
-    assert "any web site" not in capsys.readouterr().out
-    monkeypatch.setattr(Authority, "_permitted", lambda self: ())
-    assert tls("renew", "--directory", str(own), "--address", "more.example") == 0
-    assert "may sign for any web site" in capsys.readouterr().out
 
 
 def test_without_the_authority_s_key_the_message_asks_for_it(

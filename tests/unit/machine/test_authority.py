@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from acsard.machine.authority import Authority
 from tests.each import each
@@ -66,7 +67,15 @@ def test_the_constraints_are_critical(authority: tuple[Authority, Path]) -> None
     certificate = x509.load_pem_x509_certificate((authority[1] / "ca.pem").read_bytes())
     found = certificate.extensions.get_extension_for_class(x509.NameConstraints)
     assert found.critical
-    assert authority[0].limited
+
+
+def test_an_authority_of_another_program_without_constraints_may_sign_for_any_name(
+    authority: tuple[Authority, Path], tmp_path: Path
+) -> None:
+    authority[0].issue(tmp_path, "unlimited", [], 1)
+    certificate = x509.load_pem_x509_certificate((tmp_path / "certificate.pem").read_bytes())
+    key = ec.generate_private_key(ec.SECP256R1())
+    assert Authority(certificate, key).permits("bank.example")
 
 
 @each("name", ["anna", "anna.meyer", "laptop-anna.example.com"])

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.guided.equipment import NEEDS, SIMULATED
+from acsard.calibration.guided.drive_plan import NEEDS, SIMULATED
 from acsard.calibration.guided.methods import METHODS
 from acsard.cli import parser
 from acsard.web.frames import Begin, FrameError

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.error_budget.drive_log import Line
+from acsard.calibration.error_budget.measured_errors import Line
 
 Array = npt.NDArray[np.floating[Any]]
 

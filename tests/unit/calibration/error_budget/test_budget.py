@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.calibration.error_budget.budget import Budget, Cause, Received, Share, budget
-from acsard.calibration.error_budget.drive_log import Line
+from acsard.calibration.error_budget.measured_errors import Line
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.motion.uncertainty import GYRO_SCALE
 from tests.unit.calibration.error_budget import drives

@@ -20,7 +20,7 @@ from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
 from acsard.terminal.prompt import Ask
 from acsard.terminal.terminal_prompt import NoPrompt
-from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
+from tests.unit.calibration.robots import Drive, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30
 """Distance between the points of the robot's sides and of its ends that the person measures, m."""
@@ -74,24 +74,12 @@ class Player:
 
     def _run(self, made: Drive) -> Run:
         """Return the reported samples as a run, without going through a file."""
-        streams: list[tuple[Floats, dict[str, Floats]]] = [
-            (made.t, {"left": made.left, "right": made.right})
-        ]
+        sensors = [{"t": made.t, "left": made.left, "right": made.right}]
         if self.gyro:
-            streams.append((made.gyro_t, {"yaw_rate": made.gyro}))
+            sensors.append({"t": made.gyro_t, "yaw_rate": made.gyro})
         if self.places:
-            streams.append((made.place_t, {"x": made.place.real, "y": made.place.imag}))
-        t = np.concatenate([times for times, _ in streams])
-        order = np.argsort(t)
-        columns = {"t": t[order]}
-        at = 0
-        for times, values in streams:
-            for name, column in values.items():
-                whole = np.full(len(t), np.nan)
-                whole[at : at + len(times)] = column
-                columns[name] = whole[order]
-            at += len(times)
-        return runs(Table(columns, np.zeros(len(t), dtype=np.int64), ("",), ())).runs[0]
+            sensors.append({"t": made.place_t, "x": made.place.real, "y": made.place.imag})
+        return runs(Table.joined(sensors)).runs[0]
 
     def _round_s(self, angular: float) -> float:
         rate = abs(angular)

@@ -12,12 +12,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from acsard.calibration.guided.drive_plan import MOST_S, WIDEST, GuideError, Slant, setup
-from acsard.calibration.guided.equipment import NEEDS
+from acsard.calibration.guided.drive_plan import MOST_S, NEEDS, WIDEST, GuideError, Slant, setup
 from acsard.calibration.guided.methods import METHODS, side_of_square
 from acsard.calibration.guided.runner import guide
-from acsard.calibration.log_table import LogError
-from acsard.calibration.plausibility import RefusedError
+from acsard.calibration.log_table import LogError, RefusedError
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.terminal.prompt import Ask

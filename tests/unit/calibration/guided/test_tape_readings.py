@@ -1,4 +1,4 @@
-"""Tests that turn tape readings and spins into parameters and their standard deviations."""
+"""Tests that turn tape readings and spins into parameters, and these into a calibration."""
 
 from __future__ import annotations
 
@@ -11,20 +11,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT
+from acsard.calibration.calibration_report import keys, parts, report
+from acsard.calibration.fit import INVERSE_TRACK, LEFT, RIGHT
 from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Quantity
 from acsard.calibration.guided.methods import MOST_SPIN_S, once_round, turns
 from acsard.calibration.guided.tape_readings import (
     Reading,
+    calibrated,
     fit_readings,
     joined,
     predicted,
     slant,
     track_ratio,
 )  # fmt: skip
-from acsard.calibration.plausibility import RefusedError
+from acsard.calibration.log_table import RefusedError
 from acsard.calibration.runs import Run
+from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig
+from acsard.core.config.writing import excerpt
+from acsard.terminal.output import plain
 from tests.unit.calibration.cut import BASE, IDEAL, log_of, table
 from tests.unit.calibration.guided.played import Player, usual_setup
 from tests.unit.calibration.robots import Plan, Robot, drive
@@ -168,3 +173,31 @@ def test_a_turn_that_was_not_a_full_circle_is_reported() -> None:
     half = once(2.4)
     with pytest.raises(GuideError, match="one full circle"):
         track_ratio(Reading(half.rides, "turned", math.pi, 0.01), DriveConfig())
+
+
+DRIVE = DriveConfig()
+
+
+def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
+    made = calibrated("a tape", readings(), DRIVE)
+    assert made.improvement.turn.before == pytest.approx(180, rel=0.05)
+    assert made.improvement.turn.after is not None
+    assert made.improvement.turn.after < 10
+    assert made.drives.runs == 3
+    assert made.drives.turns == pytest.approx(15 * 1.2 / 1.5 / 2 / np.pi, rel=0.15)
+
+
+def test_people_read_it_and_the_configuration_takes_it() -> None:
+    made = calibrated("a tape", readings(), DRIVE)
+    told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml"))
+    assert "compared with a tape" in told
+    assert "error of a turn of 360 deg" in told
+    config = parse("\n".join(excerpt(keys(made))).encode())
+    assert config.drive.wheel_separation_multiplier == pytest.approx(1.5, rel=0.02)
+    assert 0 < config.odometry.wheel_separation_multiplier_std < 0.2
+
+
+def test_readings_that_tell_too_little_are_refused() -> None:
+    vague = [Reading(one.rides, one.quantity, one.value, 100 * one.deviation) for one in readings()]
+    with pytest.raises(RefusedError, match="too inaccurate"):
+        calibrated("a tape", vague, DRIVE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.guided.leg_recorder import Recorder, Sample, times
+from acsard.calibration.guided.robot_on_bus import Recorder, Sample, times
 from acsard.calibration.log_table import LogError
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages.schema import (

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.fit import Multipliers
-from acsard.calibration.plausibility import RefusedError
-from acsard.calibration.tape_distance import TAPE_M, Extent, Tape, scaled
+from acsard.calibration.log_table import RefusedError
+from acsard.calibration.multipliers import TAPE_M, Extent, Multipliers, Tape, scaled
 
 FOUND = Multipliers(np.array([1.6, 1.0, 1.0]), np.diag([0.02, 1e-3, 1e-3]) ** 2)
 NAMES = ("turns", "straight")

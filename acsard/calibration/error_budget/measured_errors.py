@@ -1,0 +1,478 @@
+"""Measures the motion of a drive and the errors of each of its steps from feedback lines.
+
+Two of the errors are late stamps and lost lines. To find them, the times at which the board made
+its lines are estimated. The board makes a line at a fixed period, or as the answer to each line of
+the daemon, so these times form a grid. A line cannot arrive before it was made. The line with the
+smallest delay among its neighbours therefore shows where the grid is. If even this line comes a
+whole period later than expected, a line was lost. The difference between a stamp and its time on
+the grid is the error of the stamp.
+
+Rounding is an error because a feedback line carries wheel speeds with two decimals. Independent
+rounding errors have a standard deviation of q / sqrt(12), where q is the quantization step. A wheel
+at a constant speed repeats the same error, so a run of n equal values is one error of n times this
+size. If a wheel passes through a value while it becomes faster or slower, the run is different: the
+errors of its first and second half cancel. Some firmware counts encoder edges in each period and
+reports multiples of the speed of one count. An edge that it misses in one period is counted in the
+next one. Only the rounding of the reported multiple to two decimals adds up then, and this rounding
+is known.
+
+`Driving` divides a drive into steps, each with the errors of one cause. An error that is
+independent from step to step is given as a variance. An error that has the same sign in each step
+adds up; it is given as motion that the pose missed, like the motion in a gap.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+
+from acsard.calibration.log_table import Floats
+from acsard.core.link.quantization_step import Search
+from acsard.core.motion.error_model import DECIMAL
+from acsard.core.motion.gap_filling import Gaps
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.uncertainty import GYRO_SCALE
+from acsard.core.values import Twist, WheelSpeeds
+
+Counts = npt.NDArray[np.int64]
+
+AHEAD = 30
+"""Number of consecutive lines of which at least one is not delayed.
+
+It is the number of lines in 0.3 s, the longest time for which a host stalls.
+"""
+
+MISSING = 0.6
+"""Delay of the earliest line, in periods, from which a line was lost."""
+
+FOLLOWED = 0.05
+"""Part of a new delay by which the grid is corrected. At first the period is known to about 1 %."""
+
+CLUSTERED, ALIKE_TIMES = 0.4, 0.25
+"""Criterion for lines that arrive one by one, not in bursts.
+
+More than the fraction `CLUSTERED` of the intervals differ from their median by less than the
+fraction `ALIKE_TIMES`.
+"""
+
+
+class LineTimes(Struct, frozen=True):
+    """Estimates of the delay of each feedback line and of the lines that were lost."""
+
+    late: Floats
+    """Delay of each line minus the median delay, s."""
+    missing: Counts
+    """Number of lines that were lost before each line."""
+    period: float
+    """Mean interval between two lines, s."""
+
+
+def line_times(t: Floats, sent: Floats) -> LineTimes:
+    """Estimate the delays of at least 3 lines from their stamps, s, and the daemon's lines, s.
+
+    Both kinds of boards are tried, and the estimate with the smaller delays is returned.
+    """
+    even = _even(t)
+    asked = _asked(t, sent)
+    if asked is None or np.ptp(t) == 0.0:
+        return even
+    return min(even, asked, key=lambda found: float(np.mean(np.abs(found.late))))
+
+
+def _even(t: Floats) -> LineTimes:
+    """Estimate the delays of the lines of a board that sends at a fixed period."""
+    steps = np.diff(t)
+    usual, mean = float(np.median(steps)), float(np.mean(steps))
+    alike = np.abs(steps - usual) < ALIKE_TIMES * usual
+    period = usual if np.mean(alike) > CLUSTERED else mean
+    missing = _missing((t - t[0]) / period if period > 0.0 else np.arange(len(t), dtype=float))
+    number = np.arange(len(t)) + np.cumsum(missing)
+    # Fit a straight line twice. The second fit leaves out the stalls, which distort the first one.
+    among = np.ones(len(t), dtype=bool)
+    for _ in range(2):
+        slope, start = np.polyfit(number[among], t[among], 1)
+        late = t - (start + slope * number)
+        among = np.abs(late - np.median(late)) <= 3 * np.std(late) + 1e-9
+    return LineTimes(late - np.median(late), missing, float(slope))
+
+
+def _asked(t: Floats, sent: Floats) -> LineTimes | None:
+    """Estimate the delays of a board that answers each line; None if too few of these are known."""
+    if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
+        return None
+    at = np.interp(t, sent, np.arange(len(sent)))
+    missing = _missing(at)
+    number = np.arange(len(t)) + np.cumsum(missing)
+    first = int(np.floor(np.quantile(at - number, 0.05)))
+    number = number + first
+    if number[0] < 0 or number[-1] >= len(sent):
+        return None
+    late = t - sent[number]
+    return LineTimes(late - np.median(late), missing, float(np.mean(np.diff(sent))))
+
+
+def _missing(at: Floats) -> Counts:
+    """Return the number of lines that were lost before each line.
+
+    `at` has the number of periods from the first line to the stamp of each line.
+    """
+    count = len(at)
+    ahead = at - np.arange(count)
+    padded = np.concatenate([ahead, np.full(AHEAD, np.inf)])
+    earliest = np.lib.stride_tricks.sliding_window_view(padded, AHEAD)[:count].min(axis=1)
+    found = np.zeros(count, dtype=np.int64)
+    usual = float(earliest[0])
+    for i, now in enumerate(earliest.tolist()):
+        over = now - usual
+        if over >= MISSING:
+            found[i] = round(over)
+            usual += round(over)
+        else:
+            usual += FOLLOWED * over
+    return found
+
+
+BLOCK_S = 0.5
+"""Time within which errors of stamps are correlated, s. It exceeds the longest stall of a host."""
+
+LEAST_LINES, ALIKE = 20, 0.99
+"""Limits for the fit of the gyro's noise: the smallest number of lines while the robot moves, and
+the cosine of turn and time above which the fit cannot separate them."""
+
+LATEST_S = 0.1
+"""Delay, s, from which a stamp says nothing, so that the motion of its line counts as a gap."""
+
+Wheels = tuple[float, float, float, float]
+"""Values of the four wheels, in the order of `values.WHEELS`."""
+
+
+class Line(Struct, frozen=True):
+    """A feedback line and the odometry computed from it."""
+
+    at: float
+    """Stamp, s since the start."""
+    speeds: Wheels
+    """Wheel speeds, rad/s."""
+    positions: Wheels
+    """Wheel angles since the start of the daemon, rad."""
+    yaw: float
+    """Heading, rad."""
+    yaw_variance: float
+    """Variance of the heading, rad2."""
+
+
+class Motion(Struct, frozen=True):
+    """The motion between consecutive feedback lines, and its errors.
+
+    An array has one entry for each line except the first.
+    """
+
+    seconds: float
+    """Duration of the drive, s."""
+    period: float
+    """Mean interval between two lines, s."""
+    distance: Floats
+    """Signed distance, m."""
+    turn: Floats
+    """Turn, rad."""
+    yaw_variance: Floats | None
+    """Variance that odometry added to the heading with time, rad2; None if it is unknown."""
+    late: Floats
+    """Errors because of wrong stamps, rows of (m, rad)."""
+    lateness: float
+    """RMS error of the stamps, s."""
+    filled: Floats
+    """Variances of gaps that odometry filled, rows of (m2, rad2). Other rows are zero."""
+    unfilled: Floats
+    """Motion in gaps that odometry did not fill, and its variances, rows of (m, rad, m2, rad2).
+
+    The pose did not move in such a gap. Other rows are zero.
+    """
+    missing: int
+    """Number of lines that were lost."""
+    unseen: float
+    """Total duration of the gaps, s."""
+
+
+def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
+    """Compute the motion of a drive of at least 3 lines, and its errors.
+
+    `sent` has the times of the daemon's own lines, s. `whole` says that every line of the daemon
+    arrived here. If not, a missing line may have been lost between the daemon and this program, so
+    it does not count as lost.
+    """
+    t = np.array([line.at for line in lines])
+    found = line_times(t, sent)
+    twists = [kinematics.twist(WheelSpeeds(*line.speeds)) for line in lines]
+    rolled = [
+        kinematics.twist(WheelSpeeds(*np.subtract(b.positions, a.positions).tolist()))
+        for a, b in pairwise(lines)
+    ]
+    turns = [math.remainder(b.yaw - a.yaw, math.tau) for a, b in pairwise(lines)]
+    growth = _noise(
+        t, np.array([line.speeds for line in lines]), np.array(turns),
+        np.array([line.yaw_variance for line in lines]),
+    )  # fmt: skip
+    filled, unfilled, missing, unseen = _gaps(t, twists, rolled, found, whole)
+    late = _late(t, twists, found)
+    late[unfilled.any(axis=1)] = 0.0
+    return Motion(
+        float(t[-1] - t[0]), found.period, np.array([one.linear for one in rolled]),
+        np.array(turns), growth, late, float(np.sqrt(np.mean(found.late**2))), filled,
+        unfilled, missing, unseen,
+    )  # fmt: skip
+
+
+def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
+    """Return the growth of the heading's variance with time in each line, rad2.
+
+    It is 0 in lines in which the wheels do not turn. The variance of the heading also contains the
+    scale error of the gyro, S^2 A^2. S is the relative standard deviation of the scale, and A is
+    the turn since the pose was set. A line with the turn dA adds 2 S^2 A dA, which is subtracted
+    here. The turn before the first line is unknown, so a least-squares fit estimates it together
+    with the rate of growth. Returns None if the fit cannot separate turn and time.
+    """
+    # Leave out the lines in which the variance falls, because the pose was set there.
+    dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
+    levers, before = 2 * GYRO_SCALE**2 * turns, np.cumsum(turns) - turns / 2
+    grown = np.diff(variances) - levers * before
+    columns = np.column_stack((dt, levers))[moves]
+    sizes = np.sqrt(np.sum(columns**2, axis=0))
+    if len(columns) < LEAST_LINES or not sizes[0]:
+        return None
+    if sizes[1] and abs(columns[:, 0] @ columns[:, 1]) > ALIKE * sizes[0] * sizes[1]:
+        return None
+    used = columns / np.where(sizes > 0.0, sizes, 1.0)
+    rate = float(np.linalg.lstsq(used, grown[moves], rcond=None)[0][0]) / float(sizes[0])
+    return np.where(moves, max(0.0, rate) * dt, 0.0)
+
+
+def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
+    """Return the errors of the motion because of wrong stamps, rows of (m, rad).
+
+    A wrong stamp changes the interval dt of a line, and so the distance, which is speed times dt.
+    Summation by parts turns the sum of these errors into terms of one line each: minus the delay of
+    the line times the change of the speed after it.
+    """
+    speeds = np.array([(one.linear, one.angular) for one in twists])
+    near = np.abs(found.late) <= LATEST_S
+    # A constant delay causes no error, so subtract the mean delay.
+    late = np.where(near, found.late - found.late[near].mean(), 0.0)
+    parts = np.zeros((len(t) - 1, 2))
+    parts[:-1] = -late[1:-1, None] * np.diff(speeds[1:], axis=0)
+    return parts
+
+
+def _gaps(
+    t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
+) -> tuple[Floats, Floats, int, float]:
+    """Return the last four fields of `Motion`, by the odometry's own model of unseen motion."""
+    filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
+    lost, unseen = 0, 0.0
+    gaps = Gaps()
+    gaps.interrupt(twists[0])
+    for k, (moved, missing) in enumerate(zip(rolled, found.missing[1:].tolist(), strict=True)):
+        before, after, dt = twists[k], twists[k + 1], float(t[k + 1] - t[k])
+        mean = Twist((before.linear + after.linear) / 2, (before.angular + after.angular) / 2)
+        moves = moved != Twist() or after == Twist()
+        if not moves and dt >= LATEST_S:
+            unseen += dt
+            lost += missing
+            along, yaw = gaps.unseen(dt, before, after)
+            unfilled[k] = dt * mean.linear, dt * mean.angular, along, yaw
+            gaps.interrupt(after)
+        elif missing and whole:
+            seconds = missing * found.period
+            unseen += seconds
+            lost += missing
+            # Odometry may have filled in another motion than that at the mean of the speeds before
+            # and after the gap.
+            off = moved.linear - after.linear * found.period - mean.linear * seconds
+            turned = moved.angular - after.angular * found.period - mean.angular * seconds
+            along, yaw = gaps.unseen(seconds, before, after)
+            filled[k] = along + off * off, yaw + turned * turned
+            gaps.interrupt(after)
+        else:
+            gaps.follow(after, found.period)
+    return filled, unfilled, lost, unseen
+
+
+TOGETHER = 0.8
+"""Part of the feedback lines with equal values from which two wheels have the same errors."""
+
+LEAST_VALUES = 3
+"""Number of different speeds that are needed to find a quantization step."""
+
+
+class Rounding(Struct, frozen=True):
+    """Rounding errors. Rows are feedback lines, columns are wheels in `values.WHEELS` order."""
+
+    variance: Floats
+    """Variance of the angle that a wheel rolled, rad2. The entries are independent."""
+    offset: Floats
+    """Known error of the angle that a wheel rolled, rad."""
+    alike: Floats
+    """Shape (4, 4): 1 for a pair of wheels with the same errors, otherwise 0."""
+    quantum: float
+    """Quantization step, rad/s."""
+    count: float
+    """Wheel rotation per encoder count, rad; 0 if the feedback lines do not show it."""
+
+
+def rounding(speeds: Floats, period: float) -> Rounding:
+    """Estimate the rounding errors of `speeds`, rad/s. A row is a line, which covers `period` s."""
+    moving = np.any(speeds != 0.0, axis=1)
+    same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
+    alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
+    quantum = _quantum(speeds)
+    if quantum:
+        off = (speeds - quantum * np.round(speeds / quantum)) * period
+        return Rounding(np.zeros_like(speeds), off, alike, quantum, quantum * period)
+    variance = np.column_stack([_runs(column) for column in speeds.T])
+    scale = (DECIMAL * period) ** 2 / 12
+    return Rounding(variance * scale, np.zeros_like(speeds), alike, DECIMAL, 0.0)
+
+
+def _runs(values: Floats) -> Floats:
+    """Return the variance of each run of equal values of a wheel, in units of q^2 / 12.
+
+    The variance is in the row of the run's last value, and the other rows are 0. It is the square
+    of the number of values, or 1 if the wheel passed through the value.
+    """
+    found = np.zeros(len(values))
+    ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
+    starts = np.append(0, ends[:-1] + 1)
+    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+        if values[start] == 0.0:
+            continue  # the wheel stands still
+        length = end - start + 1
+        if start > 0 and end + 1 < len(values):
+            before, after = values[start - 1] - values[start], values[end + 1] - values[start]
+            length = 1 if before * after < 0.0 else length
+        found[end] = length**2
+    return found
+
+
+def _quantum(speeds: Floats) -> float:
+    """Return the speed in rad/s of which all speeds are multiples, or 0 without such a speed."""
+    # A value that is repeated for a whole drive is no more evidence than a single one.
+    seen = np.unique(np.abs(speeds[speeds != 0.0])).tolist()
+    if len(seen) < LEAST_VALUES:
+        return 0.0
+    search = Search(dict.fromkeys(seen, 1))
+    while not search.go_on():
+        pass
+    return search.found.quantum if search.found is not None else 0.0
+
+
+class Steps(Struct, frozen=True):
+    """The steps of a drive with the errors of one cause."""
+
+    rows: Floats
+    """One row for each step, with nine columns:
+
+    - 0, 1: distance (m) and turn (rad) of the step
+    - 2, 3: variances of both (m2, rad2) that are independent of other steps
+    - 4, 5: motion that the pose missed (m, rad), with the same sign in each step
+    - 6, 7: variances of the missed motion (m2, rad2)
+    - 8: variance of the turn if a gyro measured it (rad2)
+    """
+    by_gyro: bool = False
+    """Whether a gyro measured the turns. Otherwise the wheels did."""
+
+    def to_the_left(self) -> Steps:
+        """Return the steps with every turn, and the missed part of it, to the left."""
+        rows = self.rows.copy()
+        rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
+        return Steps(rows, self.by_gyro)
+
+
+class Driving:
+    """A drive, divided into steps of about `step_s` s, with the errors of each cause."""
+
+    def __init__(
+        self, lines: list[Line], motion: Motion, rounding: Rounding, kinematics: Kinematics,
+        step_s: float, gyro: bool,
+    ) -> None:  # fmt: skip
+        self._lines, self._motion, self._rounding, self._gyro = lines, motion, rounding, gyro
+        self._each = max(1, round(step_s / motion.period))
+        twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
+        self._weights = np.array([[t.linear for t in twists], [t.angular for t in twists]])
+        """Motion of the robot for 1 rad of each wheel: a row of m and a row of rad."""
+
+    def plain(self) -> Steps:
+        """Return the steps without an error."""
+        return self._steps()
+
+    @property
+    def tells_gyro(self) -> bool:
+        """Whether the feedback lines show the noise of the gyro."""
+        return self._motion.yaw_variance is not None
+
+    def turned_by_gyro(self) -> Steps:
+        """Return the steps with the gyro noise that odometry assumes."""
+        return self._steps(gyro=self._motion.yaw_variance)
+
+    def late(self) -> Steps:
+        """Return the steps with the errors of wrong times of feedback lines.
+
+        The errors within `BLOCK_S` are correlated, so they are summed before they are squared.
+        """
+        late = self._motion.late
+        starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
+        squares = np.zeros_like(late)
+        squares[starts] = np.add.reduceat(late, starts, axis=0) ** 2
+        return self._steps(squares)
+
+    def missed(self) -> Steps:
+        """Return the steps with the errors of gaps."""
+        return self._steps(self._motion.filled, self._motion.unfilled)
+
+    def rounded(self) -> Steps:
+        """Return the steps with the rounding errors of lines, without the encoders' resolution."""
+        found = self._rounding
+        if found.count:
+            return self._steps(missed=self._of_wheels(found.offset[1:]))
+        roots = np.sqrt(found.variance[1:])
+        variances = [
+            np.einsum("ki,ij,kj->k", roots * row, found.alike, roots * row) for row in self._weights
+        ]
+        return self._steps(np.column_stack(variances))
+
+    def contradicted(self) -> Steps:
+        """Return the steps with the errors of wheels that contradict each other.
+
+        If the front and the rear wheel of a side differ and one of them is right, the mean of both
+        is wrong by half of the difference.
+        """
+        turned = np.diff([line.positions for line in self._lines], axis=0)
+        front_right, front_left, rear_left, rear_right = turned.T
+        right, left = (front_right - rear_right) / 2, (front_left - rear_left) / 2
+        return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
+
+    def _of_wheels(self, off: Floats) -> Floats:
+        """Return the missed motion for wheel angles that are wrong by exactly `off`, rad."""
+        moved = off @ self._weights.T
+        return np.hstack([moved, np.zeros_like(moved)])
+
+    def _steps(
+        self, variances: Floats | None = None, missed: Floats | None = None,
+        gyro: Floats | None = None,
+    ) -> Steps:  # fmt: skip
+        """Return the steps with these errors. The arguments have one row for each feedback line."""
+        moved, count = self._motion, len(self._motion.distance)
+        errors = [
+            np.zeros((count, width)) if given is None else given.reshape(count, width)
+            for given, width in ((variances, 2), (missed, 4), (gyro, 1))
+        ]
+        if self._gyro:
+            # The gyro determines the heading, so wheel errors do not affect it.
+            errors[0] = errors[0] * (1, 0)
+            errors[1] = errors[1] * (1, 0, 1, 0)
+        rows = np.column_stack([moved.distance, moved.turn, *errors])
+        starts = np.arange(0, count, self._each)
+        return Steps(np.add.reduceat(rows, starts, axis=0), self._gyro)

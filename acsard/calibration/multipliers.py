@@ -1,0 +1,159 @@
+"""The multipliers that the parameters of a fit give, and their correction by a tape measure.
+
+A log of turn rates alone shows the ratios of the multipliers. A distance that was measured by tape
+shows how large the wheels are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.calibration.fit import INVERSE_TRACK, LEFT, RIGHT, TRACK_GROWTH, Base
+from acsard.calibration.heading import Rates
+from acsard.calibration.log_table import Floats, RefusedError
+
+SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
+"""Indices into `values` and `covariance` of `Multipliers`."""
+
+
+class Multipliers(Struct, frozen=True):
+    """The multipliers of wheel separation, left and right wheel radius, and their covariance."""
+
+    values: Floats
+    covariance: Floats
+
+    @property
+    def std(self) -> Floats:
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def ratio_std(self) -> float:
+        """Standard deviation of the ratio of both radii, as a fraction."""
+        shares = self.covariance / np.outer(self.values, self.values)
+        apart = np.array([0.0, 1.0, -1.0])
+        return float(np.sqrt(max(0.0, apart @ shares @ apart)))
+
+    def own(self) -> tuple[Floats, float]:
+        """Return four standard deviations, as the settings of `[odometry]` declare them.
+
+        The first three belong to one multiplier each. The fourth belongs to the common scale of all
+        multipliers, as a fraction. The odometry treats the four errors as independent.
+
+        Let d be the relative variance of the difference of both radii. Each radius then has its own
+        variance d / 2, which contributes d / 4 to the variance of their mean. This d / 4 is
+        subtracted from the variances of the mean radius (the scale) and of the track relative to
+        the mean radius (the track).
+        """
+        shares = self.covariance / np.outer(self.values, self.values)
+        mean, track, apart = (
+            float(row @ shares @ row)
+            for row in np.array([[0.0, 0.5, 0.5], [1.0, -0.5, -0.5], [0.0, 1.0, -1.0]])
+        )
+        own = np.sqrt(np.maximum(0.0, [track - apart / 4, apart / 2, apart / 2]))
+        return self.values * own, float(np.sqrt(max(0.0, mean - apart / 4)))
+
+
+def configured(base: Base) -> Multipliers:
+    """Return the configured multipliers, with a covariance of zero because it is unknown."""
+    return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
+
+
+def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
+    """Return the multipliers that fit best at the turn rates of the log.
+
+    `parameters` and `covariance` are those of a fit. The variance of the track is that of the best
+    constant track there. The turns that skid more or less than usual belong to the noise of the
+    odometry.
+    """
+    inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
+    slower = 1.0 - growth * rate.mean
+    values = np.array([1 / (inverse * slower), parameters[LEFT], parameters[RIGHT]])
+    jacobian = np.zeros((3, len(parameters)))
+    jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
+    jacobian[SEPARATION, INVERSE_TRACK] = -values[SEPARATION] / inverse
+    jacobian[SEPARATION, TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
+    return Multipliers(values, jacobian @ covariance @ jacobian.T)
+
+
+TAPE_M = 0.01
+"""Standard deviation of a distance by tape, m. It includes the choice of the point on the robot."""
+
+UNKNOWN = 1.0
+"""Standard deviation of the logarithm of the scale if no sensor has measured the scale."""
+
+LEAST_M = 0.5
+"""Shortest distance between start and end of a run, m, that a tape may measure."""
+
+STRAIGHT = 0.8
+"""Smallest straightness of a run, as in `Extent.straight`."""
+
+
+class Tape(Struct, frozen=True):
+    """A measured straight-line distance from the start to the end of a run."""
+
+    metres: float
+    run: str = ""
+    """Name of the run; "" means the straightest run of the log."""
+
+
+class Extent(Struct, frozen=True):
+    """The extent of a run's path according to the wheels."""
+
+    distance: float
+    """Straight-line distance from start to end, m."""
+    length: float
+    """Length along the path, m."""
+
+    @property
+    def straight(self) -> float:
+        """Distance divided by length: 1 for a straight line, 0 for at most `LEAST_M`."""
+        return self.distance / self.length if self.distance > LEAST_M else 0.0
+
+
+Follow = Callable[[Floats, int], Extent]
+"""Function from multipliers (as in `Multipliers.values`) and a run's number to its extent."""
+
+
+def scaled(
+    found: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
+) -> tuple[Multipliers, str]:
+    """Return the corrected multipliers, and the name of the run that the distance belongs to.
+
+    The correction is the update step of a Kalman filter on the logarithms of the multipliers.
+    `names` has the names of the runs. `known` says that positions have already measured the scale.
+    Raises `RefusedError` if the log has no such run, or the run is not straight enough.
+    """
+    if tape.run and tape.run not in names:
+        raise RefusedError(
+            f'--distance: there is no run "{tape.run}" in the log; it has {", ".join(names[:10])}'
+        )
+    numbers = [names.index(tape.run)] if tape.run else range(len(names))
+    extents = {number: follow(found.values, number) for number in numbers}
+    best = max(extents, key=lambda number: extents[number].straight)
+    extent = extents[best]
+    if extent.straight < STRAIGHT:
+        raise RefusedError(
+            f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, after "
+            f"{extent.length:.2f} m: drive straight ahead for 2 m or more in a separate run, and "
+            "measure from start to end"
+        )
+    # Derivatives of the logarithm of the distance with respect to those of the multipliers.
+    jacobian = np.zeros(3)
+    for index in (SEPARATION, LEFT_RADIUS, RIGHT_RADIUS):
+        longer = found.values.copy()
+        longer[index] *= 1.0 + 1e-4
+        jacobian[index] = np.log(follow(longer, best).distance / extent.distance) / 1e-4
+    logs = np.diag(1 / found.values)
+    covariance = logs @ found.covariance @ logs
+    if not known:
+        covariance = covariance + UNKNOWN**2
+    noise = (TAPE_M / tape.metres) ** 2
+    gain = covariance @ jacobian / (jacobian @ covariance @ jacobian + noise)
+    values = found.values * np.exp(gain * np.log(tape.metres / extent.distance))
+    rest = np.eye(3) - np.outer(gain, jacobian)
+    covariance = rest @ covariance @ rest.T + np.outer(gain, gain) * noise
+    back = np.diag(values)
+    return Multipliers(values, back @ covariance @ back), names[best]

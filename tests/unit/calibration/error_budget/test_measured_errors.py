@@ -1,0 +1,250 @@
+"""Tests of the errors that lines show: late and missing lines, motion, rounding and steps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from acsard.calibration.error_budget.measured_errors import (
+    Driving,
+    Line,
+    Steps,
+    line_times,
+    motion,
+    rounding,
+)
+from acsard.calibration.log_table import Floats
+from acsard.core.config.settings import DriveConfig
+from acsard.core.motion.kinematics import Kinematics
+from tests.each import each
+from tests.unit.calibration.error_budget.drives import Told, late, rounded
+
+PERIOD = 0.01
+KINEMATICS = Kinematics(DriveConfig())
+NONE = np.zeros(0)
+EVEN = np.asarray(np.arange(600) * PERIOD, dtype=np.float64)
+
+
+def test_even_lines_are_in_their_places() -> None:
+    found = line_times(EVEN, NONE)
+    assert np.abs(found.late).max() < 1e-9
+    assert found.period == pytest.approx(PERIOD)
+    assert not found.missing.any()
+
+
+@each("period", [0.00997, 0.01, 0.0102, 0.05])
+def test_the_period_need_not_be_known(period: float) -> None:
+    t = np.asarray(np.arange(400) * period, dtype=np.float64)
+    assert line_times(t, NONE).period == pytest.approx(period, rel=1e-6)
+
+
+def test_a_line_that_is_read_late_is_late_and_not_missing() -> None:
+    late = EVEN.copy()
+    late[300:308] = late[308]  # a stall of the host delays all reads to its end
+    found = line_times(late, NONE)
+    assert not found.missing.any()
+    assert found.late[300] == pytest.approx(0.08, abs=0.002)
+    assert abs(found.late[400]) < 0.002
+
+
+def test_an_adapter_that_holds_lines_loses_none() -> None:
+    found = line_times(np.ceil(EVEN / 0.016) * 0.016, NONE)
+    assert not found.missing.any()
+    assert 0.003 < float(np.std(found.late)) < 0.006  # a uniform delay over 16 ms has 4.6
+
+
+@each("gone", [1, 2, 5, 20])
+def test_lines_that_do_not_come_are_missing_where_they_were(gone: int) -> None:
+    rng = np.random.default_rng(1)
+    kept = np.delete(EVEN, np.arange(300, 300 + gone)) + rng.uniform(0, 0.001, 600 - gone)
+    found = line_times(np.sort(kept), NONE)
+    assert np.flatnonzero(found.missing).tolist() == [300]
+    assert found.missing[300] == gone
+    assert np.abs(found.late).max() < 0.002
+
+
+def test_lines_that_answer_others_belong_behind_those_however_uneven_they_left() -> None:
+    rng = np.random.default_rng(2)
+    sent = np.cumsum(rng.choice([0.004, 0.01, 0.013], 600))
+    found = line_times(sent[3:] + 0.006, sent)
+    assert np.abs(found.late).max() < 1e-9
+    assert not found.missing.any()
+    assert not line_times(np.delete(sent[3:], 200) + 0.002, sent).missing[:190].any()
+
+
+def test_lines_of_one_stamp_are_no_error() -> None:
+    assert len(line_times(np.zeros(40), NONE).late) == 40
+
+
+SPEED = 10.0
+"""Speed of all wheels, rad/s; this is 0.5 m/s."""
+
+
+def ahead(at: list[float], moved: list[float] | None = None) -> list[Line]:
+    """Return lines of a straight drive; `moved` is the motion of odometry in each line, rad."""
+    speeds = (SPEED,) * 4
+    steps = [SPEED * PERIOD] * len(at) if moved is None else moved
+    turned = np.cumsum(steps).tolist()
+    return [Line(t, speeds, (p,) * 4, 0.0, 0.0) for t, p in zip(at, turned, strict=True)]
+
+
+def even(count: int) -> list[float]:
+    return [n * PERIOD for n in range(count)]
+
+
+def test_distance_and_time_are_those_of_the_drive() -> None:
+    found = motion(ahead(even(101)), NONE, KINEMATICS, whole=True)
+    assert found.distance.sum() == pytest.approx(0.5)
+    assert found.seconds == pytest.approx(1.0)
+    assert (found.missing, found.unseen) == (0, 0.0)
+    assert not found.late.any() or np.abs(found.late).max() < 1e-12
+
+
+def test_a_gap_in_which_the_pose_stood_is_all_the_way_that_was_driven_in_it() -> None:
+    at = even(100) + [1.5 + t for t in even(100)]
+    moved = [SPEED * PERIOD] * 200
+    moved[100] = 0.0
+    found = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
+    (unfilled,) = found.unfilled[found.unfilled.any(axis=1)]
+    assert unfilled[0] == pytest.approx(0.5 * 0.51)
+    assert found.unseen == pytest.approx(0.51)
+
+
+def test_lines_that_are_missing_are_a_doubt_where_the_pose_went_on() -> None:
+    at, moved = even(200), [SPEED * PERIOD] * 197
+    del at[100:103]
+    moved[100] = 4 * SPEED * PERIOD
+    found = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
+    assert found.missing == 3
+    assert found.unseen == pytest.approx(0.03)
+    assert np.flatnonzero(found.filled[:, 0]).tolist() == [99]
+    assert not found.unfilled.any()
+
+
+def test_lines_that_only_we_have_missed_are_no_gap() -> None:
+    at, moved = even(200), [SPEED * PERIOD] * 197
+    del at[100:103]
+    moved[100] = 4 * SPEED * PERIOD
+    found = motion(ahead(at, moved), NONE, KINEMATICS, whole=False)
+    assert (found.missing, found.unseen) == (0, 0.0)
+
+
+def test_lines_that_are_late_at_one_speed_change_nothing() -> None:
+    rng = np.random.default_rng(1)
+    at = np.sort(np.array(even(300)) + rng.exponential(0.002, 300)).tolist()
+    found = motion(ahead(at), NONE, KINEMATICS, whole=True)
+    assert found.lateness == pytest.approx(0.002, rel=0.3)
+    assert not found.late.any()
+
+
+COUNT = 4000
+
+
+def four(*columns: Floats) -> Floats:
+    return np.column_stack(columns)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ripple", [0.0, 0.03])
+def test_the_variance_is_that_of_the_rounding_errors_sum(ripple: float) -> None:
+    """A steady wheel has the same rounding error all the time.
+
+    A wheel that trembles has a new one in each line.
+    """
+    rng = np.random.default_rng(1)
+    errors, told = [], []
+    for _ in range(60):
+        true = rng.uniform(5, 15) + rng.normal(0, ripple, COUNT)
+        said = np.round(true, 2)
+        errors.append(float((said - true).sum()) * PERIOD)
+        told.append(float(rounding(four(said, said, said, said), PERIOD).variance[:, 0].sum()))
+    assert np.mean(np.square(errors)) == pytest.approx(np.mean(told), rel=0.6)
+
+
+def test_a_wheel_that_passes_through_its_speeds_hardly_errs() -> None:
+    true = np.linspace(0.0, 10.0, 20_000)  # twenty lines for each hundredth
+    said = np.round(true, 2)
+    found = rounding(four(said, said, said, said), PERIOD)
+    assert math.sqrt(found.variance[:, 0].sum()) < 20 * 0.01 * PERIOD
+
+
+def test_wheels_that_always_say_the_same_err_together_and_others_by_themselves() -> None:
+    rng = np.random.default_rng(2)
+    one, other = (np.round(rng.uniform(5, 9, COUNT), 2) for _ in range(2))
+    alike = rounding(four(one, other, other, one), PERIOD).alike
+    assert alike.tolist() == [[1, 0, 0, 1], [0, 1, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]]
+
+
+def test_a_wheel_that_stands_does_not_err() -> None:
+    assert not rounding(np.zeros((COUNT, 4)), PERIOD).variance.any()
+
+
+@each("counts", [96, 400, 1000, 4000])
+def test_a_firmware_that_counts_in_each_period_is_told_by_its_speeds(counts: int) -> None:
+    rng = np.random.default_rng(counts)
+    step = math.tau / counts
+    turned = np.cumsum(8.0 + 6.0 * np.sin(np.arange(COUNT) / 300) + rng.normal(0, 0.1, COUNT))
+    said = np.round(np.diff(np.floor(turned * PERIOD / step)) * step / PERIOD, 2)
+    found = rounding(four(said, said, said, said), PERIOD)
+    assert found.count == pytest.approx(step, rel=1e-3)
+    counted = np.diff(np.floor(turned * PERIOD / step)) * step
+    assert found.offset[:, 0].sum() == pytest.approx((said * PERIOD - counted).sum(), abs=0.1)
+
+
+@each("seed", range(20))
+def test_a_firmware_that_filters_is_not_taken_for_one_that_counts(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said: Floats = np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0).round(2)
+    assert rounding(said, PERIOD).count == 0.0
+
+
+def driving(told: Told, gyro: bool = False) -> Driving:
+    moved = motion(told.lines, np.zeros(0), KINEMATICS, whole=True)
+    found = rounding(np.array([line.speeds for line in told.lines]), moved.period)
+    return Driving(told.lines, moved, found, KINEMATICS, 0.1, gyro)
+
+
+@pytest.fixture(scope="module")
+def told() -> Told:
+    return rounded(1, 10.0)
+
+
+def test_the_steps_are_the_way(told: Told) -> None:
+    rows = driving(told).plain().rows
+    assert len(rows) == pytest.approx(100, abs=1)
+    first, last = told.lines[0], told.lines[-1]
+    rolled = (np.subtract(last.positions, first.positions)).mean() * 0.05
+    assert rows[:, 0].sum() == pytest.approx(rolled)
+    assert rows[:, 1].sum() == pytest.approx(last.yaw - first.yaw)
+
+
+def test_rounding_is_in_every_step_that_moves(told: Told) -> None:
+    rows = driving(told).rounded().rows
+    assert rows[np.abs(rows[:, 0]) > 0.01, 2].all()
+
+
+def test_the_time_of_lines_is_in_blocks() -> None:
+    assert 10 <= np.count_nonzero(driving(late(1, 10.0, "batches")).late().rows[:, 2]) <= 21
+
+
+def test_nothing_is_missed_where_all_lines_came(told: Told) -> None:
+    assert not driving(told).missed().rows[:, 2:].any()
+
+
+def test_wheels_of_a_side_that_agree_contradict_nobody(told: Told) -> None:
+    assert not driving(told).contradicted().rows[:, 2:].any()
+
+
+def test_where_a_gyro_turns_no_wheel_errs_in_the_heading(told: Told) -> None:
+    steps = driving(told, gyro=True).rounded()
+    assert steps.by_gyro
+    assert steps.rows[:, 2].any()
+    assert not steps.rows[:, 3].any()
+
+
+def test_to_the_left_a_step_turns_by_as_much_and_errs_to_the_other_side() -> None:
+    right = [0.1, -0.2, 1.0, 2.0, 0.3, 0.4, 5.0, 6.0, 7.0]
+    left = [0.1, 0.2, 1.0, 2.0, 0.3, -0.4, 5.0, 6.0, 7.0]
+    assert Steps(np.array([right, left])).to_the_left().rows.tolist() == [left, left]
