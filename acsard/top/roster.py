@@ -1,13 +1,11 @@
-"""One line per robot of a fleet, for any width. This module is pure and needs no library."""
+"""One line per robot of a fleet, for any width. This module is pure."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from msgspec import Struct
-
+from acsard.client.fleet import Row
 from acsard.core.formatting import printable, rough, signed
-from acsard.core.messages.schema import RobotState
 from acsard.top.teleop import reason
 
 HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "FILE", "SEEN", "WHY")
@@ -31,20 +29,6 @@ WIDE = 72
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
 """Modes that need attention; they are listed first, because the lines may not all fit."""
-
-
-class Row(Struct, frozen=True):
-    """The known facts of one robot."""
-
-    robot_id: str
-    here: bool
-    """True while the liveliness token of its daemon is present."""
-    state: RobotState | None
-    age: float
-    """Age of `state` in s; inf if the only state is an answer that a storage may have sent."""
-    version: str
-    silent: bool = False
-    """Whether the robot counts as silent."""
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:

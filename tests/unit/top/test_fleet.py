@@ -11,11 +11,11 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
+from acsard.client import fleet as fleets
 from acsard.client.follower import FLEET_ASK_S
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Info, Message, Time
 from acsard.daemon.bus.address import Address
-from acsard.top import fleet as fleets
 from acsard.top.fleet import Fleet
 from acsard.top.roster import table
 from tests.unit.top.screens import STATE
@@ -53,8 +53,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 @pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch) -> Session:
-    monkeypatch.setattr(fleets, "MOST", 3)
+def session() -> Session:
     return Session()
 
 
@@ -71,7 +70,7 @@ def fleet_of(
             said = {"state": replace(STATE, stamp=Time(next(stamps))), "info": INFO}
             take(sample_of(name, key, said[key]))
 
-    return Fleet(robot, ids)
+    return Fleet(robot, ids, most=3)
 
 
 def sample_of(name: str, key: str, said: Message) -> Any:
@@ -121,7 +120,7 @@ def test_the_version_of_a_robot_that_publishes_its_state_often_is_asked_for(
     fleet = fleet_of(session, ("robot1",), ("robot1",))
     session.comes("robot1")
     for _ in range(3):
-        fleet._state(sample_of("robot1", "state", STATE), asked=False)
+        fleet._state(sample_of("robot1", "state", STATE))
         version = fleet.rows()[0].version
         clock.now += 0.1
     assert version == "0.1"

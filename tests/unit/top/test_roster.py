@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.top.roster import HEADS, Row, table
+from acsard.client.fleet import Row
+from acsard.top.roster import HEADS, table
 from tests.each import each
 from tests.unit.top.screens import STATE
 
