@@ -25,8 +25,16 @@ from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices, Objections
 from acsard.foxglove.relay import Relay
 from acsard.foxglove.robot_facts import Facts, learn
-from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, start
-from acsard.foxglove.services import CALLED, STOPS, services
+from acsard.foxglove.server import (
+    CALLED,
+    STOPS,
+    Listener,
+    Refusals,
+    Shown,
+    as_parameters,
+    services,
+    start,
+)
 from acsard.foxglove.viewer_parameters import Settings
 from acsard.host import clock
 

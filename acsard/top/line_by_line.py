@@ -7,9 +7,9 @@ import shutil
 import sys
 import time
 
-from acsard.top.key_reader import keys, until_told
 from acsard.top.keyboard import Ride
 from acsard.top.teleop import HELP, Teleop, moves, news, parting
+from acsard.top.terminal import keys, until_told
 
 PERIOD_S = 0.05
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from gzip import decompress
 from pathlib import Path
@@ -17,12 +18,14 @@ from urllib.parse import parse_qsl
 
 import msgspec
 from aiohttp import web
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType, inspect
 
 from acsard import __version__
+from acsard.core.config.live import WHEN, flat, live
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
+from acsard.core.ros.parameters import kind_of
 from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
@@ -30,25 +33,32 @@ from acsard.host.threads import NoThreadError, in_thread
 from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
-from acsard.web.answers import READ_S, TroubleError, reply, sent, sent_in_pieces, takes_gzip
+from acsard.web.answers import (
+    PAGE,
+    READ_S,
+    File,
+    Files,
+    TroubleError,
+    reply,
+    sent,
+    sent_in_pieces,
+    takes_gzip,
+)
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
 from acsard.web.calls import Calls
 from acsard.web.camera import SEND_S, Camera
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
-from acsard.web.files import PAGE, File, Files
 from acsard.web.fleet import Fleet
-from acsard.web.frames import MAX_BYTES, Begin
 from acsard.web.guide import Choices, Guide
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
+from acsard.web.metrics import Counts
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.reports import POLICY, Reports, ReportState, State
 from acsard.web.robots import Robots
 from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Problem, Route, services, values
-from acsard.web.settings_form import Setting, rows
+from acsard.web.socket_messages import MAX_BYTES, Begin
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
-from acsard.web.viewer import HEARTBEAT_S, Viewer
+from acsard.web.viewer import HEARTBEAT_S, Hand, Viewer
 
 BODY_S = 5.0
 """Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
@@ -86,6 +96,18 @@ class Caller(Struct, frozen=True):
     role: Role
     name: str
     full: Annotated[str, Meta(description='reason to refuse another WebSocket, or ""')]
+
+
+class Setting(Struct, frozen=True, omit_defaults=True):
+    """One setting, with its value, its explanation and its allowed values."""
+
+    key: str
+    value: Any
+    what: str
+    when: str
+    low: float | UnsetType = UNSET
+    high: float | UnsetType = UNSET
+    choices: list[str] | UnsetType = UNSET
 
 
 class Page:
@@ -253,7 +275,7 @@ class Page:
 
     async def settings(self, request: web.Request) -> web.StreamResponse:
         """Return the settings that can be changed at run time, with their present values."""
-        return reply(rows(msgspec.json.decode(await self._value("config"))))
+        return reply(settings_in(msgspec.json.decode(await self._value("config"))))
 
     async def guide(self, request: web.Request) -> web.StreamResponse:
         """Return the checks and calibrations that a maintainer may start."""
@@ -331,6 +353,26 @@ class Page:
             raise TroubleError(504, str(error)) from None
         except (MendableError, DecodeError, TimeoutError) as error:
             raise TroubleError(503, str(error) or "no answer in time") from None
+
+
+def settings_in(config: Mapping[str, Any]) -> list[Setting]:
+    """Return the changeable settings in the order of `config`, a value of the key `config`."""
+    return [
+        Setting(key, value, told.what, WHEN[told.when], **_allowed(key))
+        for key, value in flat(config)
+        if (told := live(key)) is not None
+    ]
+
+
+def _allowed(key: str) -> dict[str, Any]:
+    """Return the range or the choices of a setting, as fields of `Setting`."""
+    kind = kind_of(key)
+    match kind.type if isinstance(kind, inspect.Metadata) else kind:
+        case inspect.FloatType(ge=float(low), le=float(high)):
+            return {"low": low, "high": high}
+        case inspect.LiteralType(values=choices):
+            return {"choices": [str(one) for one in choices]}
+    return {}
 
 
 async def _body_of(request: web.Request) -> bytes:

@@ -119,8 +119,8 @@ def _row(one: fleet.Row) -> Row:
     state = one.state if math.isfinite(one.age) else None
     version = one.version[:LONG]
     if state is None:
-        gone = ("gone", "its daemon has ended") if one.here is False else (None, "")
-        return Row(one.robot_id, *gone, None, "", None, version)
+        mode, reason = ("gone", "its daemon has ended") if one.here is False else (None, "")
+        return Row(one.robot_id, mode, reason, None, "", None, version)
     age = round(one.age, 3)
     if one.here is False:
         was = f"its daemon has ended; it was {state.mode}"

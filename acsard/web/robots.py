@@ -25,8 +25,8 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.mailbox import Mailbox
 from acsard.host.threads import in_thread
-from acsard.web.counts import Counts
 from acsard.web.last_minute import Minute, Plotted
+from acsard.web.metrics import Counts
 from acsard.web.streams import UNREADY, Stream, Streams
 
 LOOK_S = 0.1

@@ -25,19 +25,18 @@ from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import BEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
+from acsard.web.answers import PAGE
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.calls import Calls
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
-from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
-from acsard.web.frames import PROGRAM
-from acsard.web.guide import Guide
-from acsard.web.jobs import Reach
+from acsard.web.guide import Guide, Reach
 from acsard.web.listen import Listen, bound, own_name, require_certificate
+from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
+from acsard.web.socket_messages import PROGRAM
 from acsard.web.tokens import Vault
+from acsard.web.viewer import Hand
 
 TIDY_S, TELL_S = 1.0, 1.0
 

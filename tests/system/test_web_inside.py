@@ -21,15 +21,14 @@ from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
 from acsard.web.app import DEFAULT, Page
 from acsard.web.calls import Calls
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
-from acsard.web.guide import Guide
-from acsard.web.jobs import Reach
+from acsard.web.guide import Guide, Reach
 from acsard.web.limits import OVERRUNS, UNREAD_BYTES
+from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
 from acsard.web.tokens import Vault
+from acsard.web.viewer import Hand
 from tests.system.browser import Hands, run
 from tests.system.harness import PATIENCE_S, Daemon, seconds
 

@@ -16,7 +16,7 @@ from acsard.core.messages.schema import RobotState, Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
 from acsard.web import robots, streams
-from acsard.web.counts import Counts
+from acsard.web.metrics import Counts
 from acsard.web.robots import LOOK_S, About, Robots
 from acsard.web.streams import Stream
 from tests.unit.top.screens import STATE
