@@ -45,20 +45,16 @@ from acsard.web.answers import (
     takes_gzip,
 )
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
-from acsard.web.calls import Calls
 from acsard.web.camera import SEND_S, Camera
-from acsard.web.fleet import Fleet
-from acsard.web.guide import Choices, Guide
+from acsard.web.guide import Choices
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
-from acsard.web.metrics import Counts
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.reports import POLICY, Reports, ReportState, State
-from acsard.web.robots import Robots
 from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_BYTES, Begin
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
-from acsard.web.viewer import HEARTBEAT_S, Hand, Viewer
+from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
 """Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
@@ -115,28 +111,23 @@ class Page:
 
     def __init__(
         self,
-        robots: Robots,
-        hand: Hand,
-        calls: Calls,
-        fleet: Fleet,
-        counts: Counts,
+        parts: Parts,
         vault: Vault,
         names: AbstractSet[str],
         acceptor: Acceptor,
-        guide: Guide,
         page: Path = PAGE,
         rules: WebConfig = DEFAULT,
     ) -> None:
         """Make the application; `names` and `rules` are those of `Admission`."""
-        self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
-        self._guide, self._counts, self._vault, self._acceptor = guide, counts, vault, acceptor
-        self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
+        self._parts, self._vault, self._acceptor = parts, vault, acceptor
+        self._robots, self._files, self._reports = parts.robots, Files(page), Reports()
+        self._box = BlackBox(parts.robots)
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
         """The files of the page, and when each was read or compared, by the event loop's clock."""
         self._viewers: set[Viewer] = set()
-        self._admission = Admission(robots.id, names, vault, acceptor, counts, rules)
+        self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
@@ -236,10 +227,7 @@ class Page:
             )
             await served.prepare(request)
             _limit_buffer(request)
-            viewer = Viewer(
-                served, request, who, self._robots, self._hand, self._calls, self._fleet,
-                self._guide, self._counts, camera=self._has_camera,
-            )  # fmt: skip
+            viewer = Viewer(served, request, who, self._parts, camera=self._has_camera)
             self._viewers.add(viewer)
             try:
                 await viewer.run()
@@ -255,7 +243,7 @@ class Page:
         return web.Response(body=DOCUMENT, content_type=JSON)
 
     async def metrics(self, request: web.Request) -> web.StreamResponse:
-        robots, counts = self._robots, self._counts
+        robots, counts = self._robots, self._parts.counts
         body = metrics.text(
             robots.id, robots.state, not robots.gone, len(self._viewers), counts.all(),
             counts.refused(),
@@ -279,7 +267,7 @@ class Page:
 
     async def guide(self, request: web.Request) -> web.StreamResponse:
         """Return the checks and calibrations that a maintainer may start."""
-        return reply(await self._guide.choices(simulated=self._robots.about.simulated))
+        return reply(await self._parts.guide.choices(simulated=self._robots.about.simulated))
 
     async def service(self, request: web.Request) -> web.StreamResponse:
         """Call a service with the fields of a JSON object as its arguments."""
@@ -293,7 +281,7 @@ class Page:
             text = "robot must be the id of a robot; a robot of another page can only be stopped"
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
-        told = await self._calls.call(request[WHO], verb, given, robot)
+        told = await self._parts.calls.call(request[WHO], verb, given, robot)
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
@@ -348,7 +336,7 @@ class Page:
     async def _value(self, key: str) -> bytes:
         """Return the last value of a key as JSON."""
         try:
-            return as_json(*await self._calls.get(self._robots.id, key))
+            return as_json(*await self._parts.calls.get(self._robots.id, key))
         except NoAnswerError as error:
             raise TroubleError(504, str(error)) from None
         except (MendableError, DecodeError, TimeoutError) as error:

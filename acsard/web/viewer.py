@@ -120,6 +120,15 @@ class Hand:
         self._counts.add("commands_dropped")
 
 
+class Parts:
+    """The parts of the server that all viewers and the page share."""
+
+    def __init__(self, robots: Robots, guide: Guide, counts: Counts) -> None:
+        self.robots, self.guide, self.counts = robots, guide, counts
+        self.hand, self.fleet = Hand(lambda: robots.client, counts), Fleet(robots)
+        self.calls = Calls(robots, guide.stop, self.fleet.sees)
+
+
 class Viewer:
     """One connected client; it lives as long as its connection."""
 
@@ -128,34 +137,29 @@ class Viewer:
         socket: web.WebSocketResponse,
         request: web.Request,
         who: Who,
-        robots: Robots,
-        hand: Hand,
-        calls: Calls,
-        fleet: Fleet,
-        guide: Guide,
-        counts: Counts,
+        parts: Parts,
         *,
         camera: bool,
     ) -> None:
         self.who, self._camera = who, camera
+        self._robots, self._hand, self._calls = parts.robots, parts.hand, parts.calls
+        self._fleet, self._guide, self._counts = parts.fleet, parts.guide, parts.counts
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
-        self.sender = public_name(whole, robots.certificate)
+        self.sender = public_name(whole, parts.robots.certificate)
         """Public name that `state.sender` has while this viewer drives. The page never learns the
         secret part."""
         self._socket = socket
-        self._robots, self._hand, self._calls = robots, hand, calls
-        self._fleet, self._guide, self._counts = fleet, guide, counts
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
-        self._out = Outgoing(socket, request, counts, who.origin)
-        self._keys = Keys(self._out, robots, self._start, who.token or who.name)
+        self._out = Outgoing(socket, request, parts.counts, who.origin)
+        self._keys = Keys(self._out, parts.robots, self._start, who.token or who.name)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
         self._stamp_ns = -1
         """Stamp of the last command."""
-        self._gone, self._about = "", robots.about
+        self._gone, self._about = "", parts.robots.about
         self._fleet_due: float | None = None
 
     async def run(self) -> None:

@@ -18,12 +18,10 @@ from acsard.web import app
 from acsard.web.acceptor import Acceptor
 from acsard.web.app import Page, settings_in
 from acsard.web.callers import MAINTAINER
-from acsard.web.calls import Calls
-from acsard.web.fleet import Fleet
 from acsard.web.guide import Guide, Reach
 from acsard.web.metrics import Counts
 from acsard.web.tokens import Vault
-from acsard.web.viewer import Hand
+from acsard.web.viewer import Parts
 from tests.each import each
 from tests.unit.web.test_fleet import robots
 
@@ -49,12 +47,9 @@ def test_a_phone_stays_if_no_thread_can_read_the_tokens_and_leaves_if_the_disk_h
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def story() -> list[str]:
-        counts, ours, ends = Counts(), robots(None), list[str]()
-        page = Page(
-            ours, Hand(lambda: None, counts), Calls(ours), Fleet(ours), counts,
-            Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts),
-            Guide(Reach("", "", "", ""), ""),
-        )  # fmt: skip
+        counts, ends = Counts(), list[str]()
+        parts = Parts(robots(None), Guide(Reach("", "", "", ""), ""), counts)
+        page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))
         page._viewers.add(Phone(ends))  # type: ignore[arg-type]
         monkeypatch.setattr(app, "in_thread", fails(error))
         await page.tidy()

@@ -11,27 +11,17 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
-from acsard.core.messages.encodings import encode
-from acsard.core.messages.schema import RobotState, Time
+from acsard.client.watch import Watch
+from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
-from acsard.web import robots, streams
+from acsard.web import robots
 from acsard.web.metrics import Counts
-from acsard.web.robots import LOOK_S, About, Robots
-from acsard.web.streams import Stream
+from acsard.web.robots import LOOK_S, About, Robots, _Asking
+from tests.unit.client.test_watch import UNREADABLE, Robot, sample_of
 from tests.unit.top.screens import STATE
 
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
-
-
-def sample_of(state: RobotState) -> Any:
-    payload = SimpleNamespace(to_bytes=lambda: encode(state, "json"))
-    return SimpleNamespace(encoding="application/json", payload=payload)
-
-
-UNREADABLE = SimpleNamespace(
-    encoding="application/json", payload=SimpleNamespace(to_bytes=lambda: b"{}")
-)
 
 
 class World:
@@ -43,7 +33,6 @@ class World:
         self.asked = 0
         clock = SimpleNamespace(mono_ns=lambda: round(self.now * NS_PER_S))
         monkeypatch.setattr(robots, "clock", clock)
-        monkeypatch.setattr(streams, "clock", clock)
         monkeypatch.setattr(robots, "LOOK_S", 0.0)
 
         async def at_once(call: Callable[[], Any], timeout: float | None) -> Any:
@@ -52,14 +41,14 @@ class World:
         monkeypatch.setattr(robots, "in_thread", at_once)
         never: Any = None
         self.robots = Robots(Address("tcp/x:1", "acsar", ""), never, ABOUT, Counts())
-        client: Any = SimpleNamespace(ask=self._ask)
-        self.robots.client = client
+        self.robot: Any = Robot()
+        answer = self.robot.ask
 
-    def _ask(self, name: str, take: Callable[[Any], object]) -> None:
-        assert name == "state"
-        self.asked += 1
-        if (answer := self.answers()) is not None:
-            take(answer)
+        def ask(name: str, take: Callable[[Any], object]) -> None:
+            self.asked, self.robot.answer = self.asked + 1, self.answers()
+            answer(name, take)
+
+        self.robot.ask = ask
 
     def state(self) -> Any:
         return sample_of(replace(STATE, stamp=Time.from_ns(round(self.now * NS_PER_S))))
@@ -70,14 +59,14 @@ class World:
         `publishes` returns the sample that the robot publishes at a time, or None.
         """
         found: list[tuple[float, str]] = []
-        stream = Stream()
 
         async def story() -> None:
-            watching = asyncio.create_task(self.robots._watch(stream))
+            watch = Watch(_Asking(self.robot), self.now)
+            watching = asyncio.create_task(self.robots._follow(watch))
             began, before = self.now, self.robots.gone
             while self.now - began < seconds:
                 if (sample := publishes(self.now - began)) is not None:
-                    stream.take(sample)
+                    self.robot.queue.append(sample)
                 for _ in range(5):  # each task of the page has its turn
                     await asyncio.sleep(0)
                 if self.robots.gone != before:
