@@ -19,8 +19,8 @@ from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.fleet import Fleet
-from acsard.top.line_by_line import output_size
 from acsard.top.roster import table
+from acsard.top.terminal import output_size
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -18,7 +18,7 @@ import zenoh
 
 from acsard.client import Client
 from acsard.client.commander import LONGEST_S
-from acsard.client.watch import Watch
+from acsard.client.follower import Watch
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove.drives import Drives
@@ -30,12 +30,12 @@ from acsard.foxglove.server import (
     STOPS,
     Listener,
     Refusals,
+    Settings,
     Shown,
     as_parameters,
     services,
     start,
 )
-from acsard.foxglove.viewer_parameters import Settings
 from acsard.host import clock
 
 GATHER_S = 0.015

@@ -48,8 +48,7 @@ from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offer
 from acsard.web.camera import SEND_S, Camera
 from acsard.web.guide import Choices
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
-from acsard.web.recordings import BlackBox, Recording
-from acsard.web.reports import POLICY, Reports, ReportState, State
+from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportState, State
 from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_BYTES, Begin
 from acsard.web.streams import as_json

@@ -12,8 +12,7 @@ import zenoh
 from msgspec import Struct
 
 from acsard.client import Client
-from acsard.client.follower import restarted
-from acsard.client.watch import Watch
+from acsard.client.follower import Watch, restarted
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
 from acsard.core.thinning import Place, Track

@@ -10,15 +10,14 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
-from acsard.client.watch import Watch
+from acsard.client.follower import ASK_S, FIRST_S, SILENT_S, Watch
 from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
 from acsard.web import robots
 from acsard.web.metrics import Counts
 from acsard.web.robots import LOOK_S, About, Robots, _Asking
-from tests.unit.client.test_watch import UNREADABLE, Robot, sample_of
+from tests.unit.client.test_follower import UNREADABLE, Robot, sample_of
 from tests.unit.top.screens import STATE
 
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
@@ -41,14 +40,7 @@ class World:
         monkeypatch.setattr(robots, "in_thread", at_once)
         never: Any = None
         self.robots = Robots(Address("tcp/x:1", "acsar", ""), never, ABOUT, Counts())
-        self.robot: Any = Robot()
-        answer = self.robot.ask
-
-        def ask(name: str, take: Callable[[Any], object]) -> None:
-            self.asked, self.robot.answer = self.asked + 1, self.answers()
-            answer(name, take)
-
-        self.robot.ask = ask
+        self.robot = Answering(self)
 
     def state(self) -> Any:
         return sample_of(replace(STATE, stamp=Time.from_ns(round(self.now * NS_PER_S))))
@@ -61,7 +53,8 @@ class World:
         found: list[tuple[float, str]] = []
 
         async def story() -> None:
-            watch = Watch(_Asking(self.robot), self.now)
+            client: Any = self.robot
+            watch = Watch(_Asking(client), self.now)
             watching = asyncio.create_task(self.robots._follow(watch))
             began, before = self.now, self.robots.gone
             while self.now - began < seconds:
@@ -78,6 +71,19 @@ class World:
 
         asyncio.run(story())
         return found
+
+
+class Answering(Robot):
+    """The client, whose queries the world answers."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__()
+        self._world = world
+
+    def ask(self, name: str, take: Any) -> None:
+        self._world.asked += 1
+        self.answer = self._world.answers()
+        super().ask(name, take)
 
 
 @pytest.fixture
