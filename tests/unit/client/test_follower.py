@@ -18,10 +18,9 @@ from acsard.client.follower import (
     Watch,
     restarted,
 )
-from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import RobotState, Time
 from acsard.daemon.bus.subscription import QUEUED
-from tests.unit.top.screens import BEFORE, STATE
+from tests.unit.top.screens import BEFORE, STATE, raw_sample, sample_of
 
 TICK = 0.01
 
@@ -144,14 +143,7 @@ class Robot:
             take(self.answer)
 
 
-def sample_of(state: RobotState) -> Any:
-    payload = SimpleNamespace(to_bytes=lambda: encode(state, "json"))
-    return SimpleNamespace(encoding="application/json", payload=payload)
-
-
-UNREADABLE = SimpleNamespace(
-    encoding="application/json", payload=SimpleNamespace(to_bytes=lambda: b"{}")
-)
+UNREADABLE = raw_sample(b"{}")
 
 
 def test_the_states_that_arrived_are_returned_in_order() -> None:

@@ -13,12 +13,11 @@ from msgspec.structs import replace
 
 from acsard.client import fleet as fleets
 from acsard.client.follower import FLEET_ASK_S
-from acsard.core.messages.encodings import encode
-from acsard.core.messages.schema import Info, Message, Time
+from acsard.core.messages.schema import Info, Time
 from acsard.daemon.bus.address import Address
 from acsard.top.fleet import Fleet
 from acsard.top.roster import table
-from tests.unit.top.screens import STATE
+from tests.unit.top.screens import STATE, sample_of
 
 
 class Session:
@@ -68,15 +67,9 @@ def fleet_of(
     def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
         if name in answering:
             said = {"state": replace(STATE, stamp=Time(next(stamps))), "info": INFO}
-            take(sample_of(name, key, said[key]))
+            take(sample_of(said[key], f"acsard/{name}/{key}"))
 
     return Fleet(robot, ids, most=3)
-
-
-def sample_of(name: str, key: str, said: Message) -> Any:
-    payload = SimpleNamespace(to_bytes=lambda: encode(said, "json"))
-    full = f"acsard/{name}/{key}"
-    return SimpleNamespace(key_expr=full, payload=payload, encoding="application/json")
 
 
 INFO = Info("robot1", "0.1", 1, "sim", simulated=True, rate=100.0, listen=[], connect=[])
@@ -120,7 +113,7 @@ def test_the_version_of_a_robot_that_publishes_its_state_often_is_asked_for(
     fleet = fleet_of(session, ("robot1",), ("robot1",))
     session.comes("robot1")
     for _ in range(3):
-        fleet._state(sample_of("robot1", "state", STATE))
+        fleet._state(sample_of(STATE, "acsard/robot1/state"))
         version = fleet.rows()[0].version
         clock.now += 0.1
     assert version == "0.1"
@@ -166,7 +159,7 @@ class Remembers:
 
     def ask(self, key: str, take: Callable[[Any], object]) -> None:
         if key == "state":
-            take(sample_of("robot1", key, self.stored))
+            take(sample_of(self.stored, f"acsard/robot1/{key}"))
 
 
 def told(fleet: Fleet, clock: Clock, seconds: float) -> str:
@@ -198,16 +191,3 @@ def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
     assert told(fleet, clock, 2.5).endswith("commanded by app")
     assert "SILENT" not in told(fleet, clock, 0.0)
     assert told(fleet, clock, 9.0).endswith("SILENT, was: commanded by app")
-
-
-def test_a_robot_whose_clock_was_set_back_is_heard_by_its_answers(
-    session: Session, clock: Clock
-) -> None:
-    robot: Any = Remembers(session)
-    fleet = Fleet(robot, ("robot1",))
-    session.comes("robot1")
-    told(fleet, clock, 0.5)
-    for second in (2000, 1, 3, 5):  # a clock that has run for long, and one that restarts
-        robot.stored = replace(STATE, stamp=Time(second))
-        told(fleet, clock, 2.5)
-    assert "SILENT" not in told(fleet, clock, 0.0)

@@ -17,8 +17,8 @@ from acsard.daemon.bus.address import Address
 from acsard.web import robots
 from acsard.web.metrics import Counts
 from acsard.web.robots import LOOK_S, About, Robots, _Asking
-from tests.unit.client.test_follower import UNREADABLE, Robot, sample_of
-from tests.unit.top.screens import STATE
+from tests.unit.client.test_follower import UNREADABLE, Robot
+from tests.unit.top.screens import STATE, sample_of
 
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
@@ -106,13 +106,6 @@ def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
     found = world.told(30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None)
     assert [gone for _, gone in found] == [""]
     assert world.asked > 30.0 / (2 * ASK_S + 2 * LOOK_S)
-
-
-def test_a_storage_that_answers_for_a_daemon_that_died_does_not_hide_it(world: World) -> None:
-    last = world.state()
-    world.answers = lambda: last
-    found = world.told(10.0, lambda t: last if t == 0.0 else None)
-    assert [bool(gone) for _, gone in found] == [False, True]
 
 
 def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
