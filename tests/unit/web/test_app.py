@@ -17,12 +17,12 @@ from acsard.host.threads import NoThreadError
 from acsard.web import app
 from acsard.web.acceptor import Acceptor
 from acsard.web.app import Page, settings_in
-from acsard.web.callers import MAINTAINER
 from acsard.web.guide import Guide, Reach
 from acsard.web.metrics import Counts
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
 from tests.each import each
+from tests.unit.web.test_callers import MAINTAINER
 from tests.unit.web.test_fleet import robots
 
 
