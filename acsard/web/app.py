@@ -12,7 +12,6 @@ import socket
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from gzip import decompress
-from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
@@ -34,7 +33,6 @@ from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
 from acsard.web.answers import (
-    PAGE,
     READ_S,
     File,
     Files,
@@ -114,12 +112,11 @@ class Page:
         vault: Vault,
         names: AbstractSet[str],
         acceptor: Acceptor,
-        page: Path = PAGE,
         rules: WebConfig = DEFAULT,
     ) -> None:
         """Make the application; `names` and `rules` are those of `Admission`."""
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
-        self._robots, self._files, self._reports = parts.robots, Files(page), Reports()
+        self._robots, self._files, self._reports = parts.robots, Files(), Reports()
         self._box = BlackBox(parts.robots)
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)

@@ -25,7 +25,6 @@ from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import BEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
-from acsard.web.answers import PAGE
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.guide import Guide, Reach
@@ -67,11 +66,9 @@ class Wanted(Struct, frozen=True):
     """Directory of the access tokens."""
     file: str = ""
     """Configuration file named on the command line, or ""."""
-    next_port: bool = False
-    """Whether to use a later port if the requested one is taken."""
-    held: bool = False
-    """Whether the server must end when its standard input closes."""
-    page: Path = PAGE
+    supervised: bool = False
+    """Whether the daemon started the server. It then uses a later port if the requested one is
+    taken, and ends when its standard input closes."""
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
@@ -83,7 +80,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     leaving = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
-    if wanted.held:
+    if wanted.supervised:
         end_with_parent(signal.SIGTERM)
         os.nice(NICE)
     counts = Counts()
@@ -94,7 +91,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
     parts = Parts(robots, guide, counts)
     vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
-    page = Page(parts, vault, names, acceptor, wanted.page, wanted.config.web)
+    page = Page(parts, vault, names, acceptor, wanted.config.web)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
         shutdown_timeout=LEAVE_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
@@ -104,7 +101,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
         stack.push_async_callback(guide.close)
-        places = bound(wanted.listen, wanted.next_port)
+        places = bound(wanted.listen, wanted.supervised)
         for one, opened in places:
             tls = secure if one.secure else None
             acceptor.listen(opened, tls, lambda: Reader(counts, runner.server))
@@ -128,7 +125,7 @@ async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wante
         asyncio.create_task(_tidy(page)),
         asyncio.wrap_future(parts.hand.outbox.dead),
     ]
-    if wanted.held:
+    if wanted.supervised:
         work.append(asyncio.create_task(_held(leaving)))
     try:
         done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)

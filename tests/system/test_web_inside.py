@@ -223,7 +223,7 @@ def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
 
 def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
     address = Address("tcp/127.0.0.1:1", "acsar", "")
-    wanted = Wanted(Config(), address, (), "", tmp_path, next_port=False, held=False)
+    wanted = Wanted(Config(), address, (), "", tmp_path)
 
     async def story() -> None:
         inside.parts.hand.outbox.dead.set_exception(MemoryError("no room"))
