@@ -271,9 +271,5 @@ def _require_stop(verb: str, robot: str) -> None:
 def _named(client: Client, robot: str, who: Who) -> Client:
     """Return a client for `robot` under the caller's name, which the daemon logs."""
     other = client.like(robot)
-    other.name = _caller(who)
+    other.name = f"{who.name}@page"
     return other
-
-
-def _caller(who: Who) -> str:
-    return f"{who.name}@page"
