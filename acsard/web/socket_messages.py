@@ -248,7 +248,7 @@ class Row(Struct, frozen=True):
     """Measured forward speed, m/s."""
     link: str
     age: float | None
-    """Seconds since the last state arrived or the daemon ended."""
+    """Seconds since the last state arrived; None before the first one."""
     version: str
     """Version of the daemon; "" until it is reported."""
     settings_differ: str = ""
