@@ -24,9 +24,8 @@ from acsard.core.values import AcsardError
 from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.output import has_screen, plain
 from acsard.top.feed import Feed
-from acsard.top.fleet import Fleet
 from acsard.top.keyboard import Ride
-from acsard.top.roster import table
+from acsard.top.roster import Roster, table
 from acsard.top.teleop import HELP, Teleop, lines, moves, news, parting
 from acsard.top.view import screen
 
@@ -98,7 +97,7 @@ def part(ride: Ride) -> None:
         time.sleep(KEYS_S)
 
 
-def roster(fleet: Fleet) -> None:
+def roster(fleet: Roster) -> None:
     """Show a line for each robot and update them until a key or a signal."""
     console = Console()
 

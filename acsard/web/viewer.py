@@ -28,7 +28,7 @@ from acsard.host.rate_limits import Bucket, Buckets
 from acsard.web import socket_messages
 from acsard.web.callers import RefusedError, Who
 from acsard.web.calls import Calls
-from acsard.web.fleet import Fleet
+from acsard.web.fleet_rows import Fleet
 from acsard.web.guide import Guide
 from acsard.web.limits import COMMANDS, MESSAGES, OVERRUNS
 from acsard.web.metrics import Counts

@@ -23,7 +23,7 @@ from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
 from tests.each import each
 from tests.unit.web.test_callers import MAINTAINER
-from tests.unit.web.test_fleet import robots
+from tests.unit.web.test_fleet_rows import robots
 
 
 def fails(error: Exception) -> Callable[..., Awaitable[Any]]:

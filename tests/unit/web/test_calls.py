@@ -26,11 +26,11 @@ from acsard.web.calls import (
     Merged,
     Stops,
 )
-from acsard.web.fleet import Fleet
+from acsard.web.fleet_rows import Fleet
 from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 from tests.unit.web.test_callers import MAINTAINER
-from tests.unit.web.test_fleet import quiet, robots, row
+from tests.unit.web.test_fleet_rows import quiet, robots, row
 from tests.unit.web.test_metrics import STATE
 
 PATIENCE_S = 20.0
