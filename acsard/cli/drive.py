@@ -10,8 +10,7 @@ import sys
 from acsard.cli.connection import add_bus, connected, require_one
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
-from acsard.terminal.output import has_screen
-from acsard.top import line_by_line, terminal
+from acsard.top import terminal
 from acsard.top.keyboard import Keyboard, Ride
 from acsard.top.teleop import HELP
 
@@ -44,11 +43,8 @@ def main(args: argparse.Namespace) -> int:
             raise (NotPermittedError if us.role else NoAnswerError)(us.words())
         ride = Ride(robot, Keyboard(args.linear, args.angular))
         try:
-            if has_screen():
-                terminal.drive(ride.step, ride.seen)
-            else:
-                line_by_line.drive(ride)
+            terminal.drive(ride)
         finally:
             ride.end()
-        line_by_line.part(ride)
+        terminal.part(ride)
     return 0

@@ -18,9 +18,8 @@ from acsard.daemon.bus.robot_discovery import ALL
 from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
-from acsard.top.fleet import Fleet
-from acsard.top.line_by_line import output_size
-from acsard.top.roster import table
+from acsard.top.roster import Roster, table
+from acsard.top.terminal import output_size
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     with connected_to_many(args) as (robot, many):
         ids = (many or (robot.where.robot_id,)) if args.id else (ALL,)
-        fleet = Fleet(robot, ids)
+        fleet = Roster(robot, ids)
         if not (args.once or args.json) and has_screen():
             terminal.roster(fleet)
             return int(Exit.OK)

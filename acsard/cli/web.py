@@ -119,8 +119,7 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         tls,
         tokens.place(),
         args.config or "",
-        next_port=args.supervised,
-        held=args.supervised,
+        args.supervised,
     )
     log = Log(config.log)
     try:

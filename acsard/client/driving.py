@@ -24,8 +24,7 @@ from acsard.client.commander import (
     hopeless,
     objection,
 )
-from acsard.client.follower import QUIET_S
-from acsard.client.watch import Followed, Watch
+from acsard.client.follower import QUIET_S, Followed, Watch
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2

@@ -18,16 +18,24 @@ import zenoh
 
 from acsard.client import Client
 from acsard.client.commander import LONGEST_S
-from acsard.client.watch import Watch
+from acsard.client.follower import Watch
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices, Objections
 from acsard.foxglove.relay import Relay
 from acsard.foxglove.robot_facts import Facts, learn
-from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, start
-from acsard.foxglove.services import CALLED, STOPS, services
-from acsard.foxglove.viewer_parameters import Settings
+from acsard.foxglove.server import (
+    CALLED,
+    STOPS,
+    Listener,
+    Refusals,
+    Settings,
+    Shown,
+    as_parameters,
+    services,
+    start,
+)
 from acsard.host import clock
 
 GATHER_S = 0.015

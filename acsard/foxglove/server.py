@@ -1,7 +1,8 @@
-"""The websocket server of foxglove-sdk: its callbacks and its start.
+"""The websocket server of foxglove-sdk: its callbacks, settings, services and its start.
 
 The library implements the protocol. The protocol has no authentication, so the subcommand
-(`cli/foxglove.py`) takes only an address of this machine.
+(`cli/foxglove.py`) takes only an address of this machine. Viewers call the services in JSON, and
+get the daemon's own replies.
 """
 
 from __future__ import annotations
@@ -9,19 +10,34 @@ from __future__ import annotations
 import errno
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from threading import Lock
+from typing import Any
 
 import foxglove
+import msgspec
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, WebSocketServer
 
+from acsard.client import Client as Robot
+from acsard.core.config.live import flat, live
+from acsard.core.config.settings import RosConfig
+from acsard.core.messages.encodings import DecodeError, Decoder, encode
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.schema import MESSAGES, ServiceReply
+from acsard.core.messages.topics import PLAIN_SERVICES, SERVICES
+from acsard.core.ros.names import full_name
+from acsard.core.values import NS_PER_S, AcsardError, Verb
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.viewer_parameters import Settings
+from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 
 BACKLOG = 256
 """Maximum number of waiting messages for a slow viewer; the oldest are dropped."""
+
+POLL_NS = 5 * NS_PER_S
+"""Interval at which the settings are read while a viewer follows them, because other clients change
+them too."""
 
 REFUSED = (
     "a client was refused: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 does not), "
@@ -59,6 +75,95 @@ class Shown:
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
+
+
+class Settings:
+    """The live settings. The server's threads query them; the main thread reads them again."""
+
+    def __init__(self, robot: Robot, notices: Notices, tables: object) -> None:
+        self._robot, self._notices = robot, notices
+        self._lock = Lock()
+        self._known: dict[str, Any] = {}
+        self._read_ns = clock.mono_ns()
+        self._asked = False
+        self._followed: set[str] = set()
+        self._readable = tables is not None
+        self.learn(tables)
+
+    def learn(self, tables: object) -> dict[str, Any]:
+        """Store the configuration and return the settings that changed.
+
+        `tables` is None if this program may not read the configuration.
+        """
+        now = {} if tables is None else live_settings(tables)
+        with self._lock:
+            news = changes(self._known, now)
+            self._known, self._read_ns = now, clock.mono_ns()
+            self._asked, self._readable = False, tables is not None
+        return news
+
+    def get(self, names: Collection[str]) -> dict[str, Any]:
+        """Return the settings with these names, or all, as last read."""
+        with self._lock:
+            self._asked = True
+            return asked(self._known, names)
+
+    def follow(self, names: Collection[str]) -> None:
+        """Record that a viewer follows these settings."""
+        with self._lock:
+            self._followed.update(names)
+
+    def unfollow(self, names: Collection[str]) -> None:
+        """Record that no viewer follows these settings any longer."""
+        with self._lock:
+            self._followed.difference_update(names)
+
+    def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
+        """Change settings, all or none, and return their values afterwards.
+
+        A refusal is reported to the viewers.
+        """
+        try:
+            if any(value is None for value in wishes.values()):
+                raise AcsardError("a setting cannot be removed, only changed")
+            reply = self._robot.set(wishes)
+            said, done = reply.message, reply.success
+            if self._readable:
+                self.learn(self._robot.get("config"))
+        except AcsardError as error:
+            said, done = str(error), False
+        self._notices.say("info" if done else "error", "set", said if done else f"not set: {said}")
+        with self._lock:
+            return asked(self._known, wishes.keys()) if wishes else {}
+
+    def refresh(self) -> dict[str, Any]:
+        """Read the settings again if a viewer needs them; return the settings that changed."""
+        with self._lock:
+            age_ns = clock.mono_ns() - self._read_ns
+            due = (self._asked and age_ns > NS_PER_S) or (self._followed and age_ns > POLL_NS)
+        if not due or not self._readable:
+            return {}
+        try:
+            return self.learn(self._robot.get("config"))
+        except AcsardError:
+            with self._lock:
+                self._read_ns = clock.mono_ns()
+            return {}  # the daemon is gone, which the bridge reports
+
+
+def live_settings(config: object) -> dict[str, Any]:
+    """Return the settings that can be changed at run time, by key, tuples as lists."""
+    found = ((key, value) for key, value in flat(config) if live(key))
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in found}
+
+
+def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Return the settings with these names, or all of them if `names` is empty."""
+    return {key: value for key, value in known.items() if key in names or not names}
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in now.items() if before.get(key) != value}
 
 
 class Listener:
@@ -158,3 +263,54 @@ class Refusals(logging.Handler):
         """Take a line of the library's log."""
         if "handshake failed" in record.getMessage():
             self._notices.say("warning", "refused", REFUSED)
+
+
+CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
+"""Services that are offered; `set` is left out because viewers set parameters instead."""
+
+STOPS: tuple[Verb, ...] = ("stop",)
+"""Services that are offered without `--drive`. Any web page in a local browser can connect, and the
+browser does not identify the page, so only a stop is safe."""
+
+NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
+
+
+def services(robot: Robot, ros: RosConfig, verbs: Iterable[Verb]) -> list[foxglove.Service]:
+    """Return these services of the robot under their ROS names, for example `/acsard/stop`."""
+    return [_service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in verbs]
+
+
+def _service(robot: Robot, verb: Verb, name: str) -> foxglove.Service:
+    payload = "" if verb in PLAIN_SERVICES else SERVICES[verb].payload
+
+    def answer(request: foxglove.ServiceRequest) -> bytes:
+        return encode(called(robot, verb, request.payload), "json")
+
+    schema = foxglove.ServiceSchema(
+        f"acsard/srv/{payload}" if payload else "std_srvs/srv/Trigger",
+        request=_schema(SCHEMAS[payload] if payload else NOTHING),
+        response=_schema(SCHEMAS["ServiceReply"]),
+    )
+    return foxglove.Service(name, schema=schema, handler=answer)
+
+
+def called(robot: Robot, verb: Verb, payload: bytes) -> ServiceReply:
+    """Call a service. An error becomes a negative reply."""
+    try:
+        fields: dict[str, float] = {}
+        if verb not in PLAIN_SERVICES:
+            decoder = Decoder(MESSAGES[SERVICES[verb].payload])
+            fields = msgspec.structs.asdict(decoder.decode("application/json", payload))
+        return robot.call(verb, **fields)
+    except DecodeError as error:
+        return ServiceReply(False, f"{verb} needs a payload like {SERVICES[verb].example}: {error}")
+    except AcsardError as error:
+        return ServiceReply(False, str(error))
+
+
+def _schema(schema: dict[str, Any]) -> foxglove.MessageSchema:
+    data = msgspec.json.encode(schema)
+    return foxglove.MessageSchema(
+        encoding="json",
+        schema=foxglove.Schema(name=schema["title"], encoding="jsonschema", data=data),
+    )

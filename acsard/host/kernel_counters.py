@@ -111,8 +111,7 @@ def scheduled(text: bytes) -> Scheduled:
 
 def steal(text: str, tick_ns: int) -> tuple[int, ...]:
     """Decode the steal time of each processor from `/proc/stat`."""
-    rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
-    return tuple([int(row[8]) * tick_ns for row in rows if row[0] != "cpu" and len(row) > 8])
+    return tuple([int(row[8]) * tick_ns for row in _processors(text) if len(row) > 8])
 
 
 def iowait(text: str, tick_ns: int) -> int:
@@ -120,8 +119,13 @@ def iowait(text: str, tick_ns: int) -> int:
 
     The processors are not added up.
     """
+    return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
+
+
+def _processors(text: str) -> list[list[str]]:
+    """Return the words of the line of each processor in `/proc/stat`, without that of all."""
     rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
-    return max((int(row[5]) * tick_ns for row in rows if row[0] != "cpu"), default=0)
+    return [row for row in rows if row[0] != "cpu"]
 
 
 def stalled(text: str) -> int:
@@ -250,7 +254,7 @@ class Kernel:
         """Read the conditions under which the processor works now."""
         bits = 0
         for path in self._firmware:
-            bits |= _hexadecimal(_text(path))
+            bits |= _number(path, 16)
         low = bool(bits & UNDERVOLTAGE_BIT) or any(_number(path) for path in self._alarms)
         cooled = any(_number(path) > 0 for path in self._coolers)
         slow = (slow_clock(_policy(path)) for path in self._policies)
@@ -311,16 +315,9 @@ def _policy(directory: Path) -> dict[str, str]:
     return {name: _text(directory / name).strip() for name in names}
 
 
-def _number(path: Path) -> int:
+def _number(path: Path, base: int = 10) -> int:
     try:
-        return int(_text(path))
-    except ValueError:
-        return 0
-
-
-def _hexadecimal(text: str) -> int:
-    try:
-        return int(text, 16)
+        return int(_text(path), base)
     except ValueError:
         return 0
 

@@ -46,11 +46,6 @@ class Systemd:
             return
         self._socket = made
 
-    @property
-    def present(self) -> bool:
-        """True if a service manager is connected."""
-        return self._socket is not None
-
     def ready(self) -> None:
         """Report that the start is complete."""
         self._send("READY=1")

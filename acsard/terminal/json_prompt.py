@@ -1,9 +1,10 @@
 """`--json-lines`: a program, such as the robot's page, shows the prompts to a person.
 
-Texts and questions are written to standard output as JSON objects, one per line. Answers, key
-presses and signs of life are read from standard input. The end of the input interrupts the
-subcommand as Ctrl-C does. So does a silence of the program while something may move: the program
-sends as long as it is in contact with the person. deploy/web/README.md describes the fields.
+Texts and questions are written to standard output as JSON objects, one per line, which the page's
+server relays, and describes for programs (`web/openapi.py`). Answers, key presses and signs of life
+are read from standard input. The end of the input interrupts the subcommand as Ctrl-C does. So does
+a silence of the program while something may move: the program sends as long as it is in contact
+with the person. deploy/web/README.md describes the fields.
 """
 
 from __future__ import annotations
@@ -25,15 +26,6 @@ from msgspec import Struct
 from acsard.checkup.findings import Finding
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
-from acsard.terminal.json_messages import (
-    Doing,
-    Found,
-    JobMessage,
-    Progress,
-    Question,
-    Result,
-    Subject,
-)  # fmt: skip
 from acsard.terminal.prompt import Ask
 
 T = TypeVar("T")
@@ -65,6 +57,66 @@ class Line(Struct, frozen=True):
     answer: int = 0
     value: str | float | None = None
     key: bool = False
+
+
+# The lines of the output.
+
+
+class Subject(Struct, frozen=True):
+    """The first line: the tested subject."""
+
+    subject: str
+    simulated: bool
+
+
+class JobMessage(Struct, frozen=True):
+    """A message that stays on the screen."""
+
+    message: str
+
+
+class Doing(Struct, frozen=True):
+    """The current activity; the next one replaces it."""
+
+    doing: str
+
+
+class Progress(Struct, frozen=True):
+    """Completed share of the leg or of the check, 0 to 1."""
+
+    progress: float
+
+
+class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
+    """A question. The reply is one of `answers`, or a number if `answers` is empty."""
+
+    question: int
+    """Number that the answer must quote."""
+    words: str
+    answers: Sequence[str] = ()
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+    usual: float | None = None
+    """Default for an empty answer."""
+    leg: bool = False
+    """True if the robot drives after the answer; a key press stops it."""
+    by_key: bool = False
+    """True if a key press is the intended end of the leg."""
+    wrong: str = ""
+    """Explanation of why the previous answer was rejected."""
+
+
+class Found(Struct, frozen=True):
+    """One finding of a check, sent as soon as it is made."""
+
+    finding: Finding
+
+
+class Result(Struct, frozen=True):
+    """The complete result as printed at a terminal; nothing moves any more."""
+
+    result: str
 
 
 class JsonPrompt:

@@ -6,8 +6,7 @@ import time
 from collections import deque
 
 from acsard.client import Client
-from acsard.client.follower import restarted
-from acsard.client.watch import Watch
+from acsard.client.follower import Watch, restarted
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
 from acsard.host.errors import MendableError, ReplyError

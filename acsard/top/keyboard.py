@@ -10,7 +10,7 @@ import time
 
 from acsard.client import Client
 from acsard.client.commander import GRACE_S, ZEROS, Commander, Wish, objection
-from acsard.client.watch import Watch
+from acsard.client.follower import Watch
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.top.teleop import Teleop
 

@@ -7,7 +7,6 @@ screen with few lines cuts them off.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from textwrap import wrap
 
 from rich.cells import cell_len
@@ -16,7 +15,7 @@ from rich.text import Text
 from acsard.core.formatting import rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.daemon.latencies import NAMES
-from acsard.top.text import ScreenData, clean, count, rule
+from acsard.top.text import ScreenData, clean, count, flow, rule
 from acsard.top.wide_screen import (
     certificate,
     drives,
@@ -113,17 +112,6 @@ def timing(state: RobotState, width: int) -> list[Text]:
             one = state.latencies.get(name)
             figures = None if one is None else one.last_minute if last else one.since_start
             lines.append(Text(f"{name:<16}").append_text(spread(figures)))
-    return lines
-
-
-def flow(parts: Sequence[Text], width: int, inset: int) -> list[Text]:
-    """Put as many parts in a line as fit."""
-    lines: list[Text] = []
-    for part in parts:
-        if lines and lines[-1].cell_len + 2 + part.cell_len <= width:
-            lines[-1].append("  ").append_text(part)
-        else:
-            lines.append(Text(" " * (inset if lines else 0)).append_text(part))
     return lines
 
 

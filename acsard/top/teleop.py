@@ -14,7 +14,7 @@ from rich.text import Text
 from acsard.core.formatting import printable
 from acsard.core.messages.one_line import place, speeds
 from acsard.core.messages.schema import RobotState
-from acsard.top.text import MODES
+from acsard.top.text import MODES, flow
 
 HELP = (
     " u  i  o    arrows drive, too",
@@ -61,8 +61,8 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
         if seen.objection:
             words = f"your keys do not drive: {printable(seen.objection)}"
             shown += _wrapped(words, width, "bold red")
-        shown += map(Text, flow(measured(state), width))
-    shown += map(Text, flow([f"keys ask {asked(seen)}"], width))
+        shown += flow(measured(state), width)
+    shown.append(Text(f"keys ask {asked(seen)}"))
     below = [Text(line, "dim") for line in HELP]
     if height is not None and len(shown) + len(below) >= height:
         shown = [*shown[: max(1, height - len(below))], *below][:height]
@@ -116,23 +116,13 @@ def asked(seen: Teleop) -> str:
     return f"{seen.linear:.2f} m/s, {seen.angular:.2f} rad/s"
 
 
-def measured(state: RobotState) -> list[str]:
+def measured(state: RobotState) -> list[Text]:
     """Return pose and twist, each with its unit."""
-    return [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
+    told = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
+    return [Text(one) for one in told]
 
 
-def flow(parts: Sequence[str], width: int) -> list[str]:
-    """Put as many parts in a line as fit."""
-    found: list[str] = []
-    for part in parts:
-        if found and len(found[-1]) + 2 + len(part) <= width:
-            found[-1] += f"  {part}"
-        else:
-            found.append(part[:width])
-    return found
-
-
-def _words(told: Sequence[str], width: int, figures: Sequence[str] = ()) -> list[str]:
+def _words(told: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
     """Wrap sentences, and figures below them; continued lines are indented."""
     width = max(20, width)
     lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)

@@ -1,32 +1,52 @@
-"""The screens of `top`, `fleet` and `drive`, and `top` as plain text.
+"""The screens of `top`, `fleet` and `drive`, and their output on a terminal without screens.
 
 A screen ends with a key or a signal. ^Z suspends it, and `fg` resumes.
 """
 
 from __future__ import annotations
 
+import errno
 import io
 import os
+import select
+import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
 from acsard.core.values import AcsardError
-from acsard.terminal.output import plain
+from acsard.host.terminal_modes import one_by_one
+from acsard.terminal.output import has_screen, plain
 from acsard.top.feed import Feed
-from acsard.top.fleet import Fleet
-from acsard.top.key_reader import keys, until_told
-from acsard.top.roster import table
-from acsard.top.teleop import Teleop, lines
+from acsard.top.keyboard import Ride
+from acsard.top.roster import Roster, table
+from acsard.top.teleop import HELP, Teleop, lines, moves, news, parting
 from acsard.top.view import screen
 
 PERIOD_S = 0.25
+"""Period in which a screen is drawn, s."""
+
+KEYS_S = 0.05
+"""Period in which the keys of a drive are read, s."""
+
+NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
+"""Shortest time between two reports without a screen, s.
+
+In this order, they apply after a change, while the robot moves, and while nothing happens.
+"""
+
+PART_S = 2.0
+"""Time within which a robot usually stands after its own ramp, s."""
+
+NO_END = 10**9
+
+LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def once(feed: Feed) -> str:
@@ -52,13 +72,32 @@ def live(feed: Feed) -> None:
     _hold(lambda suspend: _watch(draw, console, suspend))
 
 
-def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
-    """Pass the typed keys to `step`, "" if none, and show the result of `seen`, until a signal."""
-    console = Console()
-    _hold(lambda suspend: _steer(step, seen, console, suspend))
+def drive(ride: Ride) -> None:
+    """Drive by the typed keys, and show the robot, until a signal."""
+    if has_screen():
+        console = Console()
+        _hold(lambda suspend: _steer(ride, console, suspend))
+    else:
+        _drive_in_lines(ride)
 
 
-def roster(fleet: Fleet) -> None:
+def part(ride: Ride) -> None:
+    """Wait until the robot stands, at most `PART_S`, and print a last report.
+
+    Without the wait, this report would say that the robot drives although it stops a moment later.
+    """
+    left = time.monotonic()
+    while os.isatty(0) and os.isatty(1):
+        ride.take()
+        seen, took = ride.seen(), time.monotonic() - left
+        rests = seen.state is not None and seen.age < took and not moves(seen.state)
+        if rests or took > PART_S:
+            print("\n".join(parting(seen, output_size().columns)), flush=True)
+            return
+        time.sleep(KEYS_S)
+
+
+def roster(fleet: Roster) -> None:
     """Show a line for each robot and update them until a key or a signal."""
     console = Console()
 
@@ -112,28 +151,20 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
             os.kill(os.getpid(), signal.SIGSTOP)  # suspend as ^Z does; fg resumes here
 
 
-def _steer(
-    step: Callable[[str], None],
-    seen: Callable[[], Teleop],
-    console: Console,
-    suspend: list[bool],
-) -> bool:
-    """Pass the typed keys to `step`, "" if none, and show the screen.
-
-    Return True at ^Z and False when the input ends.
-    """
+def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
+    """Drive and show the screen; return True at ^Z and False when the input ends."""
     with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
-            typed = read(0.05)
+            typed = read(KEYS_S)
             if typed is None:
                 return False
-            step(typed)
+            ride.step(typed)
             if typed or time.monotonic() >= due:
                 due = time.monotonic() + PERIOD_S
-                shown.update(Group(*lines(seen(), *console.size)), refresh=True)
+                shown.update(Group(*lines(ride.seen(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
-        step(letter)  # stop the robot: no steps run while suspended
+        ride.step(letter)  # stop the robot: no steps run while suspended
     return True
 
 
@@ -141,3 +172,115 @@ def _be_lenient() -> None:
     """Replace characters that the terminal's encoding lacks, instead of failing."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
+
+
+@contextmanager
+def until_told() -> Iterator[None]:
+    """End the block at the first terminating signal, or when its terminal closes.
+
+    Later signals are ignored during the cleanup: a terminal that closes under a shell sends two,
+    and Ctrl-C may be held down.
+    """
+
+    def deaf() -> None:
+        for number in LEAVES:
+            signal.signal(number, signal.SIG_IGN)
+
+    def leave(*_: object) -> None:
+        deaf()
+        raise KeyboardInterrupt
+
+    for number in LEAVES:
+        signal.signal(number, leave)
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+        # The terminal was closed, so discard further output.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    finally:
+        deaf()
+
+
+@contextmanager
+def keys() -> Iterator[Callable[[float], str | None]]:
+    """Yield a function that waits up to a number of seconds for keys.
+
+    The function returns "" if no key was typed, and None when the input has ended.
+    """
+
+    def read(seconds: float) -> str | None:
+        ready, _, _ = select.select([sys.stdin], [], [], seconds)
+        if not ready:
+            return ""
+        return os.read(sys.stdin.fileno(), 64).decode(errors="replace") or None
+
+    def nobody(seconds: float) -> str:
+        time.sleep(seconds)
+        return ""
+
+    if not sys.stdin.isatty():
+        yield nobody
+        return
+    with one_by_one():
+        yield read
+
+
+# Without a screen
+
+
+def _drive_in_lines(ride: Ride) -> None:
+    """Drive until a signal; print some lines after each change, and at intervals."""
+    due, page = News(), Page()
+    with until_told(), keys() as read:
+        while (typed := read(KEYS_S)) is not None:
+            ride.step(typed)
+            seen = ride.seen()
+            if due.tell(seen, time.monotonic()):
+                width, height = output_size()
+                print("\n".join(page.with_help(news(seen, width), height)), flush=True)
+
+
+def output_size() -> os.terminal_size:
+    """Return the size of the terminal. A file or a pipe is unlimited."""
+    unlimited = os.terminal_size((NO_END, NO_END))
+    return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
+
+
+class News:
+    """Throttle for reports on a terminal that cannot show a screen. The class is pure."""
+
+    def __init__(self) -> None:
+        self._shown: tuple[object, ...] = ()
+        self._at = -QUIET_S
+
+    def tell(self, seen: Teleop, now: float) -> bool:
+        """Return whether a report is due at `now` s, and remember it as printed."""
+        state = seen.state
+        words = ("", "") if state is None else (state.mode, state.reason)
+        what = (*words, seen.objection, seen.linear, seen.angular, seen.silent)
+        moves = state is not None and bool(state.linear or state.angular)
+        wait = NEWS_S if what != self._shown else SAME_S if moves else QUIET_S
+        if now - self._at < wait:
+            return False
+        self._shown, self._at = what, now
+        return True
+
+
+class Page:
+    """Reports with the help, repeated before it scrolls out of sight. The class is pure."""
+
+    def __init__(self) -> None:
+        self._shown = NO_END
+        """Lines printed since the help began."""
+
+    def with_help(self, told: list[str], height: int) -> list[str]:
+        """Return these lines, below the help if they are the first or would scroll it away."""
+        self._shown += len(told)
+        if self._shown < height:
+            return told
+        self._shown = len(HELP) + len(told)
+        return [*HELP, *told]

@@ -104,3 +104,14 @@ def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
             line.append("─" * (at - line.cell_len - 1) + " ", "dim")
         line.append_text(title if isinstance(title, Text) else Text(title, "cyan")).append(" ")
     return line.append("─" * max(0, width - line.cell_len), "dim")
+
+
+def flow(parts: Sequence[Text], width: int, inset: int = 0) -> list[Text]:
+    """Put as many parts in a line as fit; continued lines begin with `inset` blanks."""
+    lines: list[Text] = []
+    for part in parts:
+        if lines and lines[-1].cell_len + 2 + part.cell_len <= width:
+            lines[-1].append("  ").append_text(part)
+        else:
+            lines.append(Text(" " * (inset if lines else 0)).append_text(part))
+    return lines

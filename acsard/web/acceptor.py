@@ -35,8 +35,8 @@ from acsard.host import clock
 from acsard.host.rate_limits import Buckets
 from acsard.web.answers import HEADERS, problem
 from acsard.web.callers import Who, is_loopback, network_of, unmapped
-from acsard.web.counts import Counts
 from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, sockets_for
+from acsard.web.metrics import Counts
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 """Time limit for a TLS handshake, and maximum number of handshakes at once."""

@@ -37,10 +37,10 @@ from acsard.web.callers import (
     tokens_offered,
     unmapped,
 )
-from acsard.web.counts import Counts
-from acsard.web.frames import MAX_BYTES
 from acsard.web.limits import GUESSES, GUESSES_OF_ONE, HOLD_S, REQUESTS, STRANGERS
+from acsard.web.metrics import Counts
 from acsard.web.routes import Route
+from acsard.web.socket_messages import MAX_BYTES
 from acsard.web.tokens import Token, Vault, owner_in
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")

@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from gzip import decompress
-from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
 import msgspec
 from aiohttp import web
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType, inspect
 
 from acsard import __version__
+from acsard.core.config.live import WHEN, flat, live
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
+from acsard.core.ros.parameters import kind_of
 from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
@@ -30,25 +32,26 @@ from acsard.host.threads import NoThreadError, in_thread
 from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
-from acsard.web.answers import READ_S, TroubleError, reply, sent, sent_in_pieces, takes_gzip
+from acsard.web.answers import (
+    READ_S,
+    File,
+    Files,
+    TroubleError,
+    reply,
+    sent,
+    sent_in_pieces,
+    takes_gzip,
+)
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
-from acsard.web.calls import Calls
 from acsard.web.camera import SEND_S, Camera
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
-from acsard.web.files import PAGE, File, Files
-from acsard.web.fleet import Fleet
-from acsard.web.frames import MAX_BYTES, Begin
-from acsard.web.guide import Choices, Guide
+from acsard.web.guide import Choices
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
-from acsard.web.recordings import BlackBox, Recording
-from acsard.web.reports import POLICY, Reports, ReportState, State
-from acsard.web.robots import Robots
+from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportState, State
 from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Problem, Route, services, values
-from acsard.web.settings_form import Setting, rows
+from acsard.web.socket_messages import MAX_BYTES, Begin
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
-from acsard.web.viewer import HEARTBEAT_S, Viewer
+from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
 """Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
@@ -88,33 +91,39 @@ class Caller(Struct, frozen=True):
     full: Annotated[str, Meta(description='reason to refuse another WebSocket, or ""')]
 
 
+class Setting(Struct, frozen=True, omit_defaults=True):
+    """One setting, with its value, its explanation and its allowed values."""
+
+    key: str
+    value: Any
+    what: str
+    when: str
+    low: float | UnsetType = UNSET
+    high: float | UnsetType = UNSET
+    choices: list[str] | UnsetType = UNSET
+
+
 class Page:
     """The application and the state that its request handlers share."""
 
     def __init__(
         self,
-        robots: Robots,
-        hand: Hand,
-        calls: Calls,
-        fleet: Fleet,
-        counts: Counts,
+        parts: Parts,
         vault: Vault,
         names: AbstractSet[str],
         acceptor: Acceptor,
-        guide: Guide,
-        page: Path = PAGE,
         rules: WebConfig = DEFAULT,
     ) -> None:
         """Make the application; `names` and `rules` are those of `Admission`."""
-        self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
-        self._guide, self._counts, self._vault, self._acceptor = guide, counts, vault, acceptor
-        self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
+        self._parts, self._vault, self._acceptor = parts, vault, acceptor
+        self._robots, self._files, self._reports = parts.robots, Files(), Reports()
+        self._box = BlackBox(parts.robots)
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
         """The files of the page, and when each was read or compared, by the event loop's clock."""
         self._viewers: set[Viewer] = set()
-        self._admission = Admission(robots.id, names, vault, acceptor, counts, rules)
+        self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
@@ -214,10 +223,7 @@ class Page:
             )
             await served.prepare(request)
             _limit_buffer(request)
-            viewer = Viewer(
-                served, request, who, self._robots, self._hand, self._calls, self._fleet,
-                self._guide, self._counts, camera=self._has_camera,
-            )  # fmt: skip
+            viewer = Viewer(served, request, who, self._parts, camera=self._has_camera)
             self._viewers.add(viewer)
             try:
                 await viewer.run()
@@ -233,7 +239,7 @@ class Page:
         return web.Response(body=DOCUMENT, content_type=JSON)
 
     async def metrics(self, request: web.Request) -> web.StreamResponse:
-        robots, counts = self._robots, self._counts
+        robots, counts = self._robots, self._parts.counts
         body = metrics.text(
             robots.id, robots.state, not robots.gone, len(self._viewers), counts.all(),
             counts.refused(),
@@ -253,11 +259,11 @@ class Page:
 
     async def settings(self, request: web.Request) -> web.StreamResponse:
         """Return the settings that can be changed at run time, with their present values."""
-        return reply(rows(msgspec.json.decode(await self._value("config"))))
+        return reply(settings_in(msgspec.json.decode(await self._value("config"))))
 
     async def guide(self, request: web.Request) -> web.StreamResponse:
         """Return the checks and calibrations that a maintainer may start."""
-        return reply(await self._guide.choices(simulated=self._robots.about.simulated))
+        return reply(await self._parts.guide.choices(simulated=self._robots.about.simulated))
 
     async def service(self, request: web.Request) -> web.StreamResponse:
         """Call a service with the fields of a JSON object as its arguments."""
@@ -271,7 +277,7 @@ class Page:
             text = "robot must be the id of a robot; a robot of another page can only be stopped"
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
-        told = await self._calls.call(request[WHO], verb, given, robot)
+        told = await self._parts.calls.call(request[WHO], verb, given, robot)
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
@@ -326,11 +332,31 @@ class Page:
     async def _value(self, key: str) -> bytes:
         """Return the last value of a key as JSON."""
         try:
-            return as_json(*await self._calls.get(self._robots.id, key))
+            return as_json(*await self._parts.calls.get(self._robots.id, key))
         except NoAnswerError as error:
             raise TroubleError(504, str(error)) from None
         except (MendableError, DecodeError, TimeoutError) as error:
             raise TroubleError(503, str(error) or "no answer in time") from None
+
+
+def settings_in(config: Mapping[str, Any]) -> list[Setting]:
+    """Return the changeable settings in the order of `config`, a value of the key `config`."""
+    return [
+        Setting(key, value, told.what, WHEN[told.when], **_allowed(key))
+        for key, value in flat(config)
+        if (told := live(key)) is not None
+    ]
+
+
+def _allowed(key: str) -> dict[str, Any]:
+    """Return the range or the choices of a setting, as fields of `Setting`."""
+    kind = kind_of(key)
+    match kind.type if isinstance(kind, inspect.Metadata) else kind:
+        case inspect.FloatType(ge=float(low), le=float(high)):
+            return {"low": low, "high": high}
+        case inspect.LiteralType(values=choices):
+            return {"choices": [str(one) for one in choices]}
+    return {}
 
 
 async def _body_of(request: web.Request) -> bytes:

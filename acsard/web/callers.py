@@ -81,10 +81,6 @@ class Who(Struct, frozen=True):
         return f"for {least}s; you are {self.role}"
 
 
-MAINTAINER = Who("maintainer", HERE)
-"""The identity of a client on the robot itself."""
-
-
 class Asked(Struct, frozen=True):
     """The facts of a request that decide about its admission. The client may forge all headers."""
 

@@ -61,22 +61,14 @@ class Ending(NamedTuple):
     """False if the child process has not exited yet."""
 
 
-async def _nothing() -> Ending:
-    return Ending()
-
-
-def _none(robot: str) -> bool:
-    return False
-
-
 class Calls:
     """The requests that are under way, within the limits above."""
 
     def __init__(
         self,
         robots: Robots,
-        ends: Callable[[], Awaitable[Ending]] = _nothing,
-        sees: Callable[[str], bool] = _none,
+        ends: Callable[[], Awaitable[Ending]],
+        sees: Callable[[str], bool],
     ) -> None:
         """Store the robots, `ends`, which ends the server's check or calibration, and `sees`, which
         says whether a page shows the robot with this id.
@@ -279,9 +271,5 @@ def _require_stop(verb: str, robot: str) -> None:
 def _named(client: Client, robot: str, who: Who) -> Client:
     """Return a client for `robot` under the caller's name, which the daemon logs."""
     other = client.like(robot)
-    other.name = _caller(who)
+    other.name = f"{who.name}@page"
     return other
-
-
-def _caller(who: Who) -> str:
-    return f"{who.name}@page"

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 from asyncio.subprocess import PIPE, Process
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import msgspec
 from msgspec import Struct
@@ -26,9 +27,7 @@ from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.threads import in_thread
 from acsard.machine.serial_ports import serial_devices
 from acsard.web.calls import Ending
-from acsard.web.frames import Begin, FrameError, Press, Reply
-from acsard.web.jobs import Reach, words
-from acsard.web.socket_messages import Ended, Guided, Running
+from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
 ENDING_S = 1.0
 """Longest time that the answer to a STOP waits for the child to end."""
@@ -56,8 +55,23 @@ NO_DEVICE = (
     "check` in a terminal on the robot."
 )
 
+POSITIONS = "positions"
+
+KEY = re.compile(r"(?=.{1,80}\Z)[A-Za-z0-9_][A-Za-z0-9_-]*(/[A-Za-z0-9_-]+)*\Z")
 
 Say = Callable[[Guided], None]
+
+
+class Reach(Struct, frozen=True):
+    """The options that let a command reach the same daemon as this server.
+
+    An empty value omits its option.
+    """
+
+    config: str
+    endpoint: str
+    robot_id: str
+    tls: str
 
 
 class Board(Struct, frozen=True):
@@ -230,6 +244,38 @@ def boards(configured: str) -> list[Board]:
     # on the robot that the operator sees, because wheels turn.
     ports = sorted(found, key=lambda port: port != configured)
     return [Board(port, found[port]) for port in ports]
+
+
+def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
+    """Return the arguments after `acsard`. Raises `FrameError` if the request is not allowed.
+
+    No text from the browser becomes an option by itself. The options are fixed here, and each value
+    is either one of a known set or a plain key.
+    """
+    config = [f"--config={reach.config}"] if reach.config else []
+    if begin.begin == "check":
+        if begin.method or begin.positions:
+            raise FrameError("begin", "`method` and `positions` are only for a calibration")
+        if begin.port not in ports:
+            raise FrameError("begin", f"port is one of {', '.join(sorted(ports))}")
+        return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
+    if begin.port:
+        raise FrameError("begin", "`port` is only for the check of a board")
+    given = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
+    if reach.tls:
+        given.append(f"--tls={reach.tls}")
+    return ["calibrate", "--json-lines", *config, *given, *_method(begin)]
+
+
+def _method(begin: Begin) -> list[str]:
+    if begin.method and begin.method not in NEEDS:
+        raise FrameError("begin", f"method is one of {', '.join(NEEDS)}")
+    if (begin.method == POSITIONS) != bool(begin.positions):
+        raise FrameError("begin", f"`positions` is a key; it belongs to the method {POSITIONS}")
+    if begin.positions and not KEY.match(begin.positions):
+        raise FrameError("begin", "`positions` must be a key like sim/pose: letters, digits, _ / -")
+    options = {"method": begin.method, "positions": begin.positions}
+    return [f"--{name}={value}" for name, value in options.items() if value]
 
 
 class _Errand:

@@ -15,10 +15,10 @@ from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.topics import FOLLOWED
-from acsard.terminal import json_messages
+from acsard.terminal import json_prompt
 from acsard.web import socket_messages
-from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route
+from acsard.web.socket_messages import KINDS
 
 Described = dict[str, Any]
 
@@ -40,9 +40,9 @@ SENT = (
 )  # fmt: skip
 
 LINES = (
-    socket_messages.Running, socket_messages.Ended, json_messages.Subject,
-    json_messages.JobMessage, json_messages.Doing, json_messages.Progress, json_messages.Question,
-    json_messages.Found, json_messages.Result,
+    socket_messages.Running, socket_messages.Ended, json_prompt.Subject,
+    json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
+    json_prompt.Found, json_prompt.Result,
 )  # fmt: skip
 """Types of the content of `guide`."""
 

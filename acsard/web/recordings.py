@@ -1,15 +1,22 @@
-"""The recordings in the black box's directory, as the page lists and sends them."""
+"""The recordings in the black box's directory, as the page lists, sends and draws them."""
 
 from __future__ import annotations
 
+import asyncio
 import calendar
+import gzip
+import signal
 import time
+from asyncio.subprocess import PIPE, Process
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
 from acsard.core.values import NS_PER_S
+from acsard.host import clock
+from acsard.host.child import Limits, acsard, how_it_ended, running
 from acsard.host.errors import RecordingError
 from acsard.host.threads import in_thread
 from acsard.recording.directory import PART, STAMP, is_being_recorded, listed
@@ -17,6 +24,52 @@ from acsard.recording.end_record import how_it_ends, read_end
 from acsard.web.answers import READ_S, TroubleError
 from acsard.web.callers import RefusedError, is_loopback
 from acsard.web.robots import Robots
+
+POLICY = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src "
+    "'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+"""Security policy of a report. Without `allow-same-origin` the report has an opaque origin. The
+report's own policy names the allowed scripts by their hashes, and the browser enforces both
+policies."""
+
+NICE = 19
+
+DRAW_S = 600.0
+"""Time limit of a drawing: a full file of the black box, one to four hours, takes minutes on a
+small computer."""
+
+ALONE_NS = 60 * NS_PER_S
+"""A running drawing is given up if no client has asked for its progress for this long."""
+
+KEEP_NS = 900 * NS_PER_S
+"""A finished report is dropped if no client has opened it or asked for it for this long."""
+
+BYTES = 32 << 20
+"""Maximum size of a report; a typical one has 5 to 8 MB."""
+
+MEMORY = 256 << 20
+"""Limit of the child's data memory, bytes."""
+
+SAID = 2000
+"""Number of characters that are kept from the end of the child's error output."""
+
+TOO_LONG = (
+    f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
+    "faster machine with acsard recording report"
+)
+TOO_MUCH = (
+    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, with "
+    "acsard recording report"
+)
+KILLED = (
+    "the system ended it, most likely because memory ran out: draw it on another machine, with "
+    "acsard recording report"
+)
+TOO_BIG = (
+    f"it has over {BYTES >> 20} MB: draw a part of it, with acsard recording report --from --to"
+)
 
 
 class Recording(Struct, frozen=True):
@@ -120,3 +173,170 @@ def _begun(path: Path) -> float | None:
 def _unread(place: Path, error: Exception) -> TroubleError:
     words = getattr(error, "strerror", None) or "no answer in time"
     return TroubleError(503, f"cannot read {place}: {words}")
+
+
+# Reports
+
+State = Literal["drawing", "ready", "failed", "busy"]
+
+
+class ReportState(Struct, frozen=True, omit_defaults=True):
+    """The state of a report."""
+
+    report: State
+    text: Annotated[str, Meta(description="why it failed, or the reason to wait")] = ""
+    percent: int = 0
+    seconds: Annotated[float, Meta(description="since the drawing began")] = 0.0
+    href: Annotated[str, Meta(description="the finished report, relative to the page")] = ""
+
+
+class _Drawing:
+    """A report that is being drawn or is finished."""
+
+    def __init__(self, path: Path, stamp: tuple[int, int]) -> None:
+        self.path, self.stamp = path, stamp
+        self.percent = 0
+        self.begun_ns = self.asked_ns = clock.mono_ns()
+        self.packed = b""
+        """The finished report, compressed by gzip; empty until then."""
+        self.failed = ""
+        self.told = False
+        """True once a client has been informed that the drawing ended."""
+
+    @property
+    def ended(self) -> bool:
+        return bool(self.packed or self.failed)
+
+
+class Reports:
+    """The newest report; one is drawn at a time, in a child process.
+
+    The child runs `acsard recording report` at the lowest priority. Its time, memory and output are
+    bounded. It is killed when this server ends or no client asks for the report any more. The
+    finished report is kept compressed in memory until another one is drawn or nobody has asked for
+    it for `KEEP_NS`; no file is written.
+
+    A report contains text of unknown origin (names, sentences). Three measures contain it. The
+    report escapes the text. Its own policy allows exactly two scripts and no loading. `POLICY`
+    gives the report an opaque origin, so a script in it could reach neither the cookie nor the
+    interface of this page.
+    """
+
+    def __init__(self, command: Sequence[str] = ()) -> None:
+        """Draw by `acsard recording report`, or by another command."""
+        self._command = command or acsard("recording", "report", "--supervised")
+        self._one: _Drawing | None = None
+        self._work: asyncio.Task[None] | None = None
+
+    def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
+        """Return the progress of the report of this recording, and start drawing it if needed.
+
+        `stamp` must change when the recording changes. A failed or outdated report is drawn again
+        only after a client has seen its result.
+        """
+        one, now_ns = self._one, clock.mono_ns()
+        if one is not None and not one.ended and one.path != path:
+            return ReportState("busy", f"another report is being drawn: {one.path.name}")
+        if one is None or one.path != path or (one.told and (one.failed or one.stamp != stamp)):
+            one = self._one = _Drawing(path, stamp)
+            self._work = asyncio.get_running_loop().create_task(self._draw(one))
+        one.asked_ns, one.told = now_ns, one.ended
+        if one.failed:
+            return ReportState("failed", one.failed)
+        if one.packed:
+            return ReportState("ready", href=f"report/{path.name}")
+        seconds = (now_ns - one.begun_ns) / NS_PER_S
+        return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
+
+    def drawn(self, name: str) -> bytes | None:
+        """Return the finished report of this recording, compressed by gzip, or None.
+
+        This keeps the report for another `KEEP_NS`.
+        """
+        one = self._one
+        if one is None or one.path.name != name or not one.packed:
+            return None
+        one.asked_ns = clock.mono_ns()
+        return one.packed
+
+    def tidy(self) -> None:
+        """Give up a drawing that no client waits for, and drop an old report.
+
+        The server calls this regularly.
+        """
+        one = self._one
+        if one is None:
+            return
+        old_ns = clock.mono_ns() - one.asked_ns
+        if old_ns > (KEEP_NS if one.ended else ALONE_NS):
+            self.end()
+
+    def end(self) -> None:
+        """Cancel the drawing and drop the report."""
+        if self._work is not None:
+            self._work.cancel()
+        self._one = self._work = None
+
+    async def _draw(self, one: _Drawing) -> None:
+        try:
+            async with asyncio.timeout(DRAW_S):
+                body = await self._drawn(one)
+                one.packed = await in_thread(lambda: gzip.compress(body, 6, mtime=0), None)
+        except TimeoutError:
+            one.failed = TOO_LONG
+        except (OSError, _FailedError) as error:
+            one.failed = str(error)
+
+    async def _drawn(self, one: _Drawing) -> bytes:
+        """Run the child and return the report. Raises `_FailedError` with the child's message."""
+        command, limits = [*self._command, str(one.path)], Limits(NICE, MEMORY)
+        async with running(command, limits, stdout=PIPE, stderr=PIPE) as child:
+            listening = asyncio.create_task(_listened(child, one))
+            try:
+                body, said = await _body(child), await listening
+            finally:
+                listening.cancel()
+            code = await child.wait()
+        if code == -signal.SIGKILL:
+            raise _FailedError(KILLED)
+        if code:
+            raise _FailedError(_why(said) or f"the drawing program {how_it_ended(code)}")
+        return body
+
+
+class _FailedError(Exception):
+    """The reason, in words, why a report was not drawn."""
+
+
+def _why(said: str) -> str:
+    """Return the child's error output, or its last line if it is a traceback."""
+    last = said.rpartition("\n")[2]
+    if last.startswith("MemoryError"):
+        return TOO_MUCH
+    return last if said.startswith("Traceback") else said
+
+
+async def _body(child: Process) -> bytes:
+    assert child.stdout is not None
+    body = bytearray()
+    while part := await child.stdout.read(1 << 16):
+        body += part
+        if len(body) > BYTES:
+            raise _FailedError(TOO_BIG)
+    return bytes(body)
+
+
+async def _listened(child: Process, one: _Drawing) -> str:
+    """Read the child's error output.
+
+    Lines of digits are percents, other lines explain a failure.
+    """
+    assert child.stderr is not None
+    said = ""
+    while part := await child.stderr.read(1 << 12):
+        *lines, rest = (said + part.decode(errors="replace")).split("\n")
+        words = [line for line in lines if not line.isdecimal()]
+        numbers = [int(line) for line in lines if line.isdecimal() and len(line) <= 3]
+        one.percent = min(100, max([one.percent, *numbers]))
+        said = "\n".join([*words, rest])[-SAID:]
+    return said.strip().removeprefix("acsard: ")

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import zenoh
 from msgspec import Struct
 
 from acsard.client import Client
-from acsard.client.follower import Follower, restarted
-from acsard.client.watch import ANSWERS
+from acsard.client.follower import Watch, restarted
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
 from acsard.core.thinning import Place, Track
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.tls import shown_at
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
-from acsard.host.mailbox import Mailbox
 from acsard.host.threads import in_thread
-from acsard.web.counts import Counts
 from acsard.web.last_minute import Minute, Plotted
-from acsard.web.streams import UNREADY, Stream, Streams
+from acsard.web.metrics import Counts
+from acsard.web.streams import DECLARE_S, UNREADY, Stream, Streams
 
 LOOK_S = 0.1
 """Interval at which the newest state is checked."""
@@ -47,6 +44,8 @@ PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
 
 JUMP_M = 1.0
 """Step of the pose between two states that no robot can drive, m: the pose was set."""
+
+T = TypeVar("T")
 
 Connect = Callable[[], Client]
 """Opens the connection to the daemon or raises `UnreachableError`; it blocks."""
@@ -72,6 +71,23 @@ def _path() -> Track:
     return Track(PATH_POINTS, PATH_STEP_M, PATH_S, JUMP_M)
 
 
+class _Asking:
+    """A client for a watch on the event loop. A query runs in a thread, because it may block."""
+
+    def __init__(self, client: Client) -> None:
+        self.subscribe, self._client = client.subscribe, client
+        self._asked: asyncio.Task[None] | None = None
+
+    def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+        """Query a key unless the last query is still under way."""
+        if self._asked is None or self._asked.done():
+            self._asked = asyncio.create_task(self._ask(name, take))
+
+    async def _ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+        with suppress(*UNREADY):
+            await in_thread(lambda: self._client.ask(name, take), None)
+
+
 class Robots:
     """Keeps the connection to the daemon, and the data that a newly opened page needs at once."""
 
@@ -92,26 +108,27 @@ class Robots:
         self._connect, self._counts = connect, counts
         self._paths = {"path": _path(), "truth": _path()}
         self._minute = Minute()
-        self._states, self._poses = Decoder(RobotState), Decoder(PoseStamped)
-        self._wishes = Decoder(TwistStamped)
+        self._poses, self._wishes = Decoder(PoseStamped), Decoder(TwistStamped)
         self._asks = asyncio.Event()
-        self._follower = Follower(0.0)
-        self._answers = Mailbox[zenoh.Sample](ANSWERS)
-        """Answers to queries of the state. A thread of Zenoh puts them here."""
+        self._watch: Watch | None = None
 
     async def run(self) -> None:
         """Follow the robot until cancelled. Raises a `MendableError` that a retry cannot fix."""
-        self.client = await self._reached()
+        client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
+
+        def watch() -> Watch:
+            return Watch(_Asking(client), clock.mono_ns() / NS_PER_S)
+
         try:
-            await self._watch(await self._following("state"))
+            await self._follow(await self._insisted(lambda: in_thread(watch, DECLARE_S, Watch.end)))
         finally:
             asking.cancel()
 
     @property
     def state(self) -> RobotState | None:
         """The newest state, or None before the first one."""
-        return self._follower.state
+        return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:
         """Query the daemon's facts again because they may have changed."""
@@ -136,69 +153,47 @@ class Robots:
                 self.gone = str(error)
                 await asyncio.sleep(AGAIN_S)
 
-    async def _following(self, key: str) -> Stream:
-        assert self.client is not None
+    async def _insisted(self, call: Callable[[], Awaitable[T]]) -> T:
         while True:
             try:
-                return await self.streams.follow(self.client, self.id, key)
+                return await call()
             except UNREADY:
                 self.gone = "the bus is stuck; the page tries again"
                 await asyncio.sleep(AGAIN_S)
 
-    async def _watch(self, states: Stream) -> None:
-        seen, truth, asking = 0, None, None
-        follower = self._follower = Follower(clock.mono_ns() / NS_PER_S)
+    async def _follow(self, watch: Watch) -> None:
+        self._watch, truth = watch, None
         while True:
             now_ns = clock.mono_ns()
-            now = now_ns / NS_PER_S
-            if states.number != seen:
-                seen, asked = states.number, states.asked
-                self._take(states.raw() or ("", b""), states.at_ns, now_ns, asked=asked)
-            # Replies come last: `answered` compares stamps, and `published` does not.
-            for answer in self._answers.take():
-                self._take(encoded(answer), now_ns, now_ns, asked=True)
-            if follower.asks(now) and (asking is None or asking.done()):
-                asking = asyncio.create_task(self._ask_state())
-            quiet = follower.silent(now)
-            if quiet and follower.unreadable:
+            before, unreadable, now = watch.state, watch.unreadable, now_ns / NS_PER_S
+            with suppress(zenoh.ZError):  # the session is closed, so the robot is silent
+                for state in watch.look(now):
+                    self._take(before, state, now_ns)
+                    before = state
+            if watch.unreadable > unreadable:
+                self._counts.add("unreadable", watch.unreadable - unreadable)
+            quiet = watch.silent(now)
+            if quiet and watch.unreadable:
                 self.gone = (
                     "the daemon's state cannot be read: does the daemon have another version?"
                 )
-            elif quiet and (follower.heard or not self.gone):
+            elif quiet and (watch.heard or not self.gone):
                 self.gone = f"nothing is received from the daemon at {self.endpoint}: does it run?"
-            elif follower.heard and not quiet and self.gone:
+            elif watch.heard and not quiet and self.gone:
                 self.gone = ""
                 self.ask_anew()
             if self.about.simulated and truth is None:
-                truth = await self._following("sim/pose")
+                truth = await self._insisted(self._truth)
             if truth is not None:
                 self._take_truth(truth, now_ns)
             await asyncio.sleep(LOOK_S)
 
-    def _take(self, told: tuple[str, bytes], at_ns: int, now_ns: int, *, asked: bool) -> None:
-        follower, now = self._follower, now_ns / NS_PER_S
-        before = follower.state
-        try:
-            state = self._states.decode(*told)
-        except DecodeError:
-            follower.unreadable += 1
-            self._counts.add("unreadable")
-            return
-        if not asked:
-            follower.published(state, now)
-        elif not follower.answered(state, now):
-            return
+    def _take(self, before: RobotState | None, state: RobotState, now_ns: int) -> None:
         if restarted(before, state):
             self._paths = {name: _path() for name in self._paths}
         self._paths["path"].add(Place(now_ns / NS_PER_S, state.x, state.y, state.yaw))
-        if self._minute.due(at_ns):
-            self._minute.add(at_ns, state, self._wished(now_ns))
-
-    async def _ask_state(self) -> None:
-        client = self.client
-        assert client is not None
-        with suppress(*UNREADY):
-            await in_thread(lambda: client.ask("state", self._answers.put), None)
+        if self._minute.due(now_ns):
+            self._minute.add(now_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
         """Return the commanded twist if it is recent and a viewer of this server follows it."""
@@ -210,6 +205,10 @@ class Robots:
             return self._wishes.decode(*raw).twist
         except DecodeError:
             return None
+
+    async def _truth(self) -> Stream:
+        assert self.client is not None
+        return await self.streams.follow(self.client, self.id, "sim/pose")
 
     def _take_truth(self, truth: Stream, now_ns: int) -> None:
         raw = truth.raw()

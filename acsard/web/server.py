@@ -27,17 +27,13 @@ from acsard.host.logs import Log
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
-from acsard.web.calls import Calls
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
-from acsard.web.files import PAGE
-from acsard.web.fleet import Fleet
-from acsard.web.frames import PROGRAM
-from acsard.web.guide import Guide
-from acsard.web.jobs import Reach
+from acsard.web.guide import Guide, Reach
 from acsard.web.listen import Listen, bound, own_name, require_certificate
+from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
+from acsard.web.socket_messages import PROGRAM
 from acsard.web.tokens import Vault
+from acsard.web.viewer import Parts
 
 TIDY_S, TELL_S = 1.0, 1.0
 
@@ -70,11 +66,9 @@ class Wanted(Struct, frozen=True):
     """Directory of the access tokens."""
     file: str = ""
     """Configuration file named on the command line, or ""."""
-    next_port: bool = False
-    """Whether to use a later port if the requested one is taken."""
-    held: bool = False
-    """Whether the server must end when its standard input closes."""
-    page: Path = PAGE
+    supervised: bool = False
+    """Whether the daemon started the server. It then uses a later port if the requested one is
+    taken, and ends when its standard input closes."""
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
@@ -86,7 +80,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     leaving = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
-    if wanted.held:
+    if wanted.supervised:
         end_with_parent(signal.SIGTERM)
         os.nice(NICE)
     counts = Counts()
@@ -94,15 +88,10 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     files = CertificateFiles(*files_in(wanted.tls))
     secure, names = _certified(wanted)
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
-    hand = Hand(lambda: robots.client, counts)
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
-    fleet = Fleet(robots)
-    calls = Calls(robots, guide.stop, fleet.sees)
+    parts = Parts(robots, guide, counts)
     vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
-    page = Page(
-        robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page,
-        wanted.config.web,
-    )  # fmt: skip
+    page = Page(parts, vault, names, acceptor, wanted.config.web)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
         shutdown_timeout=LEAVE_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
@@ -112,7 +101,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
         stack.push_async_callback(guide.close)
-        places = bound(wanted.listen, wanted.next_port)
+        places = bound(wanted.listen, wanted.supervised)
         for one, opened in places:
             tls = secure if one.secure else None
             acceptor.listen(opened, tls, lambda: Reader(counts, runner.server))
@@ -122,23 +111,21 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         if secure is not None:
             renewing = _renew(secure, names, files, wanted.tls, log)
             stack.callback(asyncio.create_task(renewing).cancel)
-        await _until(leaving, robots, hand, page, wanted)
+        await _until(leaving, parts, page, wanted)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
-        await asyncio.to_thread(hand.outbox.flush, LEAVE_S)
+        await asyncio.to_thread(parts.hand.outbox.flush, LEAVE_S)
 
 
-async def _until(
-    leaving: asyncio.Event, robots: Robots, hand: Hand, page: Page, wanted: Wanted
-) -> None:
+async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
     """Work until asked to leave, or until a task ends that must not end."""
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
-        asyncio.create_task(robots.run()),
+        asyncio.create_task(parts.robots.run()),
         asyncio.create_task(_tidy(page)),
-        asyncio.wrap_future(hand.outbox.dead),
+        asyncio.wrap_future(parts.hand.outbox.dead),
     ]
-    if wanted.held:
+    if wanted.supervised:
         work.append(asyncio.create_task(_held(leaving)))
     try:
         done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)

@@ -1,18 +1,183 @@
-"""The messages that `/ws` sends to a page or a program. This module is pure.
+"""The messages of `/ws`, in both directions. This module is pure.
 
-Each message is one JSON object, identified by its first field. Messages of subscribed keys are
-built in socket_sender.py instead, because their values are already JSON.
+Each message is one JSON object. The kind of an incoming one is the one field of `KINDS` that it has
+(`subscribe`, `cmd`, `call`, ...). A message of no kind, of two kinds, or with an unknown field is
+refused as a whole. An outgoing one is identified by its first field. Messages of subscribed keys
+are built in socket_sender.py instead, because their values are already JSON.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
-from acsard.core.values import Role
+from acsard.core.messages.permissions import COMMAND_ROLE
+from acsard.core.messages.signature import MOST
+from acsard.core.values import AcsardError, Role
 from acsard.web.last_minute import Plotted
+
+MAX_BYTES = 65536
+"""Maximum size of one message; a command has about a hundred bytes."""
+
+MAX_RATE, USUAL_RATE = 50.0, 10.0
+"""Maximum and default rate of one key, messages per second."""
+
+LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
+"""Largest stamp in ms since 1970: the signature's limit in ns, less one day. The margin is needed
+because the zero command after a release carries a later stamp than the last command."""
+
+PROGRAM = "app"
+"""Source of a command that names none. The page names `teleop`, the source of a person."""
+
+Short = Annotated[str, Meta(max_length=80)]
+Device = Annotated[str, Meta(max_length=200)]
+
+
+class FrameError(AcsardError):
+    """A message that is not a valid frame. `about` names its intended kind, or is "message"."""
+
+    def __init__(self, about: str, text: str) -> None:
+        super().__init__(text)
+        self.about = about
+
+
+class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all frames; it rejects unknown fields."""
+
+    least: ClassVar[Role] = "viewer"
+    """Least role that may send it. The role for a call depends on the service."""
+
+    @property
+    def kind(self) -> str:
+        """The field that identifies the frame, always the first one."""
+        return self.__struct_fields__[0]
+
+
+class Subscribe(_Frame, frozen=True):
+    """Send the messages of a key from now on, at most `rate` per second."""
+
+    subscribe: Short
+    rate: float = USUAL_RATE
+    robot: Short = ""
+
+
+class Unsubscribe(_Frame, frozen=True):
+    """Stop sending the messages of this key."""
+
+    unsubscribe: Short
+    robot: Short = ""
+
+
+class Wish(_Frame, frozen=True):
+    """A requested velocity: `linear_x` in m/s, `angular_z` in rad/s."""
+
+    linear_x: float
+    angular_z: float
+
+
+class Command(_Frame, frozen=True):
+    """Drive at this velocity.
+
+    `stamp` is the time of the command in ms by the sender's own clock.
+    """
+
+    least: ClassVar[Role] = COMMAND_ROLE
+    cmd: Wish
+    stamp: float
+    steady: bool = False
+    """True if the clock of `stamp` is never adjusted, like the browser's `performance.now()`."""
+    source: Short = PROGRAM
+    """The command source, one of the robot's."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """The stamp in ns since 1970."""
+        return int(self.stamp * 1e6)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the command sets a speed other than zero."""
+        return self.cmd.linear_x != 0.0 or self.cmd.angular_z != 0.0
+
+
+class Call(_Frame, frozen=True):
+    """Call a service of the robot; the answer carries the same `id`."""
+
+    call: Short
+    id: int | Short = 0
+    payload: dict[str, Any] = {}
+    robot: Short = ""
+
+
+class Ping(_Frame, frozen=True):
+    """Ask for a pong with the same number."""
+
+    ping: float
+
+
+class Begin(_Frame, frozen=True):
+    """Check the board at `port`, or calibrate by a `method`; "" selects the default method."""
+
+    least: ClassVar[Role] = "maintainer"  # both turn wheels and write configuration files
+    begin: Literal["check", "calibrate"]
+    port: Device = ""
+    method: Short = ""
+    positions: Short = ""
+    """The key on which positions arrive, for the method `positions` only."""
+
+
+class Reply(_Frame, frozen=True):
+    """Answer the question with this number; null takes the default."""
+
+    reply: Annotated[int, Meta(ge=0, le=1 << 31)]
+    value: float | Short | None = None
+
+
+class Press(_Frame, frozen=True):
+    """Press a key at the running check or calibration, or interrupt it like Ctrl-C ("leave")."""
+
+    press: Literal["key", "leave"]
+
+
+Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
+
+KINDS: dict[str, type[Frame]] = {kind.__struct_fields__[0]: kind for kind in get_args(Frame)}
+"""The frame type for each field that identifies one."""
+
+_heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
+_decoders: dict[str, msgspec.json.Decoder[Frame]] = {
+    name: msgspec.json.Decoder(kind) for name, kind in KINDS.items()
+}
+
+
+def decode(text: str) -> Frame:
+    """Return the frame in a message. Raises `FrameError`."""
+    about = "message"
+    try:
+        meant = [name for name in _heads.decode(text) if name in KINDS]
+        if len(meant) != 1:
+            raise FrameError(about, f"needs one of {', '.join(KINDS)}")
+        about = meant[0]
+        frame = _decoders[about].decode(text)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise FrameError(about, str(error)) from None
+    _require(frame)
+    return frame
+
+
+def _require(frame: Frame) -> None:
+    """Raise `FrameError` for numbers that are out of range."""
+    # JSON has no NaN, and msgspec refuses a number that is too large to be finite.
+    if isinstance(frame, Command) and not 0.0 < frame.stamp < LATEST_STAMP_MS:
+        raise FrameError("cmd", "stamp must be ms since 1970 by your own clock")
+    if isinstance(frame, Subscribe) and not 0.0 < frame.rate <= MAX_RATE:
+        raise FrameError("subscribe", f"rate must be above 0 and at most {MAX_RATE:g} a second")
+
+
+# From the robot.
 
 Point = tuple[float, float]
 
@@ -83,7 +248,7 @@ class Row(Struct, frozen=True):
     """Measured forward speed, m/s."""
     link: str
     age: float | None
-    """Seconds since the last state arrived or the daemon ended."""
+    """Seconds since the last state arrived; None before the first one."""
     version: str
     """Version of the daemon; "" until it is reported."""
     settings_differ: str = ""

@@ -45,7 +45,6 @@ class Stream:
     def __init__(self) -> None:
         self._taking = threading.Lock()
         self._newest: tuple[int, zenoh.Sample | None, int] = (0, None, 0)
-        self._asked = False
         self._text: tuple[int, bytes] = (0, b"null")
         self.declared: Any = None
         self.users = 0
@@ -61,23 +60,16 @@ class Stream:
         """Arrival time of the newest message, monotonic clock."""
         return self._newest[2]
 
-    @property
-    def asked(self) -> bool:
-        """Whether the newest message answered a query; a router's storage may have sent it."""
-        return self._asked
-
     def take(self, sample: zenoh.Sample) -> None:
         """Store a published message."""
         with self._taking:
             self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
-            self._asked = False
 
     def answered(self, sample: zenoh.Sample) -> None:
         """Store the answer to a query, unless a published (newer) message has arrived."""
         with self._taking:
             if not self._newest[0]:
                 self._newest = (1, sample, clock.mono_ns())
-                self._asked = True
 
     def value(self) -> tuple[int, bytes, float]:
         """Return the number, the JSON text and the age in ms of the newest message."""

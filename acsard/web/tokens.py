@@ -61,10 +61,6 @@ class Vault:
         """Change stamp of the file and its tokens, in one value because several threads replace
         it."""
 
-    def who(self, text: str) -> Who | None:
-        """Return the owner of a token, or None if the token is unknown or has expired."""
-        return owner_in(self.all(), text)
-
     def known(self, text: str) -> Who | None:
         """Return the owner of a token by the last reading of the file, without a look at the disk.
 

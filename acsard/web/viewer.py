@@ -8,26 +8,33 @@ skipped while the client has not read earlier data.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any
 
 import aiohttp
 from aiohttp import web
 
+from acsard.client import Client
 from acsard.client.commander import LONGEST_S, Commander, Sender, Wish
+from acsard.client.outbox import Outbox
+from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
-from acsard.core.values import Role, Twist
+from acsard.core.values import REST, Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
-from acsard.host.rate_limits import Bucket
+from acsard.host.rate_limits import Bucket, Buckets
 from acsard.web import socket_messages
 from acsard.web.callers import RefusedError, Who
 from acsard.web.calls import Calls
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
-from acsard.web.fleet import Fleet
-from acsard.web.frames import (
+from acsard.web.fleet_rows import Fleet
+from acsard.web.guide import Guide
+from acsard.web.limits import COMMANDS, MESSAGES, OVERRUNS
+from acsard.web.metrics import Counts
+from acsard.web.robots import Robots
+from acsard.web.routes import RECORDINGS
+from acsard.web.socket_messages import (
     Begin,
     Call,
     Command,
@@ -40,12 +47,7 @@ from acsard.web.frames import (
     Unsubscribe,
     decode,
 )
-from acsard.web.guide import Guide
-from acsard.web.keys import Keys
-from acsard.web.limits import COMMANDS, MESSAGES, OVERRUNS
-from acsard.web.robots import Robots
-from acsard.web.routes import RECORDINGS
-from acsard.web.socket_sender import Outgoing
+from acsard.web.socket_sender import Keys, Outgoing
 
 ACTIONS: dict[str, Role] = {
     **{str(verb): role for verb, role in SERVICE_ROLES.items()},
@@ -68,6 +70,65 @@ LOOK_S = 0.25
 """Interval at which a viewer checks whether the robot became unreachable or its facts changed."""
 
 
+class Hand:
+    """Puts the newest velocity command of each viewer on the bus.
+
+    A command is sent once, with the stamp of its sender, or it is dropped. The server repeats
+    nothing and makes up nothing, except one zero command for a sender that was driving and
+    disconnected. `client` returns the connection to the bus, or None while it is lost.
+    """
+
+    def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
+        self._client, self._counts = client, counts
+        self._rates = Buckets(COMMANDS)
+        self.outbox = Outbox(partial(counts.add, "commands_dropped"))
+        """The server must exit when its thread is dead: no viewer can drive then, and no zero
+        command is sent."""
+
+    def give(
+        self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
+    ) -> bool:
+        """Queue a command in place of an older one of the same commander.
+
+        Return False if its owner, a token or a local viewer, sends too many. A zero after a speed
+        is queued in any case.
+        """
+        now_ns = clock.mono_ns()
+        ends = wish.twist == REST and commander.drives(now_ns)
+        if not self._rates.take(owner, now_ns) and not ends:
+            return False
+        replaced = commander.replaced
+        self.outbox.take(commander, partial(self._put, source, sender), wish)
+        if commander.replaced > replaced:
+            self._counts.add("commands_superseded")
+        return True
+
+    def _put(self, source: str, sender: Sender, wish: Wish) -> None:
+        try:
+            client = self._client()
+            if client is not None:
+                twist = schema.Twist(
+                    schema.Vector3(x=wish.twist.linear), schema.Vector3(z=wish.twist.angular)
+                )
+                zero = wish.twist == REST
+                signature = sender.sign(wish.stamp_ns, steady=wish.steady, zero=zero)
+                client.put(twist, signature, source)
+                self._counts.add("commands")
+                return
+        except Exception:  # noqa: BLE001, S110 - only this one command is lost
+            pass
+        self._counts.add("commands_dropped")
+
+
+class Parts:
+    """The parts of the server that all viewers and the page share."""
+
+    def __init__(self, robots: Robots, guide: Guide, counts: Counts) -> None:
+        self.robots, self.guide, self.counts = robots, guide, counts
+        self.hand, self.fleet = Hand(lambda: robots.client, counts), Fleet(robots)
+        self.calls = Calls(robots, guide.stop, self.fleet.sees)
+
+
 class Viewer:
     """One connected client; it lives as long as its connection."""
 
@@ -76,34 +137,29 @@ class Viewer:
         socket: web.WebSocketResponse,
         request: web.Request,
         who: Who,
-        robots: Robots,
-        hand: Hand,
-        calls: Calls,
-        fleet: Fleet,
-        guide: Guide,
-        counts: Counts,
+        parts: Parts,
         *,
         camera: bool,
     ) -> None:
         self.who, self._camera = who, camera
+        self._robots, self._hand, self._calls = parts.robots, parts.hand, parts.calls
+        self._fleet, self._guide, self._counts = parts.fleet, parts.guide, parts.counts
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
-        self.sender = public_name(whole, robots.certificate)
+        self.sender = public_name(whole, parts.robots.certificate)
         """Public name that `state.sender` has while this viewer drives. The page never learns the
         secret part."""
         self._socket = socket
-        self._robots, self._hand, self._calls = robots, hand, calls
-        self._fleet, self._guide, self._counts = fleet, guide, counts
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
-        self._out = Outgoing(socket, request, counts, who.origin)
-        self._keys = Keys(self._out, robots, self._start, who.token or who.name)
+        self._out = Outgoing(socket, request, parts.counts, who.origin)
+        self._keys = Keys(self._out, parts.robots, self._start, who.token or who.name)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
         self._stamp_ns = -1
         """Stamp of the last command."""
-        self._gone, self._about = "", robots.about
+        self._gone, self._about = "", parts.robots.about
         self._fleet_due: float | None = None
 
     async def run(self) -> None:

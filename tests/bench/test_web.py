@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from acsard.client import connect
-from acsard.web.files import PAGE
+from acsard.web.answers import PAGE
 from tests.system.browser import Hands, Page, hands, run
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import (

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from acsard.web.files import INLINED, PAGE
+from acsard.web.answers import INLINED, PAGE
 from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import Bus, Daemon, until

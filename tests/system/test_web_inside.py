@@ -20,16 +20,13 @@ from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
 from acsard.web.app import DEFAULT, Page
-from acsard.web.calls import Calls
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
-from acsard.web.fleet import Fleet
-from acsard.web.guide import Guide
-from acsard.web.jobs import Reach
+from acsard.web.guide import Guide, Reach
 from acsard.web.limits import OVERRUNS, UNREAD_BYTES
+from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
 from acsard.web.tokens import Vault
+from acsard.web.viewer import Parts
 from tests.system.browser import Hands, run
 from tests.system.harness import PATIENCE_S, Daemon, seconds
 
@@ -51,13 +48,11 @@ class Inside:
             raise UnreachableError("nobody is there")
 
         self.robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts)
-        self.hand = Hand(lambda: self.robots.client, self.counts)
-        self.fleet, self.acceptor = Fleet(self.robots), Acceptor(self.counts)
+        guide = Guide(Reach("", "", "acsar", ""), "sim")
+        self.parts = Parts(self.robots, guide, self.counts)
         self.page = Page(
-            self.robots, self.hand, Calls(self.robots), self.fleet, self.counts,
-            Vault(where, "acsar"), frozenset(), self.acceptor,
-            Guide(Reach("", "", "acsar", ""), "sim"), rules=rules,
-        )  # fmt: skip
+            self.parts, Vault(where, "acsar"), frozenset(), Acceptor(self.counts), rules=rules
+        )
 
     @asynccontextmanager
     async def hands(self) -> AsyncIterator[Hands]:
@@ -98,7 +93,7 @@ def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside
                 await asyncio.sleep(0.01)
             await ours.say(ping=1)
             await asyncio.sleep(0.2)
-            inside.hand.outbox.flush(PATIENCE_S)
+            inside.parts.hand.outbox.flush(PATIENCE_S)
             assert inside.counts.all() == before
             wire.abort()
 
@@ -228,12 +223,12 @@ def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
 
 def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
     address = Address("tcp/127.0.0.1:1", "acsar", "")
-    wanted = Wanted(Config(), address, (), "", tmp_path, next_port=False, held=False)
+    wanted = Wanted(Config(), address, (), "", tmp_path)
 
     async def story() -> None:
-        inside.hand.outbox.dead.set_exception(MemoryError("no room"))
+        inside.parts.hand.outbox.dead.set_exception(MemoryError("no room"))
         with pytest.raises(MemoryError):
-            await _until(asyncio.Event(), inside.robots, inside.hand, inside.page, wanted)
+            await _until(asyncio.Event(), inside.parts, inside.page, wanted)
 
     run(story)
 

@@ -23,9 +23,8 @@ from acsard.calibration.guided.leg_driver import LegDriver
 from acsard.calibration.log_table import Floats, Table
 from acsard.calibration.runs import Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
-from acsard.client.follower import FIRST_S
+from acsard.client.follower import FIRST_S, Watch
 from acsard.client.synchronous import Client
-from acsard.client.watch import Watch
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time

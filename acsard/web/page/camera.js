@@ -1,6 +1,8 @@
 // The camera beside the stick: fetches one picture after another, draws it, and says how old it is. A picture that
 // no newer one replaces is marked, because a person would drive by it.
 
+import { age } from "./words.js";
+
 const FROZEN = 800; // ms; the mark appears within 1 s
 const AGAIN = 500; // ms before the next attempt after a failure
 const LEAST = 50; // ms between two requests, so that a page leaves room for the others of its token
@@ -36,8 +38,8 @@ export class Camera {
     const old = now - this.#at;
     const frozen = old > FROZEN;
     this.#figure.classList.toggle("frozen", frozen);
-    const age = old === Infinity ? "NO PICTURE" : `${frozen ? "FROZEN " : ""}${old < 1000 ? `${Math.round(old)} ms` : `${(old / 1000).toFixed(1)} s`}`;
-    const words = [age, frozen ? this.#trouble : ""].filter(Boolean).join(": ");
+    const since = old === Infinity ? "NO PICTURE" : `${frozen ? "FROZEN " : ""}${age(old)}`;
+    const words = [since, frozen ? this.#trouble : ""].filter(Boolean).join(": ");
     if (this.#words.textContent !== words) this.#words.textContent = words;
   }
 

@@ -17,11 +17,11 @@ from acsard.client import driving
 from acsard.client.commander import GRACE_S, OPENED_S, objection
 from acsard.client.driving import SETTLED_S, UnheardError, drive
 from acsard.client.follower import FIRST_S, SILENT_S
-from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from tests.each import each
+from tests.unit.top.screens import raw_sample, sample_of
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"
@@ -51,11 +51,6 @@ Says = Callable[[float, float, list[float]], RobotState | None]
 """Returns the daemon's state from the time in s, the last commanded m/s, and all commands."""
 
 
-def sample_of(state: RobotState) -> Any:
-    payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
-    return SimpleNamespace(encoding=encoding_name("msgpack", "RobotState"), payload=payload)
-
-
 class World:
     """A robot, a clock and a daemon that publishes its state ten times a second."""
 
@@ -70,8 +65,6 @@ class World:
         self.dies = math.inf
         """Time after which only a router's storage answers, with the last state, s."""
         self.stored: Any = None
-        self.set_back = math.inf
-        """Time at which the robot's clock is set back by 50 s."""
         self._says, self._told = says, 100.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -101,8 +94,7 @@ class World:
         state = self._says(self.now - 100.0, self.sent[-1] if self.sent else 0.0, self.sent)
         if state is None:
             return None
-        clock = self.now - (0.0 if self.now < self.set_back else 50.0)
-        return sample_of(replace(state, stamp=Time.from_ns(int(clock * NS_PER_S))))
+        return sample_of(replace(state, stamp=Time.from_ns(int(self.now * NS_PER_S))))
 
     def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
         """Drive at 0.5 m/s and return how long it took, s."""
@@ -290,34 +282,11 @@ def test_the_state_that_a_storage_has_of_a_robot_that_is_long_dead_begins_no_dri
     assert set(world.sent) == {0.0}
 
 
-def test_a_robot_whose_clock_was_set_back_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state that the robot publishes itself never comes from a storage.
-
-    This holds for any stamp.
-    """
-    world, made = World(followed), sample_of(FOLLOWED)
-    monkeypatch.setattr(world, "_sample", lambda: made)
-    world.drive(monkeypatch)
-    assert world.sent.count(0.5) in (20, 21)
-
-
-def test_so_does_one_that_publishes_seldom_when_its_clock_is_set_back_on_the_way(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Every answer has an older stamp than the state received before it."""
-    world = World(followed)
-    world.published, world.set_back = False, 101.0
-    world.drive(monkeypatch, 5.0)
-    assert world.sent.count(0.5) in (100, 101)
-
-
 def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
-    payload = SimpleNamespace(to_bytes=lambda: b"{}")
-    unreadable = SimpleNamespace(encoding="application/json", payload=payload)
-    monkeypatch.setattr(world, "_sample", lambda: unreadable)
+    monkeypatch.setattr(world, "_sample", lambda: raw_sample(b"{}"))
     with pytest.raises(NoAnswerError, match="another version"):
         world.drive(monkeypatch)
 

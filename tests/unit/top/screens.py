@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
+from typing import Any
 
 from msgspec.structs import replace
 from rich.console import Console
 
-from acsard.core.messages.schema import Info, Latency, RobotState, SourceState, Spread, Time
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import (
+    Info,
+    Latency,
+    Message,
+    RobotState,
+    SourceState,
+    Spread,
+    Time,
+)
 from acsard.daemon.latencies import NAMES
 from acsard.top.text import ScreenData
 from acsard.top.view import screen
@@ -74,3 +85,14 @@ def line_with(text: str, seen: ScreenData = SEEN, width: int = 80) -> str:
 def of(**changes: object) -> ScreenData:
     """Return the usual screen with another state."""
     return replace(SEEN, state=replace(STATE, **changes))
+
+
+def sample_of(message: Message, key: str = "acsard/acsar/state") -> Any:
+    """Return a sample of the bus with this message."""
+    return raw_sample(encode(message, "json"), key)
+
+
+def raw_sample(payload: bytes, key: str = "acsard/acsar/state") -> Any:
+    """Return a sample of the bus with this JSON."""
+    held = SimpleNamespace(to_bytes=lambda: payload)
+    return SimpleNamespace(key_expr=key, encoding="application/json", payload=held)

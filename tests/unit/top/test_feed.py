@@ -10,14 +10,14 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.client import Client, Subscription
-from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
-from acsard.core.messages.encodings import DecodeError, encode, encoding_name
+from acsard.client.follower import FIRST_S, SILENT_S
+from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState, Time
 from acsard.daemon.bus.address import Address
 from acsard.host.errors import ReplyError
 from acsard.top import feed as top_feed
 from acsard.top.feed import Feed
-from tests.unit.top.screens import BEFORE, INFO, STATE
+from tests.unit.top.screens import BEFORE, INFO, STATE, sample_of
 
 KEY = "acsard/acsar/state"
 
@@ -31,12 +31,9 @@ class Robot:
         self.now = 100.0
         self.state: RobotState | DecodeError = STATE
         self.queue: deque[Any] = deque()
-        self.answers = False
 
     def ask(self, name: str, take: Any) -> None:
-        if self.answers:
-            self.state = replace(STATE, stamp=Time(int(self.now * 10)))
-            take(sample_of(self.state))
+        """Get no answer."""
 
     def key(self, name: str) -> str:
         return f"acsard/acsar/{name}"
@@ -57,12 +54,6 @@ class Robot:
 
     def tells(self, state: RobotState, key: str = KEY) -> None:
         self.queue.append(sample_of(state, key))
-
-
-def sample_of(state: RobotState, key: str = KEY) -> Any:
-    payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
-    encoding = encoding_name("msgpack", "RobotState")
-    return SimpleNamespace(key_expr=key, encoding=encoding, payload=payload)
 
 
 @pytest.fixture
@@ -146,17 +137,6 @@ def test_a_silence_is_reported_sooner_once_a_state_has_arrived(robot: Robot) -> 
     assert not feed.seen().silent
     robot.now += 0.02
     assert feed.seen().silent
-
-
-def test_a_robot_that_publishes_seldom_is_queried_and_never_silent(robot: Robot) -> None:
-    feed = feed_of(robot)
-    feed.ask()
-    robot.answers = True
-    for _ in range(100):
-        feed.poll()
-        robot.now += 0.25
-        assert feed.seen().age < 2 * ASK_S + 0.5
-        assert not feed.seen().silent
 
 
 def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None:

@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.client.commander import GRACE_S, ZEROS
-from acsard.client.follower import ASK_S, SILENT_S
-from acsard.core.messages.encodings import encode
-from acsard.core.messages.schema import RobotState, Time
+from acsard.client.follower import SILENT_S
+from acsard.core.messages.schema import RobotState
 from acsard.core.values import REST, Twist
 from acsard.daemon.bus.address import Address
 from acsard.top import keyboard
 from acsard.top.keyboard import HOLD_S, Keyboard, Ride, split
 from tests.each import each
-from tests.unit.top.screens import STATE
+from tests.unit.top.screens import STATE, sample_of
 
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
 
@@ -155,33 +154,23 @@ def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
 
 
 class Robot:
-    """A client whose robot has published these states.
-
-    A storage in the router keeps the last one.
-    """
+    """A client whose robot has published these states."""
 
     source, sender = "teleop", "joe/1/aa"
     where = Address("tcp/127.0.0.1:7448", "acsar", "")
 
     def __init__(self, *said: RobotState) -> None:
         self.said = deque(map(sample_of, said))
-        self.stored: RobotState | None = None
         self.sent: list[float] = []
 
     def subscribe(self, name: str) -> Any:
         return SimpleNamespace(try_recv=lambda: self.said.popleft() if self.said else None)
 
     def ask(self, name: str, take: Any) -> None:
-        if self.stored is not None:
-            take(sample_of(self.stored))
+        """Get no answer."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         self.sent.append(linear)
-
-
-def sample_of(state: RobotState) -> Any:
-    payload = SimpleNamespace(to_bytes=lambda: encode(state, "json"))
-    return SimpleNamespace(encoding="application/json", payload=payload)
 
 
 class Drive:
@@ -251,44 +240,3 @@ def test_the_operator_is_told_why_keys_have_no_effect(monkeypatch: pytest.Monkey
     assert drive.ride.seen().objection == ""
     drive.step("i", times=3)
     assert drive.ride.seen().objection == "stopped by request"
-
-
-def heard_after(robot: Any, seconds: float, monkeypatch: pytest.MonkeyPatch) -> float:
-    """Return the age of the state that is displayed after this many seconds, s."""
-    drive = Drive(robot, monkeypatch)
-    while drive.now < 100.0 + seconds:
-        drive.ride.take()
-        drive.now += 0.05
-    return drive.ride.seen().age
-
-
-@pytest.mark.parametrize("said", [(STATE,), ()], ids=["it died on the way", "it is long dead"])
-def test_what_a_storage_still_has_of_a_dead_robot_is_no_news(
-    said: tuple[RobotState, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot = Robot(*said)
-    robot.stored = STATE
-    assert heard_after(robot, 10 * ASK_S, monkeypatch) == pytest.approx(10 * ASK_S, abs=0.11)
-
-
-def test_the_answers_of_a_robot_that_publishes_seldom_are_news(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    class Alive(Robot):
-        def ask(self, name: str, take: Any) -> None:
-            before = self.stored or STATE
-            self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
-            super().ask(name, take)
-
-    assert heard_after(Alive(), 10 * ASK_S, monkeypatch) < 2 * ASK_S
-
-
-def test_so_are_they_when_its_clock_was_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    class SetBack(Robot):
-        def ask(self, name: str, take: Any) -> None:
-            before = self.stored or replace(STATE, stamp=Time(1))
-            self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
-            super().ask(name, take)
-
-    said = replace(STATE, stamp=Time(10**6))
-    assert heard_after(SetBack(said), 10 * ASK_S, monkeypatch) < 2 * ASK_S

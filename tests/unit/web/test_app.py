@@ -1,4 +1,4 @@
-"""The page's server keeps its clients while the machine is short of threads."""
+"""The page's server lists the settings, and keeps its clients while it is short of threads."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.config.live import LIVE
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
 from acsard.host.threads import NoThreadError
 from acsard.web import app
 from acsard.web.acceptor import Acceptor
-from acsard.web.app import Page
-from acsard.web.callers import MAINTAINER
-from acsard.web.calls import Calls
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
-from acsard.web.fleet import Fleet
-from acsard.web.guide import Guide
-from acsard.web.jobs import Reach
+from acsard.web.app import Page, settings_in
+from acsard.web.guide import Guide, Reach
+from acsard.web.metrics import Counts
 from acsard.web.tokens import Vault
+from acsard.web.viewer import Parts
 from tests.each import each
-from tests.unit.web.test_fleet import robots
+from tests.unit.web.test_callers import MAINTAINER
+from tests.unit.web.test_fleet_rows import robots
 
 
 def fails(error: Exception) -> Callable[..., Awaitable[Any]]:
@@ -47,15 +47,37 @@ def test_a_phone_stays_if_no_thread_can_read_the_tokens_and_leaves_if_the_disk_h
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def story() -> list[str]:
-        counts, ours, ends = Counts(), robots(None), list[str]()
-        page = Page(
-            ours, Hand(lambda: None, counts), Calls(ours), Fleet(ours), counts,
-            Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts),
-            Guide(Reach("", "", "", ""), ""),
-        )  # fmt: skip
+        counts, ends = Counts(), list[str]()
+        parts = Parts(robots(None), Guide(Reach("", "", "", ""), ""), counts)
+        page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))
         page._viewers.add(Phone(ends))  # type: ignore[arg-type]
         monkeypatch.setattr(app, "in_thread", fails(error))
         await page.tidy()
         return ends
 
     assert bool(asyncio.run(story())) != isinstance(error, NoThreadError)
+
+
+ROWS = {row.key: row for row in settings_in(effective(Config()))}
+
+
+def test_each_setting_that_may_change_has_a_row_and_no_other() -> None:
+    sources = {f"commands.sources.{one.name}.timeout" for one in Config().commands.sources}
+    assert set(ROWS) == (set(LIVE) - {"commands.sources.*.timeout"}) | sources
+
+
+def test_a_row_has_its_value_its_range_and_when_it_may_change() -> None:
+    row = ROWS["limits.linear_speed"]
+    assert row.value == Config().limits.linear_speed
+    assert isinstance(row.low, float)
+    assert isinstance(row.high, float)
+    assert row.low <= row.value <= row.high
+    assert row.when == "at any time"
+    assert "stands" in ROWS["limits.wheel_speed"].when
+
+
+def test_what_is_one_of_some_words_names_them() -> None:
+    row = ROWS["log.level"]
+    assert isinstance(row.choices, list)
+    assert row.value in row.choices
+    assert len(row.choices) > 2

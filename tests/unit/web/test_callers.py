@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.web.callers import (
-    MAINTAINER,
+    HERE,
     MOST_TOKENS,
     Asked,
     RefusedError,
@@ -28,6 +28,9 @@ from acsard.web.callers import (
 from tests.each import each
 
 NAMES = frozenset({"robot.local", "192.168.1.7"})
+
+MAINTAINER = Who("maintainer", HERE)
+"""The identity of a client on the robot itself."""
 
 
 @each(

@@ -6,6 +6,7 @@ import asyncio
 import threading
 import time
 from collections import Counter
+from collections.abc import Awaitable, Callable
 from itertools import pairwise
 
 import pytest
@@ -15,7 +16,7 @@ from msgspec.structs import replace
 from acsard.client import Client
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import ServiceReply
-from acsard.web.callers import MAINTAINER, RefusedError
+from acsard.web.callers import RefusedError
 from acsard.web.calls import (
     ELSEWHERE_AT_ONCE,
     MERGE_S,
@@ -25,12 +26,27 @@ from acsard.web.calls import (
     Merged,
     Stops,
 )
-from acsard.web.fleet import Fleet
+from acsard.web.fleet_rows import Fleet
 from acsard.web.limits import STOPS_ELSEWHERE
-from tests.unit.web.test_fleet import quiet, robots, row
+from acsard.web.robots import Robots
+from tests.unit.web.test_callers import MAINTAINER
+from tests.unit.web.test_fleet_rows import quiet, robots, row
 from tests.unit.web.test_metrics import STATE
 
 PATIENCE_S = 20.0
+
+
+async def nothing() -> Ending:
+    return Ending()
+
+
+def calls_of(
+    known: Robots,
+    ends: Callable[[], Awaitable[Ending]] = nothing,
+    sees: Callable[[str], bool] = lambda robot: False,
+) -> Calls:
+    """Return the calls of a server without a check, whose viewers see no robot."""
+    return Calls(known, ends, sees)
 
 
 def test_stops_beyond_the_room_wait_for_one_asked_after_them_and_none_is_said_to_be_done() -> None:
@@ -90,7 +106,7 @@ def test_one_that_fails_fails_those_who_wait_for_it_and_not_the_next() -> None:
 
 def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_have() -> None:
     async def story() -> None:
-        calls = Calls(robots(None))
+        calls = calls_of(robots(None))
         with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as told:
             await calls.call(MAINTAINER, "clear", {}, "r2")
         assert told.value.reason == "role"
@@ -117,8 +133,8 @@ def test_a_stop_ends_a_check_and_is_done_when_it_has_ended_and_the_daemon_says_s
             query.reply(query.key_expr, answer, encoding=kind)
 
     async def story(client: Client | None) -> ServiceReply:
-        calls = Calls(robots(client), ends)
-        assert not (await Calls(robots(None), ends).call(MAINTAINER, "clear", {})).success
+        calls = calls_of(robots(client), ends)
+        assert not (await calls_of(robots(None), ends).call(MAINTAINER, "clear", {})).success
         return await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
 
     told = asyncio.run(story(None))
@@ -136,7 +152,7 @@ def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> 
     told: list[str] = []
 
     async def story(session: zenoh.Session) -> None:
-        calls = Calls(robots(Client(session, "acsar", "teleop")))
+        calls = calls_of(robots(Client(session, "acsar", "teleop")))
 
         async def stop(robot: str, client: int = 0) -> ServiceReply:
             return await calls.call(replace(MAINTAINER, token=f"{client}"), "stop", {}, robot)
@@ -223,7 +239,7 @@ def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_
             query.reply(query.key_expr, answer, encoding=kind)
 
     async def story(session: zenoh.Session) -> None:
-        calls = Calls(robots(Client(session, "acsar", "teleop")))
+        calls = calls_of(robots(Client(session, "acsar", "teleop")))
 
         async def stop(robot: str) -> bool:
             return (await calls.call(MAINTAINER, "stop", {}, robot)).success
@@ -248,7 +264,7 @@ def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refused() 
     async def story(session: zenoh.Session) -> None:
         known = robots(Client(session, "acsar", "teleop"))
         fleet = Fleet(known)
-        calls = Calls(known, sees=fleet.sees)
+        calls = calls_of(known, sees=fleet.sees)
 
         async def stop(robot: str) -> str:
             """Return the answer of the bus, which has no such service, or the refusal."""

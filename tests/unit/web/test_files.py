@@ -15,8 +15,7 @@ from pathlib import Path
 import pytest
 from aiohttp.test_utils import make_mocked_request
 
-from acsard.web.answers import sent
-from acsard.web.files import INLINED, PAGE, Files
+from acsard.web.answers import INLINED, PAGE, Files, sent
 
 
 @pytest.fixture

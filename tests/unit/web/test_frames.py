@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from acsard.core.messages.signature import Signature, unpack
 from acsard.core.values import NS_PER_S
-from acsard.web.frames import (
+from acsard.web.socket_messages import (
     LATEST_STAMP_MS,
     Begin,
     Call,

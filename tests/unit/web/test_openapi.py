@@ -14,9 +14,9 @@ from openapi_spec_validator import OpenAPIV31SpecValidator
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.messages.topics import SERVICES, TOPICS
 from acsard.web.app import ROUTES
-from acsard.web.frames import KINDS, FrameError, decode
 from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
 from acsard.web.routes import PARAMETERS, asked
+from acsard.web.socket_messages import KINDS, FrameError, decode
 from tests.each import each
 
 WHOLE = document("1.2.3", ROUTES)

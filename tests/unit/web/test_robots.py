@@ -10,28 +10,17 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
-from acsard.core.messages.encodings import encode
-from acsard.core.messages.schema import RobotState, Time
+from acsard.client.follower import ASK_S, FIRST_S, SILENT_S, Watch
+from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
-from acsard.web import robots, streams
-from acsard.web.counts import Counts
-from acsard.web.robots import LOOK_S, About, Robots
-from acsard.web.streams import Stream
-from tests.unit.top.screens import STATE
+from acsard.web import robots
+from acsard.web.metrics import Counts
+from acsard.web.robots import LOOK_S, About, Robots, _Asking
+from tests.unit.client.test_follower import UNREADABLE, Robot
+from tests.unit.top.screens import STATE, sample_of
 
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
-
-
-def sample_of(state: RobotState) -> Any:
-    payload = SimpleNamespace(to_bytes=lambda: encode(state, "json"))
-    return SimpleNamespace(encoding="application/json", payload=payload)
-
-
-UNREADABLE = SimpleNamespace(
-    encoding="application/json", payload=SimpleNamespace(to_bytes=lambda: b"{}")
-)
 
 
 class World:
@@ -43,7 +32,6 @@ class World:
         self.asked = 0
         clock = SimpleNamespace(mono_ns=lambda: round(self.now * NS_PER_S))
         monkeypatch.setattr(robots, "clock", clock)
-        monkeypatch.setattr(streams, "clock", clock)
         monkeypatch.setattr(robots, "LOOK_S", 0.0)
 
         async def at_once(call: Callable[[], Any], timeout: float | None) -> Any:
@@ -52,14 +40,7 @@ class World:
         monkeypatch.setattr(robots, "in_thread", at_once)
         never: Any = None
         self.robots = Robots(Address("tcp/x:1", "acsar", ""), never, ABOUT, Counts())
-        client: Any = SimpleNamespace(ask=self._ask)
-        self.robots.client = client
-
-    def _ask(self, name: str, take: Callable[[Any], object]) -> None:
-        assert name == "state"
-        self.asked += 1
-        if (answer := self.answers()) is not None:
-            take(answer)
+        self.robot = Answering(self)
 
     def state(self) -> Any:
         return sample_of(replace(STATE, stamp=Time.from_ns(round(self.now * NS_PER_S))))
@@ -70,14 +51,15 @@ class World:
         `publishes` returns the sample that the robot publishes at a time, or None.
         """
         found: list[tuple[float, str]] = []
-        stream = Stream()
 
         async def story() -> None:
-            watching = asyncio.create_task(self.robots._watch(stream))
+            client: Any = self.robot
+            watch = Watch(_Asking(client), self.now)
+            watching = asyncio.create_task(self.robots._follow(watch))
             began, before = self.now, self.robots.gone
             while self.now - began < seconds:
                 if (sample := publishes(self.now - began)) is not None:
-                    stream.take(sample)
+                    self.robot.queue.append(sample)
                 for _ in range(5):  # each task of the page has its turn
                     await asyncio.sleep(0)
                 if self.robots.gone != before:
@@ -89,6 +71,19 @@ class World:
 
         asyncio.run(story())
         return found
+
+
+class Answering(Robot):
+    """The client, whose queries the world answers."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__()
+        self._world = world
+
+    def ask(self, name: str, take: Any) -> None:
+        self._world.asked += 1
+        self.answer = self._world.answers()
+        super().ask(name, take)
 
 
 @pytest.fixture
@@ -111,13 +106,6 @@ def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
     found = world.told(30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None)
     assert [gone for _, gone in found] == [""]
     assert world.asked > 30.0 / (2 * ASK_S + 2 * LOOK_S)
-
-
-def test_a_storage_that_answers_for_a_daemon_that_died_does_not_hide_it(world: World) -> None:
-    last = world.state()
-    world.answers = lambda: last
-    found = world.told(10.0, lambda t: last if t == 0.0 else None)
-    assert [bool(gone) for _, gone in found] == [False, True]
 
 
 def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:

@@ -13,7 +13,7 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.report import Report
 from acsard.core.values import Role
-from acsard.terminal import json_messages
+from acsard.terminal import json_prompt
 from acsard.web import socket_messages
 from acsard.web.last_minute import Minute
 from acsard.web.openapi import KEYS, LINES, SENT, VALUE
@@ -42,13 +42,13 @@ SAID: tuple[Struct, ...] = (
 GUIDED: tuple[Struct, ...] = (
     socket_messages.Running("check", "here", True),
     socket_messages.Ended(0, "success", ""),
-    json_messages.Subject("port sim", True),
-    json_messages.JobMessage("so"),
-    json_messages.Doing("so"),
-    json_messages.Progress(0.5),
-    json_messages.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
-    json_messages.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
-    json_messages.Result("all"),
+    json_prompt.Subject("port sim", True),
+    json_prompt.JobMessage("so"),
+    json_prompt.Doing("so"),
+    json_prompt.Progress(0.5),
+    json_prompt.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
+    json_prompt.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
+    json_prompt.Result("all"),
 )
 
 

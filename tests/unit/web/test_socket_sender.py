@@ -8,7 +8,7 @@ import msgspec
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
-from acsard.web.counts import Counts
+from acsard.web.metrics import Counts
 from acsard.web.socket_sender import Following, Outgoing
 from acsard.web.streams import Stream
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.core.messages.schema import RobotState
-from acsard.top.line_by_line import NO_END, News, Page
 from acsard.top.teleop import HELP
+from acsard.top.terminal import NO_END, News, Page
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_teleop import SEEN
 

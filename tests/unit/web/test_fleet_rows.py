@@ -14,8 +14,8 @@ from acsard.client import Client
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import Info
 from acsard.daemon.bus.address import Address
-from acsard.web.counts import Counts
-from acsard.web.fleet import Fleet
+from acsard.web.fleet_rows import Fleet
+from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.socket_messages import Row
 from tests.unit.web.test_metrics import STATE

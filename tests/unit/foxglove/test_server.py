@@ -12,13 +12,12 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.server import Listener, Shown
-from acsard.foxglove.viewer_parameters import POLL_NS, Settings, asked, changes, values
+from acsard.foxglove.server import POLL_NS, Listener, Settings, Shown, asked, changes, live_settings
 from acsard.host import clock
 
 KEY, OTHER = "rates.odom", "rates.joint_states"
 
-NOW = values(effective(Config()))
+NOW = live_settings(effective(Config()))
 
 
 class Robot:

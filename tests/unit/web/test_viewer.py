@@ -8,9 +8,9 @@ from acsard.client import Client
 from acsard.client.commander import Commander, Sender, Wish
 from acsard.core.messages.signature import unpack
 from acsard.core.values import Twist
-from acsard.web.commands import Hand
-from acsard.web.counts import Counts
 from acsard.web.limits import COMMANDS
+from acsard.web.metrics import Counts
+from acsard.web.viewer import Hand
 
 PATIENCE_S = 20.0
 

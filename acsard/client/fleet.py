@@ -1,0 +1,205 @@
+"""Follows many robots: their liveliness tokens, their newest states and their versions.
+
+Zenoh's threads store the newest state of each robot, and the reader decodes it. Only `ask` may
+wait for the bus.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from threading import Lock
+from typing import Any
+
+import zenoh
+from msgspec import Struct
+
+from acsard.client.follower import FLEET_ASK_S, Follower
+from acsard.client.synchronous import Client
+from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.schema import Info, RobotState
+from acsard.core.messages.topics import full_key
+from acsard.daemon.bus.robot_discovery import ALL, robot_of
+from acsard.daemon.bus.subscription import encoded
+from acsard.host.mailbox import Mailbox
+
+MOST = 1000
+"""Maximum number of robots. The bound is needed because any client of the bus can invent robot
+names."""
+
+
+class Row(Struct, frozen=True):
+    """The known facts of one robot."""
+
+    robot_id: str
+    here: bool | None
+    """Whether the liveliness token of its daemon is present; None if it was never seen."""
+    state: RobotState | None
+    age: float
+    """Age of `state` in s; inf if the only state is an answer that a storage may have sent."""
+    version: str
+    silent: bool = False
+    """Whether the robot counts as silent."""
+
+
+class _Known:
+    """The known facts of one robot. Zenoh's threads replace each value as a whole."""
+
+    def __init__(self) -> None:
+        self.here: bool | None = None
+        self.version = ""
+        self.newest = Mailbox[tuple[zenoh.Sample, float]](1)
+        """The newest published state and its arrival time, until it is decoded."""
+        self.begin()
+
+    def begin(self) -> None:
+        """Query the robot at once, because it appeared or the search for it begins."""
+        self.since = self.info_due = time.monotonic()
+        self.follower = Follower(self.since, FLEET_ASK_S)
+        self.follower.due = self.since
+
+
+class Fleet:
+    """Follows the robots with these ids; "*" stands for all robots."""
+
+    def __init__(
+        self, robot: Client, ids: Sequence[str], most: int = MOST, forget_s: float = math.inf
+    ) -> None:
+        """Subscribe; this may wait for the bus. Raises `ZError`.
+
+        Args:
+            robot: A client of any robot on the same bus.
+            ids: The named robots, which are never dropped, or "*".
+            most: Maximum number of robots.
+            forget_s: Silence after which a robot is dropped unless its token is present, s.
+        """
+        self._robot, self._ids, self._most, self._forget_s = robot, ids, most, forget_s
+        self._lock = Lock()
+        self.left_out = False
+        """Whether there were more robots than `most`."""
+        self._known = {one: _Known() for one in ids if one != ALL}
+        self._states, self._infos = Decoder(RobotState), Decoder(Info)
+        self._declared: list[Any] = []
+        session, liveliness = robot.session, robot.session.liveliness()
+        try:
+            for one in ids:
+                states, tokens = full_key(one, "state"), full_key(one, "alive")
+                self._declared += [
+                    session.declare_subscriber(states, self._state),
+                    liveliness.declare_subscriber(tokens, self._token, history=True),
+                ]
+        except zenoh.ZError:
+            self.end()
+            raise
+
+    def rows(self) -> list[Row]:
+        """Return one row per robot."""
+        now = time.monotonic()
+        with self._lock:
+            for name, one in list(self._known.items()):
+                self._take(one)
+                seen = max(one.since, one.follower.last_seen)
+                if not one.here and name not in self._ids and now - seen > self._forget_s:
+                    del self._known[name]
+            return [self._row(name, one, now) for name, one in self._known.items()]
+
+    def due(self) -> list[tuple[str, str]]:
+        """Return the robot and the key of each query that is due, and plan the next ones."""
+        now, due = time.monotonic(), []
+        with self._lock:
+            for name, one in self._known.items():
+                self._take(one)
+                if one.follower.asks(now):
+                    due.append((name, "state"))
+                if one.here and not one.version and now >= one.info_due:
+                    one.info_due = now + FLEET_ASK_S
+                    due.append((name, "info"))
+        return due
+
+    def ask(self, due: Sequence[tuple[str, str]]) -> None:
+        """Send these queries; this may wait for the bus. Raises `ZError`."""
+        for name, key in due:
+            self._robot.like(name).ask(key, self._answer if key == "state" else self._info)
+
+    def here(self, robot_id: str) -> bool:
+        """Return whether the token of this robot is present."""
+        one = self._known.get(robot_id)
+        return one is not None and bool(one.here)
+
+    def end(self) -> None:
+        """Unsubscribe; this may wait for the bus. Raises `ZError`."""
+        for one in self._declared:
+            one.undeclare()
+
+    def _row(self, name: str, one: _Known, now: float) -> Row:
+        follower, state = one.follower, one.follower.state
+        silent = follower.silent(now)
+        if one.here and not follower.heard and not silent:
+            state = None  # wait for the robot's own answer
+        age = follower.age(now) if follower.heard else math.inf
+        return Row(name, one.here, state, age, one.version, silent)
+
+    def _take(self, one: _Known) -> None:
+        """Decode the newest published state."""
+        for sample, at in one.newest.take():
+            try:
+                one.follower.published(self._states.decode(*encoded(sample)), at)
+            except DecodeError:
+                pass  # another version: the robot is shown as silent
+
+    # Zenoh's threads call the methods below.
+
+    def _of(self, sample: zenoh.Sample) -> _Known | None:
+        name = robot_of(str(sample.key_expr))
+        with self._lock:
+            if name not in self._known and name:
+                if len(self._known) >= self._most:
+                    self._forget_one()
+                if len(self._known) < self._most:
+                    self._known[name] = _Known()
+                else:
+                    self.left_out = True
+            return self._known.get(name)
+
+    def _forget_one(self) -> None:
+        """Drop the unnamed robot that has been gone for the longest time."""
+        gone = [(one.since, name) for name, one in self._known.items() if not one.here]
+        for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
+            del self._known[name]
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        if one is not None:
+            appeared, one.here = not one.here, sample.kind == zenoh.SampleKind.PUT
+            if not one.here:
+                # A restarted daemon may have another version.
+                one.since, one.version = time.monotonic(), ""
+            elif appeared:
+                one.begin()
+
+    def _state(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        if one is not None:
+            one.newest.put((sample, time.monotonic()))
+
+    def _answer(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        if one is None:
+            return
+        try:
+            state = self._states.decode(*encoded(sample))
+        except DecodeError:
+            return
+        with self._lock:
+            self._take(one)
+            one.follower.answered(state, time.monotonic())
+
+    def _info(self, sample: zenoh.Sample) -> None:
+        one = self._of(sample)
+        try:
+            version = self._infos.decode(*encoded(sample)).version
+        except DecodeError:
+            version = "?"
+        if one is not None:
+            one.version = version

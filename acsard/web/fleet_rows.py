@@ -1,0 +1,131 @@
+"""The robots that the bus or router knows, one row each, tracked while a viewer looks at them."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from typing import Any
+
+from acsard.client import Client, fleet
+from acsard.daemon.bus.robot_discovery import ALL
+from acsard.host.threads import in_thread
+from acsard.web.robots import Robots
+from acsard.web.socket_messages import Row
+from acsard.web.streams import DECLARE_S, STATE, UNREADY
+
+MOST = 200
+
+FORGET_S = 30.0
+"""A robot that has been silent for longer is dropped, unless its liveliness token is present."""
+
+UNROUTED = (
+    "this page sees only robots that are connected to the daemon of {robot}, because daemons "
+    "forward no messages. To see all robots of a router, connect this page's server to the "
+    "router: acsard web --connect ROUTER --id {robot}"
+)
+"""Note for a server that is connected to a daemon instead of a router."""
+
+BY_NAME = (
+    "{endpoint} passes only exact keys, as every TLS endpoint does, so no other robot is "
+    "visible. To see all robots of a router, run this page's server on the router's machine: "
+    "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
+)
+"""Note for a server that is connected over TLS, which limits it to its own robot."""
+
+LONG = 40
+"""Maximum number of characters of a version that the page shows."""
+
+
+class Fleet:
+    """Tracks all robots for as long as at least one viewer has joined."""
+
+    def __init__(self, robots: Robots) -> None:
+        self._robots = robots
+        self._joined: set[object] = set()
+        self._tracked: fleet.Fleet | None = None
+        self._busy: set[asyncio.Task[None]] = set()
+        self.note = ""
+        """Explanation of why robots may be missing from the rows; "" if all robots of a router are
+        visible."""
+
+    def join(self, viewer: object) -> None:
+        """Start tracking on behalf of this viewer."""
+        self._joined.add(viewer)
+        self._look()
+
+    def leave(self, viewer: object) -> None:
+        """Remove this viewer; the last one to leave ends the tracking."""
+        self._joined.discard(viewer)
+        self._tidy()
+
+    def rows(self) -> list[Row]:
+        """Return the rows sorted by robot id, and retry missing subscriptions and queries."""
+        self._look()
+        rows = [] if self._tracked is None else self._tracked.rows()
+        return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
+
+    def sees(self, robot: str) -> bool:
+        """Return whether a viewer sees that this robot exists.
+
+        It sees the robot's liveliness token in the fleet, or its state.
+        """
+        states = self._robots.streams.followed(robot, STATE)
+        here = self._tracked is not None and self._tracked.here(robot)
+        return here or bool(states and states.number)
+
+    def _look(self) -> None:
+        """Start the next call that waits for the bus, unless one is under way."""
+        tracked, client = self._tracked, self._robots.client
+        if not self._joined or client is None or self._busy:
+            return
+        if tracked is None:
+            self._start(self._declare(client))
+        elif due := tracked.due():
+            self._start(_within_time(lambda: tracked.ask(due)))
+
+    async def _declare(self, client: Client) -> None:
+        def declare() -> fleet.Fleet:
+            robots = self._robots
+            by_name = robots.endpoint.startswith("tls/")
+            why = BY_NAME if by_name else "" if client.session.info.routers_zid() else UNROUTED
+            self.note = why.format(robot=robots.id, endpoint=robots.endpoint)
+            return fleet.Fleet(client, [robots.id if by_name else ALL], MOST, FORGET_S)
+
+        try:
+            self._tracked = await in_thread(declare, DECLARE_S, lambda late: late.end())
+        except UNREADY:
+            return  # the next viewer that looks retries
+        self._tidy()
+
+    def _tidy(self) -> None:
+        if not self._joined and self._tracked is not None:
+            self._start(_within_time(self._tracked.end))
+            self._tracked = None
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._busy.add(task)
+        task.add_done_callback(self._busy.discard)
+
+
+async def _within_time(call: Callable[[], None]) -> None:
+    with suppress(*UNREADY):  # the bus is stuck or closed
+        await in_thread(call, DECLARE_S)
+
+
+def _row(one: fleet.Row) -> Row:
+    state = one.state if math.isfinite(one.age) else None
+    version = one.version[:LONG]
+    if state is None:
+        mode, reason = ("gone", "its daemon has ended") if one.here is False else (None, "")
+        return Row(one.robot_id, mode, reason, None, "", None, version)
+    age = round(one.age, 3)
+    if one.here is False:
+        was = f"its daemon has ended; it was {state.mode}"
+        return Row(one.robot_id, "gone", was, None, "", age, version)
+    return Row(
+        one.robot_id, state.mode, state.reason, state.linear, state.link, age, version,
+        state.settings_differ,
+    )  # fmt: skip
