@@ -18,9 +18,7 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import GatewayState
 from acsard.core.messages.topics import full_key
-from acsard.core.ros.transports import command_keys
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.bus.certificate_files import CertificateFiles
 from acsard.daemon.bus.tls import ends, files_in, require_usable
 from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
@@ -74,10 +72,7 @@ class Gateway:
 
     def open(self) -> zenoh.Session:
         """Open the session between the network and the daemon."""
-        config = self._config
-        sources = tuple(source.name for source in config.commands.sources)
-        limited, access = command_keys(config.ros), gateway_access(config)
-        session = gateway_session(config.bus, config.robot.id, sources, limited, access)
+        session = gateway_session(self._config)
         self._opened_ns = clock.mono_ns()
         return session
 
