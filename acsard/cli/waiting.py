@@ -14,8 +14,7 @@ from acsard.client.follower import FIRST_S
 from acsard.core.config.settings import TLS
 from acsard.core.formatting import printable
 from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.robot_discovery import presence
-from acsard.daemon.bus.silent_key import Presence, explain_silence
+from acsard.daemon.bus.robot_discovery import Presence, explain_silence, presence
 from acsard.daemon.bus.tls import trouble
 
 

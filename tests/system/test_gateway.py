@@ -15,9 +15,9 @@ import pytest
 import zenoh
 
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.certificate_files import LOOK_NS
+from acsard.daemon.bus.certificate_watch import LOOK_NS
 from acsard.daemon.bus.tls import KEY, peer_ends_ns
-from acsard.daemon.gateway.session_health import MAX_UNANSWERED
+from acsard.daemon.gateway.listener_process import MAX_UNANSWERED
 from acsard.machine.authority import Authority
 from tests.system.harness import (
     Bus,

@@ -20,9 +20,9 @@ from pathlib import Path
 import zenoh
 
 from acsard.core.values import ROLES, Role
-from acsard.daemon.bus.certificate_files import CertificateFiles
+from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.zenoh_sessions import first_line
-from acsard.daemon.gateway.session_health import Events, Observation, SessionHealth
+from acsard.daemon.gateway.listener_process import Events, Observation, SessionHealth
 from acsard.host import clock
 from acsard.host.errors import InUseError, RouterFileError, UsageError
 

@@ -19,10 +19,10 @@ from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import GatewayState
 from acsard.core.messages.topics import full_key
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.certificate_files import CertificateFiles
+from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.tls import ends, files_in, require_usable
 from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
-from acsard.daemon.gateway.session_health import GATEWAY_EVENTS, Observation, SessionHealth
+from acsard.daemon.gateway.listener_process import GATEWAY_EVENTS, Observation, SessionHealth
 from acsard.host import clock
 
 CONNECT_S = 1.0
