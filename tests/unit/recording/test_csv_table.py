@@ -10,12 +10,12 @@ from acsard.calibration.log_table import read
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
 from acsard.core.values import GyroSample, Instant
-from acsard.recording.csv_table import (
-    HEADER,
-    MEASURED_HEADER,
+from acsard.recording.export import (
+    CSV_HEADER,
+    MEASURED_CSV_HEADER,
+    csv_rows,
     gyro_columns,
-    measured,
-    rows,
+    measured_csv_rows,
     wheel_columns,
 )
 from acsard.recording.replay import replay_step
@@ -37,11 +37,11 @@ def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(tape: T
     robot = Robot(GYRO)
     lines: list[str] = []
     for step in tape.steps():
-        lines += rows(step, replay_step(robot, step))
+        lines += csv_rows(step, replay_step(robot, step))
     estimates = [e for t in tape.taken for e in t.outputs.estimates]
     reports = [one for t in tape.taken for one in t.inputs.gyro]
     cells = [line.split(",") for line in lines]
-    assert {len(row) for row in cells} == {len(HEADER.split(","))}
+    assert {len(row) for row in cells} == {len(CSV_HEADER.split(","))}
     assert len(estimates) == sum(row[1] != "" for row in cells) > 100
     assert len(reports) == sum(row[5] != "" for row in cells) > 100
     assert ["driving", "up", "app"] in [row[-3:] for row in cells]
@@ -51,10 +51,10 @@ def test_calibration_reads_the_same_from_the_whole_table_and_from_the_measured_c
     tape: Tape,
 ) -> None:
     robot, twin = Robot(GYRO), Robot(GYRO)
-    whole, part = [HEADER], [MEASURED_HEADER]
+    whole, part = [CSV_HEADER], [MEASURED_CSV_HEADER]
     for step in tape.steps():
-        whole += rows(step, replay_step(robot, step))
-        part += measured(step, replay_step(twin, step))
+        whole += csv_rows(step, replay_step(robot, step))
+        part += measured_csv_rows(step, replay_step(twin, step))
     tables = [read("\n".join(lines).encode()) for lines in (whole, part)]
     assert list(tables[0].columns) == ["t", "fr", "fl", "rl", "rr", "yaw_rate"]
     for name, values in tables[0].columns.items():

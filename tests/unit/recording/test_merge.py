@@ -10,8 +10,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.recording.merge import adopt
-from acsard.recording.state import freeze
+from acsard.recording.state import adopt, freeze
 from tests.scenarios.world import World
 
 PLAIN = Config()
