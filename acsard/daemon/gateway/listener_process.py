@@ -16,12 +16,13 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import zenoh
 from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Event, EventName
+from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.host import clock
 from acsard.host.child import Parent, Silence, end_with_parent
 from acsard.host.errors import Exit
@@ -155,7 +156,7 @@ NICE = 5
 """Niceness, so that the daemon and the programs of people run before this process."""
 
 
-class Listener(Protocol):
+class Listener:
     """A session that listens to the network: the TLS gateway, or the router of a fleet."""
 
     where: str
@@ -164,21 +165,20 @@ class Listener(Protocol):
     """Largest number of connections from the network."""
     events: Events
     """Names of the log events."""
+    files: CertificateFiles | None
+    """The certificate files of the session, or None if it has none."""
 
     def ready(self) -> bool:
         """Return whether clients may be admitted now."""
+        return True
 
     def open(self) -> zenoh.Session:
         """Open the session and listen. This call blocks."""
+        raise NotImplementedError
 
     def observe(self, session: zenoh.Session) -> Observation:
         """Return the state of the session. This call may never return."""
-
-    def renewed(self) -> bool:
-        """Return whether the session must be opened again, because it has a new certificate."""
-
-    def refused(self) -> str:
-        """Return why a session cannot be opened with the new certificate, or "" if it can."""
+        raise NotImplementedError
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
         """Publish the state for the daemon, if there is one. This call may never return."""
@@ -228,20 +228,26 @@ class ListenerProcess:
             if event is not None:
                 self._log.event(event)
                 return Exit.FAILURE
-            if self._listener.renewed() and not self._refused():
+            if self._renewed():
                 text = "opens again with its new certificate; all clients are disconnected"
                 self._log.info(self._listener.events["open"], text=text)
                 return Exit.FAILURE
             before_ns = now_ns
         return Exit.OK
 
-    def _refused(self) -> bool:
-        """Return whether the new certificate cannot be used, and log why."""
-        why = self._listener.refused()
+    def _renewed(self) -> bool:
+        """Return whether the session must be opened again, because it has a new certificate.
+
+        Zenoh cannot use it in an open session. If it cannot be used at all, the log says why.
+        """
+        files = self._listener.files
+        if files is None or not files.renewed():
+            return False
+        why = files.refused()
         if why:
             text = f"goes on with its old certificate, because it cannot use the new one: {why}"
             self._log.event(Event(self._listener.events["open"], text, "warning"))
-        return bool(why)
+        return not why
 
     def _leave(self, *_: object) -> None:
         self._leaving = True
