@@ -6,7 +6,7 @@ After a damaged place the replay goes on with the next state of the robot in the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import zip_longest
 from typing import NamedTuple
@@ -127,7 +127,72 @@ def _items(
             recording.damaged += 1
 
 
-class RecordedRun:
+MAX_STATE_BYTES = 8
+"""Largest size of the states that are decoded behind gaps, in bytes for each byte of the file.
+
+A state takes a third of its size in a file. Without this limit a forged file of 5 kB took 4 s.
+"""
+
+
+class _Source:
+    """A recording that is replayed, and the robot that the replay took from it last."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._state: State | None = None
+        """The robot that came from the file; None for a new robot."""
+        self._left = MAX_BYTES
+        """Largest size in bytes of the states that may still be decoded behind gaps."""
+        for path in recording.paths:
+            # A file that is gone is reported when its steps are read.
+            with suppress(OSError):
+                self._left += MAX_STATE_BYTES * path.stat().st_size
+
+    @contextmanager
+    def state_errors(self) -> Iterator[None]:
+        """Raise `RecordingError` if the block fails because the recorded state is incomplete.
+
+        Wrap every use of the robot in this context. The state may come from other code or a forged
+        file, so any part of the robot may be missing or of a wrong type. If the robot does not come
+        from the file, an error of the block is a defect of this version and is raised as it is.
+        """
+        try:
+            yield
+        except RecordingError:
+            raise
+        except INCOMPLETE_STATE_ERRORS as error:
+            if self._state is None:
+                raise
+            reason = f"this version cannot read the state at its start: {short(error)}"
+            raise _foreign(self._recording, reason) from error
+
+    def _resumed(
+        self,
+        saved: Checkpoint | None,
+        number: int,
+        tried: Callable[[Config], Config] | None = None,
+    ) -> State | None:
+        """Return the robot of `saved` if it is the robot before the step `number`.
+
+        Returns None if it is not, or if this version cannot read it. `tried` takes the
+        configuration of that robot, and returns the one that it gets.
+        """
+        if saved is None or saved.number != number:
+            return None
+        self._left -= len(saved.data)
+        if self._left < 0:
+            return None
+        try:
+            state = thaw(saved.data)
+            # A forged configuration may have values that no robot can work with.
+            present = parse("\n".join(document(effective(state.robot.config))).encode())
+            adopt(state.robot, Robot(present), Robot(tried(present) if tried else present))
+        except (StateError, ConfigError, *INCOMPLETE_STATE_ERRORS):
+            return None
+        return state
+
+
+class RecordedRun(_Source):
     """The steps of a recording that can be replayed, and the robot as it was before each of them.
 
     If steps are missing, the run goes on with the next state of the robot in the file. The steps
@@ -139,6 +204,7 @@ class RecordedRun:
 
         Raises `RecordingError` if this version cannot read the recorded configuration or state.
         """
+        super().__init__(recording)
         self._other, self._recorded = other, config_of(recording)
         self.config = other or self._recorded
         """Configuration of the first step."""
@@ -150,7 +216,6 @@ class RecordedRun:
         """Called with each step that can be read but not replayed."""
         self.copies = EventCopies(recording)
         """The copies of the events of the steps that can be read."""
-        self._recording, self._states = recording, _States(recording)
         self._next, self._state = _first_state(recording)
         """Number of the step before which `robot` is known, and the recorded robot if it is one."""
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
@@ -158,13 +223,6 @@ class RecordedRun:
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
-
-    def state_errors(self) -> AbstractContextManager[None]:
-        """Raise `RecordingError` if the recorded state lacks a part that the block uses.
-
-        Wrap every use of `robot` in this context.
-        """
-        return _state_errors(self._recording, lambda: self._state is not None)
 
     def steps(self) -> Iterator[Step]:
         """Yield the steps that can be replayed, and count the others in `gaps`.
@@ -225,55 +283,12 @@ class RecordedRun:
         """
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
-        state = self._states.resumed(saved, number, tried)
+        state = self._resumed(saved, number, tried)
         if state is None:
             return False
         self._state = state
         self.robot, self.memory = state
         return True
-
-
-MAX_STATE_BYTES = 8
-"""Largest size of the states that are decoded behind gaps, in bytes for each byte of the file.
-
-A state takes a third of its size in a file. Without this limit a forged file of 5 kB took 4 s.
-"""
-
-
-class _States:
-    """Decodes the states from which a replay goes on behind a gap, with a limited effort."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._left = MAX_BYTES
-        for path in recording.paths:
-            # A file that is gone is reported when its steps are read.
-            with suppress(OSError):
-                self._left += MAX_STATE_BYTES * path.stat().st_size
-
-    def resumed(
-        self,
-        saved: Checkpoint | None,
-        number: int,
-        tried: Callable[[Config], Config] | None = None,
-    ) -> State | None:
-        """Return the robot of `saved` if it is the robot before the step `number`.
-
-        Returns None if it is not, or if this version cannot read it. `tried` takes the
-        configuration of that robot, and returns the one that it gets.
-        """
-        if saved is None or saved.number != number:
-            return None
-        self._left -= len(saved.data)
-        if self._left < 0:
-            return None
-        try:
-            state = thaw(saved.data)
-            # A forged configuration may have values that no robot can work with.
-            present = parse("\n".join(document(effective(state.robot.config))).encode())
-            adopt(state.robot, Robot(present), Robot(tried(present) if tried else present))
-        except (StateError, ConfigError, *INCOMPLETE_STATE_ERRORS):
-            return None
-        return state
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
@@ -331,16 +346,15 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
     return f"{name} does not end the robot of this version"
 
 
-class DisplayReplay:
+class DisplayReplay(_Source):
     """Replay of a recording for display, which goes on after missing steps."""
 
     def __init__(self, recording: Recording) -> None:
         """Read the recording; raise `RecordingError` if its configuration cannot be read."""
-        self._recording, self._states = recording, _States(recording)
+        super().__init__(recording)
         self.notes: list[str] = []
         """Notes for the user about how this replay may differ from the recorded drive."""
         self.config = config_of(recording)
-        self._state: State | None = None
         self._in_gap = False
         """True from a missing step to the next state of the robot."""
         try:
@@ -355,13 +369,6 @@ class DisplayReplay:
                 "the replay begins with a new robot, which knows nothing of the "
                 f"time before: {error}"
             )
-
-    def state_errors(self) -> AbstractContextManager[None]:
-        """Raise `RecordingError` if the recorded state lacks a part that the block uses.
-
-        Wrap every use of the robot in this context.
-        """
-        return _state_errors(self._recording, lambda: self._state is not None)
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
         """Yield each recorded step, its replayed outputs, and the robot after the step.
@@ -382,7 +389,7 @@ class DisplayReplay:
                 if number is not None and step.number != number + 1:
                     self._in_gap = True
                 number = step.number
-                if self._in_gap and (state := self._states.resumed(saved, number)) is not None:
+                if self._in_gap and (state := self._resumed(saved, number)) is not None:
                     self._state, self._in_gap = state, False
                     self.replay.resume(*state)
                 with self.state_errors():
@@ -406,25 +413,6 @@ def _first_state(recording: Recording) -> tuple[int, State | None]:
         if topic == "steps":
             break
     return 0, None
-
-
-@contextmanager
-def _state_errors(recording: Recording, from_file: Callable[[], bool]) -> Iterator[None]:
-    """Raise `RecordingError` if the block fails because the recorded state is incomplete.
-
-    The state may come from other code or a forged file, so any part of the robot may be missing or
-    of a wrong type. If the robot does not come from the file, an error of the block is a defect of
-    this version and is raised as it is.
-    """
-    try:
-        yield
-    except RecordingError:
-        raise
-    except INCOMPLETE_STATE_ERRORS as error:
-        if not from_file():
-            raise
-        reason = f"this version cannot read the state at its start: {short(error)}"
-        raise _foreign(recording, reason) from error
 
 
 def _foreign(recording: Recording, reason: str) -> RecordingError:
