@@ -19,32 +19,49 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import msgspec
 
 from acsard.calibration.calibration_report import Refusal, keys, parts, report
-from acsard.calibration.guided.drive_plan import GuideError
+from acsard.calibration.guided.drive_plan import NEEDS, GuideError, setup
+from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
+from acsard.calibration.guided.runner import guide
 from acsard.calibration.log_table import LogError, RefusedError
 from acsard.calibration.multipliers import Tape
 from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.ros_bag_log import AXES, Choice
-from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_drive_options, differing, guided
+from acsard.calibration.solve import Calibration
 from acsard.cli.common import add_outcome, load, require_asking
-from acsard.cli.connection import add_bus
+from acsard.cli.connection import add_bus, require_one
+from acsard.client import connect
+from acsard.core.config.settings import Config
+from acsard.core.messages.topics import full_key
+from acsard.daemon.bus.address import address_of
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
+from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.output import SENTENCES, plain, show
-from acsard.terminal.prompt import NobodyError
+from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
+from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 DRIVEN = "the drive"
 """The name of a guided drive in messages and reports, where a log has its file name."""
 
+DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
+"""The options that only a guided drive takes."""
+
+IMU = "imu"
+"""The gyro's key if the command line names none."""
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_bus(parser)
-    add_drive_options(parser)
+    _add_drive_options(parser)
     parser.add_argument(
         "--log",
         type=Path,
@@ -96,7 +113,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
         if args.log:
             found, config = calibrated(args.log, mine, args.distance, _choice(args)), mine
         else:
-            found, config = guided(args, mine, where, lines)
+            found, config = _guided(args, mine, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
@@ -114,7 +131,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             show(*parts(told, found, where), most=SENTENCES)
     else:
         lines.result(plain(*parts(told, found, where), width=SENTENCES))
-        trouble = differing(config, mine, where)
+        trouble = _differing(config, mine, where)
         written = written or lines.offer(args.config, keys(found), trouble)
     if written and not args.log:
         print("restart the daemon: it reads these values only when it starts", file=sys.stderr)
@@ -150,3 +167,143 @@ def _distance(text: str) -> Tape:
     if not 0.1 <= value <= 1e4:
         raise argparse.ArgumentTypeError(f"{text} is not a distance in m from 0.1 to 10000")
     return Tape(value, run)
+
+
+def _add_drive_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--method",
+        choices=tuple(NEEDS),
+        help="reference for the drive (default: a gyro if the robot has one ([odometry] gyro), "
+        "else a tape)",
+    )
+    parser.add_argument(
+        "--positions",
+        metavar="KEY",
+        help="for --method positions: the key of the positions (PoseStamped or Odometry in JSON, "
+        "msgpack or CDR), as `acsard topics` lists it (sim/pose), or any full key",
+    )
+    parser.add_argument(
+        "--positions-at",
+        metavar="ENDPOINT",
+        help="where that key is published if the daemon does not have it, for example a router",
+    )
+    parser.add_argument(
+        "--imu",
+        metavar="KEY",
+        help="for --method gyro: the key of the gyro (default: imu), as `acsard topics` lists it, "
+        "or a full key",
+    )
+    parser.add_argument(
+        "--yes",
+        action="store_true",
+        help="start every leg without Enter (only with the built-in simulator)",
+    )
+
+
+def _guided(
+    args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
+) -> tuple[Calibration, Config]:
+    """Drive the robot and return the calibration with the configuration that the robot runs with.
+
+    A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
+    `RefusedError`.
+    """
+    require_one(args)
+    endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
+    _usable(args, full_key(robot_id, "odom"))
+    with ExitStack() as stack:
+        client = stack.enter_context(connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls))
+        info = client.get("info")
+        if args.yes and not info.simulated:
+            raise UsageError(
+                "--yes is only for the built-in simulator: this robot is real, and a person "
+                "must stand near it and start each leg. Leave --yes out"
+            )
+        mine, config = config, msgspec.convert(client.get("config"), Config)
+        if args.write and (trouble := _differing(config, mine, where)):
+            raise GuideError(trouble)
+        name = _way(args, config)
+        made = setup(config)
+        prompt = stack.enter_context(_prompt(args, lines))
+        prompt.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
+        robot = RobotOnBus(client, config, prompt)
+        if name == "gyro":
+            robot.gyro(args.imu or IMU)
+        elif name == "positions":
+            elsewhere = None
+            if args.positions_at:
+                elsewhere = client_session(args.positions_at, tls)
+                stack.callback(elsewhere.close)
+            robot.positions(args.positions, elsewhere)
+        try:
+            return guide(name, made, prompt, robot.ride, simulated=info.simulated), config
+        except KeyboardInterrupt:
+            raise GuideError("the operator ended the drive. No file is written") from None
+
+
+def _usable(args: argparse.Namespace, odometry: str) -> None:
+    if args.method == "positions" and not args.positions:
+        raise UsageError("--method positions needs the key of the positions: --positions KEY")
+    if args.positions and args.method not in (None, "positions"):
+        raise UsageError(f"--positions does not go with --method {args.method}: leave one out")
+    if args.positions in ("odom", odometry):
+        raise UsageError(
+            "odom is computed from the wheels themselves: the positions must come from "
+            "another source"
+        )
+    if args.imu and (args.positions or args.method not in (None, "gyro")):
+        other = "--positions" if args.positions else f"--method {args.method}"
+        raise UsageError(f"--imu is for --method gyro, not for {other}: leave one out")
+    if args.positions_at and not args.positions:
+        raise UsageError(
+            "--positions-at says where the key of --positions is: give --positions KEY as well"
+        )
+    if not (args.yes or args.json_lines or sys.stdin.isatty()):
+        raise UsageError(
+            "calibrate drives the robot, and a person at the terminal starts and stops "
+            "it: run it in a terminal. Without a terminal, use --yes (only with the "
+            "built-in simulator), or --log with a recorded drive"
+        )
+
+
+def _differing(config: Config, mine: Config, where: str) -> str:
+    """Return why a result for `config` does not belong into the file `where`, or "" if it does.
+
+    Args:
+        config: the configuration that the daemon runs with.
+        mine: the configuration in the file `where`.
+    """
+    same = config.drive.wheel_radius, config.drive.wheel_separation
+    if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
+        return ""
+    return (
+        f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation "
+        f"= {same[1]:g}, but {where} has other values: give --config the file that the "
+        "daemon uses"
+    )
+
+
+def _way(args: argparse.Namespace, config: Config) -> str:
+    if args.positions:
+        return "positions"
+    gyro = args.method == "gyro" or args.imu
+    if gyro and args.imu in (None, IMU) and not config.odometry.gyro:
+        raise UsageError(
+            "this robot's daemon receives no gyro: set odometry.gyro = true and restart "
+            "the daemon, or use --method tape, wall or umbmark"
+        )
+    way: str = args.method or ("gyro" if gyro or config.odometry.gyro else "tape")
+    return way
+
+
+@contextmanager
+def _prompt(args: argparse.Namespace, lines: JsonPrompt | None) -> Iterator[Prompt]:
+    if args.yes:
+        yield NoPrompt(args.json)
+        return
+    with ended_by_signals():
+        if lines is not None:
+            yield lines
+            return
+        with one_by_one():
+            yield TerminalPrompt(args.json)

@@ -13,17 +13,23 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
-import msgspec
 import zenoh
 
 from acsard.calibration.log_table import HEADER, KEYS, row
 from acsard.cli.common import count
-from acsard.cli.connection import MANY, add_bus, connected, connected_to_many, require_followed
-from acsard.cli.waiting import silence_explained
+from acsard.cli.connection import (
+    MANY,
+    add_bus,
+    connected,
+    connected_to_many,
+    require_followed,
+    silence_explained,
+)
+from acsard.cli.replies import json_line, of_robot
 from acsard.client import Client
 from acsard.client.synchronous import decoder
 from acsard.core import formatting
-from acsard.core.messages.encodings import DecodeError, Decoder, detect
+from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.one_line import SHORT, short
 from acsard.core.messages.schema import MESSAGES
 from acsard.core.messages.topics import TOPICS, by_key
@@ -210,24 +216,3 @@ def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
         words = f"{error} Waiting."
     print(f"acsard: {words}", file=sys.stderr)
     return there if ALL in ids else ids
-
-
-def of_robot(whose: str, line: str) -> str:
-    """Return a JSON line that names the robot and contains its message."""
-    told = {"robot": whose, "message": msgspec.Raw(line.encode())}
-    return formatting.json_line(msgspec.json.encode(told).decode())
-
-
-def json_line(encoding: str, payload: bytes) -> str:
-    """Return a payload of any encoding as one line of JSON.
-
-    Bytes that cannot be decoded become the text `{"undecodable": ...}`.
-    """
-    try:
-        form = detect(encoding, payload)
-        if form == "cdr":
-            raise DecodeError("unknown_encoding", "a CDR message does not contain its type")
-        codec = msgspec.json if form == "json" else msgspec.msgpack
-        return msgspec.json.encode(codec.decode(payload)).decode()
-    except (DecodeError, msgspec.MsgspecError, ValueError, TypeError, RecursionError):
-        return msgspec.json.encode({"undecodable": repr(payload)}).decode()

@@ -11,7 +11,7 @@ import sys
 import msgspec
 
 from acsard.cli.connection import MANY, add_bus, connected_to_many, require_asked
-from acsard.cli.echo import json_line, of_robot
+from acsard.cli.replies import json_line, of_robot
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError

@@ -13,8 +13,7 @@ import numpy as np
 import zenoh
 
 from acsard.cli.common import count
-from acsard.cli.connection import add_bus, connected, require_followed
-from acsard.cli.waiting import silence_explained
+from acsard.cli.connection import add_bus, connected, require_followed, silence_explained
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

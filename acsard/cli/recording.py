@@ -8,24 +8,27 @@ from __future__ import annotations
 
 import argparse
 import re
+import signal
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import msgspec
 
-from acsard.cli import recording_files
 from acsard.cli.common import load
-from acsard.cli.recording_files import progress
 from acsard.core.config.settings import Config
 from acsard.core.formatting import json_line, listed, many, printable
 from acsard.core.values import NS_PER_S
+from acsard.host.child import end_with_parent
 from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
+from acsard.host.extras import missing
 from acsard.recording.atomic_output import replacing
 from acsard.recording.directory import is_being_recorded
 from acsard.recording.directory import listed as recordings_in
 from acsard.recording.end_record import CRASHES, EndRecord, how_it_ends, read_end
+from acsard.recording.export import SUFFIX, Kind, export
 from acsard.recording.file import UNFINISHED, Recording, is_part, rewrite
 from acsard.recording.file_replay import config_of, replay_file, steps
 from acsard.recording.replay_text import (
@@ -51,6 +54,7 @@ from acsard.recording.time_span import (
     span,
 )
 from acsard.recording.timeline import TimelineEntry, TimelineWriter, is_serious
+from acsard.report.page import drawn
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
@@ -58,6 +62,21 @@ MAX_NAMES = 10
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
+
+
+EXPORT = """\
+Write the messages of a recorded robot as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag
+play`. The file is MCAP with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each
+source, diagnostics, state and log as ROS 2 messages, and with their definitions. With --config,
+write the messages that the robot would have published with another configuration. A part that a
+damaged place makes unreadable is left out. Exit codes: 0 complete, 65 a part is left out.
+"""
+
+REPORT = """\
+Draw a recording as one HTML file that needs no network. Needs the library plotly; if it is missing,
+a message gives the command that installs it. A part that a damaged place makes unreadable is left
+out and named; the exit code stays 0.
+"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -92,37 +111,59 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     recover.add_argument("file", metavar="FILE", help="the recording, or its number in the list")
     recover.add_argument("new", metavar="NEW", help="the file to write")
     recover.set_defaults(main=main_recover)
-    export = actions.add_parser(
+    exported = actions.add_parser(
         "export",
         help="write a recording as a file for Foxglove, PlotJuggler, ros2 bag, or as a table",
-        description=recording_files.EXPORT,
+        description=EXPORT,
     )
-    export.set_defaults(main=main_export)
+    exported.set_defaults(main=main_export)
     report = actions.add_parser(
         "report",
         help="draw a recording as one HTML file with path, speeds, sources, link and events",
-        description=recording_files.REPORT,
+        description=REPORT,
     )
     report.set_defaults(main=main_report)
     number = "its number in the list of `acsard recording`"
     one = f"a recording, or {number} (default: the newest)"
     default = "the newest; all if --from or --to has a time"
     several = f"a recording, {number}, or `all` (default: {default})"
-    for action, words in ((shown, several), (replay, one), (export, several), (report, several)):
+    for action, words in ((shown, several), (replay, one), (exported, several), (report, several)):
         action.add_argument("file", nargs="?", metavar="FILE", help=words)
-    recording_files.add_export(export)
-    recording_files.add_report(report)
-    for action in (replay, export):
+    for action, name, default in (
+        (exported, "NEW", "the recording's name with another suffix, in this directory"),
+        (report, "NEW.html", "FILE.html in this directory"),
+    ):
+        words = f"file to write (default: {default})"
+        action.add_argument("new", nargs="?", metavar=name, help=words)
+    form = exported.add_mutually_exclusive_group()
+    form.add_argument(
+        "--csv",
+        dest="kind",
+        action="store_const",
+        const="csv",
+        default="mcap",
+        help="write a table with one row per feedback line; its first columns are those that "
+        "`acsard calibrate --log` reads",
+    )
+    form.add_argument(
+        "--rosbag2",
+        dest="kind",
+        action="store_const",
+        const="rosbag2",
+        help="write a directory with metadata.yaml, as `ros2 bag` does",
+    )
+    report.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
+    for action in (replay, exported):
         action.add_argument(
             "--config",
             metavar="FILE",
             help="another acsard.toml to use instead of the recorded configuration",
         )
-    for action in (recover, export, report):
+    for action in (recover, exported, report):
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
-    for action in (shown, export, report):
+    for action in (shown, exported, report):
         _times(action, argparse.SUPPRESS)
-    for action in (shown, replay, recover, export, report):
+    for action in (shown, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
     # For `replay` and `export`, --config is the configuration that they try.
     for action in (shown, recover, report):
@@ -260,7 +301,10 @@ def _tell(one: TimelineEntry, as_json: bool) -> None:
     if as_json:
         print(json_line(msgspec.json.encode(one).decode()))
     else:
-        print(printable(_sentence(one)))
+        mark = {"warning": "! ", "error": "!! "}.get(one.level, "")
+        at = f"{date(one.seconds)} {clock(one.seconds)}"
+        words = f"{at}  {mark}{one.name.replace('_', ' ')}: {one.sentence}"
+        print(printable(words))
 
 
 def main_replay(args: argparse.Namespace) -> int:
@@ -272,7 +316,7 @@ def main_replay(args: argparse.Namespace) -> int:
     _refuse_times(args, "replay")
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
-    with progress(recording) as tell:
+    with _progress(recording) as tell:
         result = replay_file(recording, other, tell)
     comparison = result.comparison
     print(f"{verdict(comparison)}\n{explain_verdict(other is not None)}")
@@ -315,9 +359,16 @@ def main_recover(args: argparse.Namespace) -> int:
 
 
 def main_export(args: argparse.Namespace) -> int:
-    code = Exit.OK
-    for recording, part in _files_to_write(args):
-        left_out = recording_files.export(recording, part, args)
+    kind: Kind = args.kind
+    parts, code = _files_to_write(args), Exit.OK
+    other = None if args.config is None else load(args.config)[1]
+    for recording, part in parts:
+        # The default is this directory, because that of the recordings belongs to the service.
+        new = Path(args.new or recording.path.name.partition(".")[0] + SUFFIX[kind])
+        with _written(new), _progress(recording) as tell:
+            done = export(recording, new, kind, other, part, tell, args.force)
+        print(f"{done.count} {'rows' if kind == 'csv' else 'messages'} in {new}")
+        left_out = describe_gaps(done.gaps, "not exported")
         _note(recording, left_out)
         _note(recording, _bracketed(recording.missing))
         if left_out:
@@ -326,9 +377,23 @@ def main_export(args: argparse.Namespace) -> int:
 
 
 def main_report(args: argparse.Namespace) -> int:
-    plotly = recording_files.library()
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError:
+        raise missing("plotly", "report") from None
+    plotly: str = get_plotlyjs()
     for recording, part in _files_to_write(args):
-        for note in recording_files.report(recording, part, args, plotly):
+        if args.supervised:
+            end_with_parent(signal.SIGKILL)
+            text, _ = drawn(recording, plotly, part, _percent(recording))
+            sys.stdout.buffer.write(text.encode())
+            continue
+        new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
+        with _written(new), replacing(new, args.force) as file, _progress(recording) as tell:
+            text, notes = drawn(recording, plotly, part, tell)
+            file.write_text(text, encoding="utf-8")
+        print(f"{new}: {len(text) / 1e6:.1f} MB; open it in any browser")
+        for note in notes:
             _note(recording, note)
     return int(Exit.OK)
 
@@ -427,14 +492,59 @@ def _recording(args: argparse.Namespace) -> Recording:
     return Recording(files[-1])
 
 
-def _sentence(one: TimelineEntry) -> str:
-    mark = {"warning": "! ", "error": "!! "}.get(one.level, "")
-    at = f"{date(one.seconds)} {clock(one.seconds)}"
-    return f"{at}  {mark}{one.name.replace('_', ' ')}: {one.sentence}"
-
-
 def _when(text: str) -> When:
     try:
         return parse_when(text, time.time())
     except TimeError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+@contextmanager
+def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
+    """Yield a function that shows the progress; call it with the wall-clock time reached, in ns.
+
+    The progress line is erased at the end. If standard error is not a terminal, nothing is shown.
+    """
+    if not sys.stderr.isatty():
+        yield lambda wall_ns: None
+        return
+    began_ns, last = recording.about.wall_ns, read_end(recording.paths[-1])
+    whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
+
+    def tell(wall_ns: int) -> None:
+        text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s"
+        print(text, end="", file=sys.stderr, flush=True)
+
+    try:
+        yield tell
+    finally:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _written(new: Path) -> Iterator[None]:
+    """Turn the error of a file that cannot be written into one with an exit code."""
+    try:
+        yield
+    except OSError as error:
+        code = Exit.NO_PERMISSION if isinstance(error, PermissionError) else Exit.FAILURE
+        raise ExitError(code, f"cannot write {new}: {error.strerror}") from None
+
+
+def _percent(recording: Recording) -> Callable[[int], None]:
+    """Return a function that writes the progress in percent to standard error.
+
+    The page's server reads it.
+    """
+    last, began = read_end(recording.path), recording.about.wall_ns / 1e9
+    end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
+    told = 0
+
+    def tell(at_ns: int) -> None:
+        nonlocal told
+        percent = int(100 * (at_ns / 1e9 - began) / max(1.0, end - began))
+        if told < percent < 100:
+            told = percent
+            print(percent, file=sys.stderr, flush=True)
+
+    return tell

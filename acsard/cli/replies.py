@@ -1,4 +1,4 @@
-"""Calls a service of several robots at the same time, and prints one line per robot."""
+"""Prints messages as lines of JSON, calls several robots at once and prints a line for each."""
 
 from __future__ import annotations
 
@@ -6,14 +6,38 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from acsard.cli.echo import of_robot
+import msgspec
+
 from acsard.client import Client
+from acsard.core import formatting
 from acsard.core.formatting import printable
-from acsard.core.messages.encodings import encode
+from acsard.core.messages.encodings import DecodeError, detect, encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
 from acsard.daemon.bus.robot_discovery import ALL, present, seen
 from acsard.host.errors import Exit
+
+
+def of_robot(whose: str, line: str) -> str:
+    """Return a JSON line that names the robot and contains its message."""
+    told = {"robot": whose, "message": msgspec.Raw(line.encode())}
+    return formatting.json_line(msgspec.json.encode(told).decode())
+
+
+def json_line(encoding: str, payload: bytes) -> str:
+    """Return a payload of any encoding as one line of JSON.
+
+    Bytes that cannot be decoded become the text `{"undecodable": ...}`.
+    """
+    try:
+        form = detect(encoding, payload)
+        if form == "cdr":
+            raise DecodeError("unknown_encoding", "a CDR message does not contain its type")
+        codec = msgspec.json if form == "json" else msgspec.msgpack
+        return msgspec.json.encode(codec.decode(payload)).decode()
+    except (DecodeError, msgspec.MsgspecError, ValueError, TypeError, RecursionError):
+        return msgspec.json.encode({"undecodable": repr(payload)}).decode()
+
 
 AT_ONCE = 32
 """Largest number of robots that are called at the same time."""

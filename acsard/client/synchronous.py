@@ -33,8 +33,7 @@ from acsard.core.messages.topics import (
 from acsard.core.values import Plain, Pose
 from acsard.daemon.bus.address import Address, address_by_environment
 from acsard.daemon.bus.identity import Identity, identity
-from acsard.daemon.bus.robot_discovery import presence
-from acsard.daemon.bus.silent_key import explain_silence
+from acsard.daemon.bus.robot_discovery import explain_silence, presence
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.daemon.bus.tls import shown_at
 from acsard.daemon.bus.zenoh_sessions import client_session

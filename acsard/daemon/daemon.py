@@ -21,10 +21,7 @@ from acsard import __version__
 from acsard.core.config.settings import TLS, Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
-from acsard.core.messages.topics import offered, published
-from acsard.core.ros.transports import left_out
 from acsard.core.values import NS_PER_S, Event, Latches
-from acsard.daemon.bus.access import access_control
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.certificate_watch import watch_certificates
 from acsard.daemon.bus.tls import ends as ends_of
@@ -36,7 +33,7 @@ from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulated_board import Simulated
 from acsard.daemon.settings_file import SettingsFile
-from acsard.daemon.supervisor import GATEWAY, PAGE, Kind, keep_running
+from acsard.daemon.supervisor import GATEWAY, PAGE, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
 from acsard.host.logs import Log
@@ -159,7 +156,7 @@ async def _run(
         keeper = _keeper(config, stack)
         path = config.mcu.port if simulated is None else simulated.path
         after = stack.enter_context(ExitStack())
-        bus, port = _bus(config, wake), _port(config, path, wake, events.append)
+        bus, port = ZenohBus(config, wake), _port(config, path, wake, events.append)
         ends = _certificates(config, gateway is not None)
         # The bus comes first: an id or address in use must end the daemon before the port opens.
         async with _patience(config, log, manager):
@@ -197,7 +194,9 @@ async def _run(
         manager.ready()
         departure.started()
         served = ((gateway if config.bus.outside else None, GATEWAY), (page, PAGE))
-        helpers = [_keep(words, events.append, kind) for words, kind in served if words is not None]
+        helpers: list[Coroutine[Any, Any, object]] = [
+            keep_running(words, events.append, kind) for words, kind in served if words is not None
+        ]
         if ends:
             helpers.append(watch_certificates(config.bus, control.report.certificate_ends))
         async with _beside([port.keep_open(), _repeat_latched(bus, control), *helpers]):
@@ -227,21 +226,6 @@ def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
     return keeper
 
 
-def _bus(config: Config, wake: Wakeup) -> ZenohBus:
-    """Return the bus, not yet open."""
-    return ZenohBus(
-        config.bus,
-        config.ros,
-        left_out(config),
-        config.robot.id,
-        tuple(source.name for source in config.commands.sources),
-        access_control(config),
-        wake,
-        offered(config),
-        published(config),
-    )
-
-
 def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
     """Return the port, not yet open."""
     stop, period_ns = _stop_line(config), int(NS_PER_S / config.rate_hz)
@@ -249,7 +233,7 @@ def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]
 
 
 @asynccontextmanager
-async def _beside(helpers: Iterable[Coroutine[Any, Any, None]]) -> AsyncIterator[None]:
+async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterator[None]:
     """Run the helpers as tasks beside the block, and cancel them when it ends."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(helper) for helper in helpers]
@@ -316,10 +300,6 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
         yield
     finally:
         task.cancel()
-
-
-async def _keep(words: Sequence[str], log: Callable[[Event], None], kind: Kind) -> None:
-    await keep_running(words, log, kind)
 
 
 async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:

@@ -148,41 +148,21 @@ class LastMinute:
         return sum(count for number, count in self._slots if number > oldest)
 
 
-class Figures:
-    """All figures of one daemon."""
+class Stopwatch:
+    """The measurements of the control loop."""
 
     def __init__(self) -> None:
-        self._figures = {name: Figure() for name in NAMES}
+        self.figures: dict[Name, Figure] = {name: Figure() for name in NAMES}
+        self._missed = LastMinute()
         self._cached: dict[str, Measured] = {}
         self._cached_ns = -FRESH_NS
-
-    def __getitem__(self, name: Name) -> Figure:
-        return self._figures[name]
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
         """Return all figures by name, at most a second old."""
         if now_ns - self._cached_ns >= FRESH_NS:
             self._cached_ns = now_ns
-            self._cached = {name: figure.measured(now_ns) for name, figure in self._figures.items()}
+            self._cached = {name: figure.measured(now_ns) for name, figure in self.figures.items()}
         return self._cached
-
-
-class Stopwatch:
-    """The measurements of the control loop."""
-
-    def __init__(self) -> None:
-        figures = self._figures = Figures()
-        self._period_lateness = figures["period_lateness"]
-        self._step_time = figures["step_time"]
-        self._command_age = figures["command_age"]
-        self._command_to_wire = figures["command_to_wire"]
-        self._feedback_to_bus = figures["feedback_to_bus"]
-        self._round_trip = figures["mcu_round_trip"]
-        self._missed = LastMinute()
-
-    def measured(self, now_ns: int) -> dict[str, Measured]:
-        """Return all figures by name."""
-        return self._figures.measured(now_ns)
 
     def missed(self, now_ns: int) -> int:
         """Return the number of periods in the last minute that had no step."""
@@ -193,7 +173,7 @@ class Stopwatch:
 
         `missed` periods before it had no step.
         """
-        self._period_lateness.add(now_ns, late_ns)
+        self.figures["period_lateness"].add(now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)
 
@@ -205,9 +185,9 @@ class Stopwatch:
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
-        self._command_age.add(sent_ns, sent_ns - command_ns)
+        self.figures["command_age"].add(sent_ns, sent_ns - command_ns)
         if command_ns > before_ns:  # otherwise it waited for its source's turn, not for the wire
-            self._command_to_wire.add(sent_ns, sent_ns - command_ns)
+            self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """Record a feedback line.
@@ -216,10 +196,10 @@ class Stopwatch:
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
-            self._round_trip.add(at_ns, at_ns - asked_ns)
+            self.figures["mcu_round_trip"].add(at_ns, at_ns - asked_ns)
         if told_ns is not None:
-            self._feedback_to_bus.add(told_ns, told_ns - at_ns)
+            self.figures["feedback_to_bus"].add(told_ns, told_ns - at_ns)
 
     def step(self, began_ns: int, ended_ns: int) -> None:
         """Record the start and the end of a step."""
-        self._step_time.add(began_ns, ended_ns - began_ns)
+        self.figures["step_time"].add(began_ns, ended_ns - began_ns)

@@ -66,14 +66,6 @@ class _Checked(Struct, frozen=True):
     edit: Edit
 
 
-class _Obeyed(Struct, frozen=True):
-    """A change that is to be written, because the robot has obeyed."""
-
-    edit: Edit
-    answer: Answer
-    """The robot's answer."""
-
-
 class _Pending(Struct):
     """A request that has no answer yet."""
 
@@ -109,8 +101,9 @@ class SettingsFile:
         """The signature of the file that `_written` was read from."""
         self._box = Mailbox[Request | Literal["look"]](JOBS)
         """The requests that the thread is to check."""
-        self._changes = deque[_Obeyed]()
-        """The changes that the thread is to write, each before the next check."""
+        self._changes = deque[tuple[Edit, Answer]]()
+        """The changes that the thread is to write, each with the robot's answer and before the next
+        check."""
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
@@ -159,7 +152,7 @@ class SettingsFile:
             del self._pending[answer.id]
             return False
         pending.answer = answer
-        self._changes.append(_Obeyed(pending.edit, answer))
+        self._changes.append((pending.edit, answer))
         self._look()
         return True
 
@@ -231,7 +224,7 @@ class SettingsFile:
     def _write(self) -> None:
         """Write the changes that the robot has obeyed."""
         while self._changes:
-            self._results.put(self._written_answer(self._changes.popleft()))
+            self._results.put(self._written_answer(*self._changes.popleft()))
 
     def _checked(self, request: Request) -> _Checked | Answer:
         """Return the request if its settings can be written, else the answer that refuses it."""
@@ -245,21 +238,21 @@ class SettingsFile:
         except MendableError as error:
             return Answer(request.id, False, f"nothing is set: {error}")
 
-    def _written_answer(self, job: _Obeyed) -> Answer:
+    def _written_answer(self, edit: Edit, answer: Answer) -> Answer:
         """Write a change, and return the answer to its request."""
-        told = job.answer.message
+        told = answer.message
         try:
-            keep(job.edit)
+            keep(edit)
         except MendableError as error:
-            return Answer(job.answer.id, False, f"{told}; until the next start: {error}")
+            return Answer(answer.id, False, f"{told}; until the next start: {error}")
         limits = {
             key.removeprefix(TABLE): float(value)  # type: ignore[arg-type]
-            for key, value in job.edit.keys.items()
+            for key, value in edit.keys.items()
             if key.startswith(TABLE)
         }
         if limits:
             self._limits = replace(self._limits, **limits)
-        return Answer(job.answer.id, True, f"{told}; written to {job.edit.file}")
+        return Answer(answer.id, True, f"{told}; written to {edit.file}")
 
     def _difference(self) -> str:
         """Return the text of `differ`."""

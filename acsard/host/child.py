@@ -38,7 +38,7 @@ BEAT_S = 0.5
 
 SILENT_NS = 3 * NS_PER_S
 """Silence after which a child is killed. The gateway ends itself after a second without progress
-(`daemon/gateway/session_health.py`); this limit is for a process that cannot even do that."""
+(`daemon/gateway/listener_process.py`); this limit is for a process that cannot even do that."""
 
 START_NS = 15 * NS_PER_S
 """Time for the first sign of life: the start of Python on a busy machine."""

@@ -5,22 +5,20 @@ The pure modules:
 - `rows`: the encoding of many steps; it refuses values that no daemon records.
 - `replay`: runs recorded inputs through `Robot.step` again and compares the outputs.
 - `replay_text`: describes the result of a replay in lines of text.
-- `merge`: applies another configuration to a recorded robot state.
 - `unpickling`: rebuilds a robot from bytes that a stranger may have written.
 - `timeline`: describes a recording in sentences.
 - `retention`: decides which recordings are deleted and which are retained.
 - `published`: rebuilds the messages that were published.
-- `csv_table`: writes the lines of a CSV file.
 - `ros_bag`: writes the `metadata.yaml` of a ROS bag.
 
 The modules that do I/O:
 - `recorder`: takes steps from the control loop; `step_writer` writes them in a thread.
 - `directory`: limits the directory of recordings in bytes and in days.
-- `file`: writes and reads one MCAP file; `chunks`, `mcap_records` and `end_record` are its parts.
+- `file`: writes and reads one MCAP file; `mcap_records` and `end_record` are its parts.
 - `series`: finds the recordings of a range of time, and reads the files of one run as one.
 - `time_span`: reads the times that a person types, and finds them in a recording.
 - `recovery`: finishes a file that was cut off.
-- `state`: encodes a robot as bytes, and decodes it.
-- `file_replay`: replays a file; `event_copies` compares the copies of its events.
+- `state`: encodes a robot as bytes, decodes it, and applies another configuration to it.
+- `file_replay`: replays a file, and compares the copies of its events.
 - `export`: writes files for other programs; `atomic_output` puts each in its place atomically.
 """

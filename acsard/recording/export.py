@@ -1,9 +1,16 @@
-"""Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV."""
+"""Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV.
+
+In the CSV table each feedback line and each gyro sample has its own row. The columns for `acsard
+calibrate` come first. The pose from odometry is in the columns `odom_...`, which calibration does
+not take for a measured position: odometry uses the wheels, and calibration must not compare the
+wheels with themselves.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, Literal, Protocol
+from typing import BinaryIO, Literal
 
 from mcap.writer import Writer
 from msgspec import Struct
@@ -12,9 +19,9 @@ from acsard import __version__
 from acsard.core.config.settings import Config
 from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.core.ros.names import TYPE_HASHES
-from acsard.core.values import NS_PER_S, Outputs
+from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, Outputs
 from acsard.host.errors import RecordingError
-from acsard.recording import csv_table, ros_bag
+from acsard.recording import ros_bag
 from acsard.recording.atomic_output import replacing, synced
 from acsard.recording.file import About, Recording
 from acsard.recording.file_replay import (
@@ -28,6 +35,67 @@ from acsard.recording.published import Published, Publisher
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import WHOLE, Span
+
+MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
+"""Columns that calibration reads. `t` is the wall-clock time, s since 1970. `yaw_rate` is from a
+gyro, and the others are the speeds of the wheels.
+"""
+
+OUTPUT_COLUMNS = (
+    "odom_x [m]", "odom_y [m]", "odom_yaw [rad]", "linear [m/s]", "angular [rad/s]",
+    "applied_linear [m/s]", "applied_angular [rad/s]", "mode", "link", "source",
+)  # fmt: skip
+"""Columns with outputs of the robot. A row of a gyro sample leaves them empty."""
+
+CSV_HEADER = ",".join([*MEASURED, *OUTPUT_COLUMNS])
+MEASURED_CSV_HEADER = ",".join(MEASURED)
+
+_NO_WHEELS = "," * 4
+_NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
+
+
+def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
+    """Yield the CSV rows of a step, without line ends."""
+    now = step.inputs.now
+    for sample in step.inputs.gyro:
+        yield gyro_columns(sample, now) + _NO_OUTPUTS
+    if outputs.estimates:
+        applied = f"{outputs.applied.linear:.6g},{outputs.applied.angular:.6g}"
+        status = f"{outputs.mode},{outputs.link},{outputs.source}"
+        for estimate in outputs.estimates:
+            pose = f"{estimate.pose.x:.6f},{estimate.pose.y:.6f},{estimate.pose.yaw:.6f}"
+            twist = f"{estimate.twist.linear:.6g},{estimate.twist.angular:.6g}"
+            yield f"{wheel_columns(estimate)},{pose},{twist},{applied},{status}"
+
+
+def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
+    """Yield the CSV rows of a step with only the columns that calibration reads."""
+    for sample in step.inputs.gyro:
+        yield gyro_columns(sample, step.inputs.now)
+    for estimate in outputs.estimates:
+        yield wheel_columns(estimate)
+
+
+def wheel_columns(estimate: Estimate) -> str:
+    """Return the measured columns of a feedback line."""
+    wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
+    return f"{_csv_seconds(estimate.at.wall_ns)},{wheels},"
+
+
+def gyro_columns(sample: GyroSample, now: Instant) -> str:
+    """Return the measured columns of a gyro sample.
+
+    The time is the sample's stamp. If it has no stamp, the time is that of its arrival, which `now`
+    converts from the monotonic to the wall clock.
+    """
+    arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
+    at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
+    return f"{_csv_seconds(at_ns)},{_NO_WHEELS}{sample.rate:.6g}"
+
+
+def _csv_seconds(wall_ns: int) -> str:
+    return f"{wall_ns // NS_PER_S}.{wall_ns % NS_PER_S // 1000:06d}"
+
 
 Kind = Literal["mcap", "csv", "rosbag2"]
 
@@ -44,13 +112,15 @@ class ExportResult(Struct, frozen=True):
     """The parts of the time span that are not exported."""
 
 
-class _Writer(Protocol):
+class _Writer:
     """A file format: takes steps and writes them to a stream."""
 
-    count: int
+    count = 0
+    """Number of messages or rows so far."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
         """Write a step and its replayed outputs."""
+        raise NotImplementedError
 
     def skip(self, step: Step, inside: bool) -> None:
         """Take a step that is not replayed, or that is not in the time span.
@@ -65,7 +135,7 @@ class _Writer(Protocol):
         """Write the end of the file."""
 
 
-class _MessageWriter:
+class _MessageWriter(_Writer):
     """Writes ROS messages to an MCAP file."""
 
     def __init__(self, stream: BinaryIO, run: RecordedRun, about: About, name: str) -> None:
@@ -80,7 +150,6 @@ class _MessageWriter:
         self._channels: dict[tuple[str, str], int] = {}
         self._topics: dict[int, tuple[str, Channel]] = {}
         self._counts: dict[int, int] = {}
-        self.count = 0
         self.times: tuple[int, int] = (0, 0)
         """Earliest and latest wall-clock time of a message, ns since 1970."""
 
@@ -137,24 +206,17 @@ class _MessageWriter:
         ]
 
 
-class _TableWriter:
+class _TableWriter(_Writer):
     """Writes a CSV table."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
-        self._stream.write(f"{csv_table.HEADER}\n".encode())
-        self.count = 0
+        self._stream.write(f"{CSV_HEADER}\n".encode())
 
     def step(self, step: Step, outputs: Outputs) -> None:
-        for row in csv_table.rows(step, outputs):
+        for row in csv_rows(step, outputs):
             self._stream.write(f"{row}\n".encode())
             self.count += 1
-
-    def skip(self, step: Step, inside: bool) -> None: ...
-
-    def end(self, ending: str = "") -> None: ...
-
-    def finish(self) -> None: ...
 
 
 def export(
@@ -256,13 +318,13 @@ def measured(recording: Recording) -> bytes:
     Raises `RecordingError` if the recording has no gyro samples, because calibration cannot use it.
     """
     run = RecordedRun(recording)
-    lines, has_gyro = [csv_table.MEASURED_HEADER], False
+    lines, has_gyro = [MEASURED_CSV_HEADER], False
     with run.state_errors():
         for step in run.steps():
             if run.gaps:
                 # A calibration compares whole drives, and part of this drive is missing.
                 break
-            lines += csv_table.measured(step, replay_step(run.robot, step))
+            lines += measured_csv_rows(step, replay_step(run.robot, step))
             has_gyro = has_gyro or bool(step.inputs.gyro)
     if not has_gyro:
         raise RecordingError(

@@ -13,8 +13,8 @@ A metadata record names the robot and the version of acsard, and an attachment h
 replayed without them. The metadata of the channels, and a further metadata record, tell people with
 other MCAP programs how to read the file.
 
-The messages are in chunks of about ten seconds, which `chunks.py` writes. A file that was cut off
-has no end record, but all data that was synced to the disk can still be read. `rewrite` makes a
+The messages are in chunks of about ten seconds, which `mcap_records.py` writes. A file that was cut
+off has no end record, but all data that was synced to the disk can still be read. `rewrite` makes a
 finished file of such a file.
 """
 
@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
-from mcap.data_stream import RecordBuilder
 from mcap.records import (
     Attachment,
     AttachmentIndex,
@@ -49,9 +48,8 @@ from msgspec import Struct
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
-from acsard.recording.chunks import GROWING_HEAD, GrowingChunk, Message
 from acsard.recording.end_record import END, EndRecord, Ns, as_metadata, end_in, how_it_ends
-from acsard.recording.mcap_records import MAGIC, walk
+from acsard.recording.mcap_records import GROWING_HEAD, MAGIC, GrowingChunk, Message, encoded, walk
 from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, Batch, Row, first_of
 from acsard.recording.state import Checkpoint
@@ -245,10 +243,8 @@ class Writing:
         self.flush()
 
     def _write(self, record: McapRecord) -> None:
-        builder = RecordBuilder()
-        record.write(builder)
         at = self._file.tell()
-        self._index.record(record, at, self._file.write(builder.end()))
+        self._index.record(record, at, self._file.write(encoded(record)))
 
     @property
     def size(self) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import zip_longest
 from typing import NamedTuple
 
 from msgspec import Struct
@@ -16,18 +17,18 @@ from acsard.core.config.live import changed, flat
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config
 from acsard.core.config.writing import document
+from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
 from acsard.core.values import Outputs
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import read_end
-from acsard.recording.event_copies import EventCopies
-from acsard.recording.file import Recording
-from acsard.recording.merge import adopt
+from acsard.recording.file import Recording, event_of
 from acsard.recording.recorded_steps import Step, UnfinishedError, unfinished
 from acsard.recording.replay import Comparison, Replay
 from acsard.recording.rows import BatchError, decode
-from acsard.recording.state import Checkpoint, State, StateError, checkpoint, short, thaw
+from acsard.recording.state import Checkpoint, State, StateError, adopt, checkpoint, short, thaw
+from acsard.recording.timeline import TimelineEntry, entry_of
 from acsard.recording.unpickling import MAX_BYTES
 
 Progress = Callable[[int], None]
@@ -126,7 +127,72 @@ def _items(
             recording.damaged += 1
 
 
-class RecordedRun:
+MAX_STATE_BYTES = 8
+"""Largest size of the states that are decoded behind gaps, in bytes for each byte of the file.
+
+A state takes a third of its size in a file. Without this limit a forged file of 5 kB took 4 s.
+"""
+
+
+class _Source:
+    """A recording that is replayed, and the robot that the replay took from it last."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._state: State | None = None
+        """The robot that came from the file; None for a new robot."""
+        self._left = MAX_BYTES
+        """Largest size in bytes of the states that may still be decoded behind gaps."""
+        for path in recording.paths:
+            # A file that is gone is reported when its steps are read.
+            with suppress(OSError):
+                self._left += MAX_STATE_BYTES * path.stat().st_size
+
+    @contextmanager
+    def state_errors(self) -> Iterator[None]:
+        """Raise `RecordingError` if the block fails because the recorded state is incomplete.
+
+        Wrap every use of the robot in this context. The state may come from other code or a forged
+        file, so any part of the robot may be missing or of a wrong type. If the robot does not come
+        from the file, an error of the block is a defect of this version and is raised as it is.
+        """
+        try:
+            yield
+        except RecordingError:
+            raise
+        except INCOMPLETE_STATE_ERRORS as error:
+            if self._state is None:
+                raise
+            reason = f"this version cannot read the state at its start: {short(error)}"
+            raise _foreign(self._recording, reason) from error
+
+    def _resumed(
+        self,
+        saved: Checkpoint | None,
+        number: int,
+        tried: Callable[[Config], Config] | None = None,
+    ) -> State | None:
+        """Return the robot of `saved` if it is the robot before the step `number`.
+
+        Returns None if it is not, or if this version cannot read it. `tried` takes the
+        configuration of that robot, and returns the one that it gets.
+        """
+        if saved is None or saved.number != number:
+            return None
+        self._left -= len(saved.data)
+        if self._left < 0:
+            return None
+        try:
+            state = thaw(saved.data)
+            # A forged configuration may have values that no robot can work with.
+            present = parse("\n".join(document(effective(state.robot.config))).encode())
+            adopt(state.robot, Robot(present), Robot(tried(present) if tried else present))
+        except (StateError, ConfigError, *INCOMPLETE_STATE_ERRORS):
+            return None
+        return state
+
+
+class RecordedRun(_Source):
     """The steps of a recording that can be replayed, and the robot as it was before each of them.
 
     If steps are missing, the run goes on with the next state of the robot in the file. The steps
@@ -138,6 +204,7 @@ class RecordedRun:
 
         Raises `RecordingError` if this version cannot read the recorded configuration or state.
         """
+        super().__init__(recording)
         self._other, self._recorded = other, config_of(recording)
         self.config = other or self._recorded
         """Configuration of the first step."""
@@ -149,25 +216,13 @@ class RecordedRun:
         """Called with each step that can be read but not replayed."""
         self.copies = EventCopies(recording)
         """The copies of the events of the steps that can be read."""
-        self._recording, self._states = recording, _States(recording)
-        first = _first_state(recording)
-        self._next = first.number if first else 0
-        """Number of the step before which `robot` is known."""
-        self._state = _robot_of(recording, first) if first else None
+        self._next, self._state = _first_state(recording)
+        """Number of the step before which `robot` is known, and the recorded robot if it is one."""
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
         """The robot and its guard's memory. They are other objects after a gap."""
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
-
-    @contextmanager
-    def state_errors(self) -> Iterator[None]:
-        """Raise `RecordingError` if the recorded state lacks a part that the block uses.
-
-        Wrap every use of `robot` in this context.
-        """
-        with _state_errors(self._recording, lambda: self._state is not None):
-            yield
 
     def steps(self) -> Iterator[Step]:
         """Yield the steps that can be replayed, and count the others in `gaps`.
@@ -228,55 +283,12 @@ class RecordedRun:
         """
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
-        state = self._states.resumed(saved, number, tried)
+        state = self._resumed(saved, number, tried)
         if state is None:
             return False
         self._state = state
         self.robot, self.memory = state
         return True
-
-
-MAX_STATE_BYTES = 8
-"""Largest size of the states that are decoded behind gaps, in bytes for each byte of the file.
-
-A state takes a third of its size in a file. Without this limit a forged file of 5 kB took 4 s.
-"""
-
-
-class _States:
-    """Decodes the states from which a replay goes on behind a gap, with a limited effort."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._left = MAX_BYTES
-        for path in recording.paths:
-            # A file that is gone is reported when its steps are read.
-            with suppress(OSError):
-                self._left += MAX_STATE_BYTES * path.stat().st_size
-
-    def resumed(
-        self,
-        saved: Checkpoint | None,
-        number: int,
-        tried: Callable[[Config], Config] | None = None,
-    ) -> State | None:
-        """Return the robot of `saved` if it is the robot before the step `number`.
-
-        Returns None if it is not, or if this version cannot read it. `tried` takes the
-        configuration of that robot, and returns the one that it gets.
-        """
-        if saved is None or saved.number != number:
-            return None
-        self._left -= len(saved.data)
-        if self._left < 0:
-            return None
-        try:
-            state = thaw(saved.data)
-            # A forged configuration may have values that no robot can work with.
-            present = parse("\n".join(document(effective(state.robot.config))).encode())
-            adopt(state.robot, Robot(present), Robot(tried(present) if tried else present))
-        except (StateError, ConfigError, *INCOMPLETE_STATE_ERRORS):
-            return None
-        return state
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
@@ -334,21 +346,19 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
     return f"{name} does not end the robot of this version"
 
 
-class DisplayReplay:
+class DisplayReplay(_Source):
     """Replay of a recording for display, which goes on after missing steps."""
 
     def __init__(self, recording: Recording) -> None:
         """Read the recording; raise `RecordingError` if its configuration cannot be read."""
-        self._recording, self._states = recording, _States(recording)
+        super().__init__(recording)
         self.notes: list[str] = []
         """Notes for the user about how this replay may differ from the recorded drive."""
         self.config = config_of(recording)
-        self._state: State | None = None
         self._in_gap = False
         """True from a missing step to the next state of the robot."""
         try:
-            first = _first_state(recording)
-            self._state = _robot_of(recording, first) if first else None
+            _, self._state = _first_state(recording)
             with self.state_errors():
                 if self._state is not None:
                     adopt(self._state.robot, Robot(self.config), Robot(self.config))
@@ -359,15 +369,6 @@ class DisplayReplay:
                 "the replay begins with a new robot, which knows nothing of the "
                 f"time before: {error}"
             )
-
-    @contextmanager
-    def state_errors(self) -> Iterator[None]:
-        """Raise `RecordingError` if the recorded state lacks a part that the block uses.
-
-        Wrap every use of the robot in this context.
-        """
-        with _state_errors(self._recording, lambda: self._state is not None):
-            yield
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
         """Yield each recorded step, its replayed outputs, and the robot after the step.
@@ -388,7 +389,7 @@ class DisplayReplay:
                 if number is not None and step.number != number + 1:
                     self._in_gap = True
                 number = step.number
-                if self._in_gap and (state := self._states.resumed(saved, number)) is not None:
+                if self._in_gap and (state := self._resumed(saved, number)) is not None:
                     self._state, self._in_gap = state, False
                     self.replay.resume(*state)
                 with self.state_errors():
@@ -397,47 +398,21 @@ class DisplayReplay:
                     yield step, self.replay.outputs, self.replay.robot
 
 
-def _first_state(recording: Recording) -> Checkpoint | None:
-    """Return the robot's state before the first step, or None if the file holds no such state.
+def _first_state(recording: Recording) -> tuple[int, State | None]:
+    """Return the number of the first step and the robot before it, or 0 and None for a new robot.
 
-    Raises `RecordingError` if the state is damaged.
+    Raises `RecordingError` if the state is damaged, or if this version cannot read it.
     """
     for topic, _, data in recording.messages():
         if topic == "state":
             try:
-                return checkpoint(data)
+                saved = checkpoint(data)
+                return saved.number, thaw(saved.data)
             except StateError as error:
                 raise _foreign(recording, str(error)) from None
         if topic == "steps":
-            return None
-    return None
-
-
-def _robot_of(recording: Recording, saved: Checkpoint) -> State:
-    """Return the robot of a state; raise `RecordingError` if this version cannot read it."""
-    try:
-        return thaw(saved.data)
-    except StateError as error:
-        raise _foreign(recording, str(error)) from None
-
-
-@contextmanager
-def _state_errors(recording: Recording, from_file: Callable[[], bool]) -> Iterator[None]:
-    """Raise `RecordingError` if the block fails because the recorded state is incomplete.
-
-    The state may come from other code or a forged file, so any part of the robot may be missing or
-    of a wrong type. If the robot does not come from the file, an error of the block is a defect of
-    this version and is raised as it is.
-    """
-    try:
-        yield
-    except RecordingError:
-        raise
-    except INCOMPLETE_STATE_ERRORS as error:
-        if not from_file():
-            raise
-        reason = f"this version cannot read the state at its start: {short(error)}"
-        raise _foreign(recording, reason) from error
+            break
+    return 0, None
 
 
 def _foreign(recording: Recording, reason: str) -> RecordingError:
@@ -445,3 +420,89 @@ def _foreign(recording: Recording, reason: str) -> RecordingError:
         f"{recording.path}: {reason}; it was recorded by acsard {recording.about.version}, whose "
         "replay can read it"
     )
+
+
+class EventCopies:
+    """Finds the first copy of an event that differs from the event of its step.
+
+    A file has each event twice: in its step, where the replay checks it, and as a message of the
+    channel `events`, from which the list of recordings makes its summary.
+
+    Call `batch` for each batch of steps, `copy` for each message of the channel `events`, both in
+    the order of the file, and `end` after the last message.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.difference = ""
+        """Sentence about the first copy that differs, or "" if all copies are equal."""
+        self._recording = recording
+        self._events: list[TimelineEntry] = []
+        """The events of the last batch of steps."""
+        self._copies: list[TimelineEntry] = []
+        """The copies that followed that batch."""
+        self._number: int | None = None
+        """Number of the step after that batch."""
+        self._damaged = 0
+        """Number of damaged places before that batch."""
+
+    def batch(self, steps: list[Step]) -> None:
+        """Take a batch of steps; its copies follow."""
+        self._compare(last=False, follows=self._number in (None, steps[0].number))
+        self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
+        self._events = [
+            entry_of(event, step.inputs.now.wall_ns)
+            for step in steps
+            for event in step.recorded.events
+        ]
+        self._copies = []
+
+    def copy(self, data: bytes) -> None:
+        """Take a message of the channel `events`."""
+        try:
+            self._copies.append(event_of(self._recording, data))
+        except RecordingError as error:
+            self._differs(str(error))
+
+    def end(self) -> None:
+        """Compare the copies of the last batch, and the summary in the end record."""
+        recording = self._recording
+        self._compare(last=True)
+        if self.difference or not recording.whole:
+            return
+        end = read_end(recording.path)
+        said = recording.compute_end_record().said
+        if end is not None and end.said != said:
+            self._differs(f'the end of the file says "{end.said}", and its events say "{said}"')
+
+    def _compare(self, last: bool, follows: bool = True) -> None:
+        """Compare the copies with the events of the batch before them.
+
+        Copies may be missing at the end of a file that was cut off. If there is damage between this
+        batch and the next one, the copies may belong to a batch that cannot be read.
+
+        Args:
+            last: true for the copies of the last batch.
+            follows: true if no step is missing between this batch and the next one.
+        """
+        recording = self._recording
+        if recording.damaged > self._damaged or not follows:
+            return
+        missing = last and bool(recording.cut or not recording.ended)
+        for event, copy in zip_longest(self._events, self._copies):
+            if event != copy:
+                if copy is not None or not missing:
+                    self._differs(
+                        f"the events of the file differ: {_words(event)} in a step, but "
+                        f"{_words(copy)} in the channel `events`"
+                    )
+                return
+
+    def _differs(self, sentence: str) -> None:
+        self.difference = self.difference or printable(sentence)
+
+
+def _words(entry: TimelineEntry | None) -> str:
+    if entry is None:
+        return "nothing"
+    by = f" (by {entry.by})" if entry.by else ""
+    return f'"{entry.name}: {entry.text}{by}"'

@@ -185,11 +185,6 @@ def count_superseded(commands: Sequence[Command]) -> int:
     return len(commands) - len({(command.source, command.sender) for command in commands})
 
 
-def microposes(estimates: Sequence[Estimate]) -> tuple[Micropose, ...]:
-    """Return the pose of each estimate, rounded to um and urad."""
-    return tuple([micropose(estimate) for estimate in estimates])
-
-
 def status_of(outputs: Outputs) -> Status:
     """Return the mode, reason, link and source of a step."""
     return outputs.mode, outputs.reason, outputs.link, outputs.source

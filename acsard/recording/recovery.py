@@ -12,15 +12,13 @@ from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import Attachment, DataEnd, Footer, McapRecord, Metadata
+from mcap.records import Attachment, DataEnd, Footer, Metadata
 
 from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
-from acsard.recording.chunks import LAST_BLOCK, chunk_places
 from acsard.recording.end_record import END, EndRecord, as_metadata
 from acsard.recording.file import EndRecordBuilder, Index, Recording, event_of, rewrite
-from acsard.recording.mcap_records import MAGIC, walk
+from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encoded, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
@@ -151,7 +149,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
             return heads, place.end + len(MAGIC)
         # A record after a chunk belongs to an earlier end, which the new end overwrites.
         if place.record is not None and chunk is None:
-            length = len(_encoded(place.record))
+            length = len(encoded(place.record))
             index.record(place.record, place.end - length, length)
         if place.chunk and place.messages:
             chunk = place.chunk
@@ -186,15 +184,8 @@ def _end(last: EndRecord, index: Index, at: int) -> bytes:
     nearly full. It has the statistics, because some readers take a file without them for empty.
     """
     record = Metadata(END, as_metadata(last))
-    data = _encoded(record)
+    data = encoded(record)
     index.record(record, at, len(data))
-    data += _encoded(DataEnd(0))
+    data += encoded(DataEnd(0))
     summary_at = at + len(data)
-    return data + _encoded(*index.records(), Footer(summary_at, 0, 0)) + MAGIC
-
-
-def _encoded(*records: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    return bytes(builder.end())
+    return data + encoded(*index.records(), Footer(summary_at, 0, 0)) + MAGIC

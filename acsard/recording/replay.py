@@ -23,12 +23,12 @@ from acsard.core.values import Event, Instant, Outputs
 from acsard.recording.recorded_steps import (
     MICRO,
     Micropose,
-    Status,
+    RecordedOutputs,
     Step,
     checksum,
     count_superseded,
     input_names,
-    microposes,
+    micropose,
     status_of,
 )
 
@@ -59,17 +59,6 @@ WORDING: frozenset[Output] = frozenset({"reason", "event text"})
 """Outputs that are text for people, so that another version may word them differently."""
 
 
-class Seen(Struct, frozen=True):
-    """The recorded or the replayed outputs of a step."""
-
-    line: bytes | None
-    status: Status
-    poses: tuple[Micropose, ...]
-    events: tuple[Event, ...] = ()
-    trip: str = ""
-    """Why the guard replaced the line; "" if it did not."""
-
-
 class Difference(Struct, frozen=True):
     """A step whose replayed outputs differ from the recorded ones."""
 
@@ -77,8 +66,10 @@ class Difference(Struct, frozen=True):
     at: Instant
     what: tuple[Output, ...]
     """The outputs that differ."""
-    recorded: Seen
-    replayed: Seen
+    recorded: RecordedOutputs
+    replayed: RecordedOutputs
+    trip: str
+    """Why the guard replaced the replayed line; "" if it did not."""
 
 
 class Comparison(Struct):
@@ -179,10 +170,10 @@ class Replay:
         if step.recorded.sent is not None:
             # The board obeyed the recorded line, even if the replay decides another one.
             self._guard.left(step.recorded.sent)
-        replayed = Seen(
-            outputs.line, status_of(outputs), microposes(outputs.estimates), outputs.events, trip
-        )
-        difference = self._compare(step, replayed, line)
+        poses = tuple([micropose(estimate) for estimate in outputs.estimates])
+        sent = line if step.recorded.sent is not None else None
+        replayed = RecordedOutputs(outputs.line, sent, status_of(outputs), poses, outputs.events)
+        difference = self._compare(step, replayed, trip)
         self._count(step, outputs, replayed)
         if difference is not None:
             self._keep(difference)
@@ -200,8 +191,7 @@ class Replay:
         if difference.replayed.status[0] == FAULT != difference.recorded.status[0]:
             comparison.fault = comparison.fault or difference
 
-    def _compare(self, step: Step, replayed: Seen, guarded: bytes | None) -> Difference | None:
-        """Compare a step's outputs; `guarded` is the line that the guard let pass in the replay."""
+    def _compare(self, step: Step, replayed: RecordedOutputs, trip: str) -> Difference | None:
         recorded = step.recorded
         exact = recorded.checksum is None or recorded.checksum == self._checksum
         self.comparison.exact = self.comparison.exact and exact
@@ -209,7 +199,7 @@ class Replay:
         recorded_mode, recorded_reason, recorded_link, recorded_source = recorded.status
         pairs: tuple[tuple[Output, object, object], ...] = (
             ("line", replayed.line, recorded.line),
-            ("sent line", guarded if recorded.sent is not None else None, recorded.sent),
+            ("sent line", replayed.sent, recorded.sent),
             ("mode", mode, recorded_mode),
             ("link", link, recorded_link),
             ("source", source, recorded_source),
@@ -223,10 +213,9 @@ class Replay:
             what += ("input names",)
         if not what:
             return None
-        seen = Seen(recorded.line, recorded.status, recorded.poses, recorded.events)
-        return Difference(step.number, step.inputs.now, what, seen, replayed)
+        return Difference(step.number, step.inputs.now, what, recorded, replayed, trip)
 
-    def _count(self, step: Step, outputs: Outputs, replayed: Seen) -> None:
+    def _count(self, step: Step, outputs: Outputs, replayed: RecordedOutputs) -> None:
         comparison, recorded = self.comparison, step.recorded
         comparison.steps += 1
         if recorded.line is not None or replayed.line is not None:

@@ -11,8 +11,8 @@ from acsard.core.config.validation import show
 from acsard.core.formatting import listed, many, printable
 from acsard.core.values import NS_PER_S, Event
 from acsard.recording.file_replay import Gap
-from acsard.recording.recorded_steps import MICRO
-from acsard.recording.replay import Comparison, Difference, Seen, fastest
+from acsard.recording.recorded_steps import MICRO, RecordedOutputs
+from acsard.recording.replay import Comparison, Difference, fastest
 
 HUNDREDTHS = 100.0
 """Divisor of the wheel speeds of a line, which are in hundredths of rad/s."""
@@ -95,20 +95,20 @@ def describe_difference(difference: Difference, began_ns: int) -> list[str]:
         f"beginning: {what}",
         *_side("recorded", difference.recorded),
         *_side("replayed", difference.replayed),
+        *([f"            the guard: {difference.trip}"] if difference.trip else []),
     ]
 
 
-def _side(name: str, seen: Seen) -> list[str]:
+def _side(name: str, seen: RecordedOutputs) -> list[str]:
     mode, reason, link, source = map(printable, seen.status)
     line = "no line" if seen.line is None else printable(seen.line.decode(errors="replace").strip())
     poses = [[f"{value / MICRO:.6f}" for value in pose] for pose in seen.poses]
-    rows = [
+    return [
         f"  {name:8}  {line}",
         f"            mode {mode} ({reason}), link {link}, source {source or 'none'}",
         *[f"            pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
+        *[f"            event {_event(event)}" for event in seen.events],
     ]
-    rows += [f"            event {_event(event)}" for event in seen.events]
-    return [*rows, f"            the guard: {seen.trip}"] if seen.trip else rows
 
 
 def _event(event: Event) -> str:

@@ -20,9 +20,9 @@ from acsard.core.config.settings import Config
 from acsard.core.config.writing import document
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
-from acsard.recording.chunks import MAX_DATA_BYTES
 from acsard.recording.directory import Ring, Run, mark_cut
 from acsard.recording.file import About, Writing
+from acsard.recording.mcap_records import MAX_DATA_BYTES
 from acsard.recording.recorded_steps import Start, Taken, runs
 from acsard.recording.recovery import FULL
 from acsard.recording.retention import IncidentWindow

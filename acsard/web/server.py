@@ -19,7 +19,7 @@ from msgspec import Struct
 from acsard.client import Client
 from acsard.core.config.settings import Config
 from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.certificate_files import CertificateFiles
+from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import BEAT_S, Parent, end_with_parent

@@ -24,10 +24,8 @@ from acsard.bench.rig import Rig, processor_ns
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.messages import encodings
 from acsard.core.messages.schema import Message
-from acsard.core.messages.topics import full_key, offered, published
-from acsard.core.ros.transports import left_out
+from acsard.core.messages.topics import full_key
 from acsard.daemon.bus import outlets
-from acsard.daemon.bus.access import access_control
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.outlets import direct
 from acsard.daemon.bus.zenoh_sessions import client_session
@@ -188,19 +186,7 @@ def encoded(
     monkeypatch.setattr(outlets, "encode", counting)
 
     async def publish() -> None:
-        sources = tuple(source.name for source in one.commands.sources)
-        bus = ZenohBus(
-            one.bus,
-            one.ros,
-            left_out(one),
-            one.robot.id,
-            sources,
-            access_control(one),
-            Nobody(),
-            offered(one),
-            published(one),
-        )
-        async with bus:
+        async with ZenohBus(one, Nobody()) as bus:
             with listening(one, keys, 1 if keys else 0):
                 made.clear()  # messages kept for late subscribers
                 while len(made) < len(keys):  # Zenoh reports each subscriber in its own time

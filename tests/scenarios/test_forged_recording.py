@@ -29,6 +29,8 @@ FORGERIES = 10
 
 Messages = list[tuple[Topic, int, bytes]]
 
+Forge = Callable[[Messages, random.Random], None]
+
 BATCH = msgspec.msgpack.Decoder(Batch)
 
 
@@ -140,42 +142,24 @@ def added_event(messages: Messages, dice: random.Random) -> None:
     forge_row(messages, dice, lambda rare: replace(rare, events_out=(*rare.events_out, added)))
 
 
-def caller(messages: Messages, dice: random.Random) -> None:
-    """Forge the client of a service call, which is an input of its step."""
+def input_name(field: str, part: str) -> Forge:
+    """Return how to forge a name in the first of these inputs of a step.
 
-    def forge(rare: Rare) -> Rare | None:
-        if not rare.requests:
-            return None
-        first, *others = rare.requests
-        return replace(rare, requests=(replace(first, by=forged_word(first.by, dice)), *others))
+    A forged sender or refused source need not change any output.
+    """
 
-    forge_row(messages, dice, forge)
+    def forge(messages: Messages, dice: random.Random) -> None:
+        def forged(rare: Rare) -> Rare | None:
+            if not (inputs := getattr(rare, field)):
+                return None
+            first, *others = inputs
+            words: dict[str, Any] = {part: forged_word(getattr(first, part), dice)}
+            changed: dict[str, Any] = {field: (replace(first, **words), *others)}
+            return replace(rare, **changed)
 
+        forge_row(messages, dice, forged)
 
-def sender(messages: Messages, dice: random.Random) -> None:
-    """Forge the sender of one command, which need not change any output."""
-
-    def forge(rare: Rare) -> Rare | None:
-        if not rare.commands:
-            return None
-        first, *others = rare.commands
-        forged = replace(first, sender=forged_word(first.sender, dice))
-        return replace(rare, commands=(forged, *others))
-
-    forge_row(messages, dice, forge)
-
-
-def refused_source(messages: Messages, dice: random.Random) -> None:
-    """Forge the source of a refused command, which changes no output."""
-
-    def forge(rare: Rare) -> Rare | None:
-        if not rare.refusals:
-            return None
-        first, *others = rare.refusals
-        forged = replace(first, source=forged_word(first.source, dice))
-        return replace(rare, refusals=(forged, *others))
-
-    forge_row(messages, dice, forge)
+    return forge
 
 
 def copy(messages: Messages, dice: random.Random) -> None:
@@ -208,9 +192,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def forged_files(
-    original: Path, path: Path, forge: Callable[[Messages, random.Random], None]
-) -> Iterator[Path]:
+def forged_files(original: Path, path: Path, forge: Forge) -> Iterator[Path]:
     recording = Recording(original)
     for seed in range(FORGERIES):
         messages = list(recording.messages())
@@ -229,14 +211,15 @@ def forged_files(
 @each(
     "forge",
     [
-        reason, source, event_client, event_text, event_name, removed_event, added_event, caller,
-        sender, refused_source, copy, removed_copy,
+        reason, source, event_client, event_text, event_name, removed_event, added_event,
+        input_name("requests", "by"), input_name("commands", "sender"),
+        input_name("refusals", "source"), copy, removed_copy,
     ],
 )  # fmt: skip
 def test_a_replay_finds_every_forged_reason_name_and_event(
     original: Path,
     tmp_path: Path,
-    forge: Callable[[Messages, random.Random], None],
+    forge: Forge,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     codes = Counter[int]()

@@ -9,9 +9,8 @@ from msgspec.structs import replace
 from acsard.core.config.named_faults import FAULTS
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
-from acsard.recording.merge import adopt
 from acsard.recording.replay import Replay
-from acsard.recording.state import thaw
+from acsard.recording.state import adopt, thaw
 from tests.scenarios.taped import (
     WITH_ARGUMENTS,
     Tape,

@@ -24,8 +24,7 @@ from typing import Any
 import pytest
 
 from acsard.client import connect
-from acsard.daemon.bus.robot_discovery import presence
-from acsard.daemon.bus.silent_key import Presence
+from acsard.daemon.bus.robot_discovery import Presence, presence
 from tests.each import each
 from tests.system.bystander import lost
 from tests.system.harness import (

@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import time
 from functools import partial
-from types import TracebackType
 
 import zenoh
 from msgspec.structs import replace
 
-from acsard.core.config.settings import BusConfig, RosConfig
+from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import BusInput, Waker
 from acsard.core.incoming.imu import OWN
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.encodings import encoding_name
 from acsard.core.messages.schema import Message
 from acsard.core.messages.signature import Signature
-from acsard.core.messages.topics import IMU, Topic, full_key, json_key
+from acsard.core.messages.topics import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.ros.names import gid
-from acsard.core.ros.transports import Endpoint, claims, command_keys, endpoints, node_tokens
+from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets, direct
@@ -42,39 +41,18 @@ TWIN_TIMEOUT_S = 0.5
 class ZenohBus:
     """The robot's keys on the bus. The keys exist while this asynchronous context is entered."""
 
-    def __init__(
-        self,
-        bus: BusConfig,
-        ros: RosConfig,
-        silent: frozenset[str],
-        robot_id: str,
-        sources: tuple[str, ...],
-        access: dict[str, object],
-        waker: Waker,
-        topics: tuple[Topic, ...],
-        published: tuple[Topic, ...],
-    ) -> None:
-        """Store the settings. The session opens when the context is entered.
+    def __init__(self, config: Config, waker: Waker) -> None:
+        """Prepare the buffers. The session opens when the context is entered.
 
-        Args:
-            bus: the table `[bus]`.
-            ros: the table `[ros]`.
-            silent: native keys that get no ROS endpoint.
-            robot_id: `robot.id`.
-            sources: names of the configured command sources.
-            access: the value of Zenoh's `access_control`.
-            waker: wakes the control loop when a command or a stop arrives.
-            topics: rows of the topic table that this robot offers.
-            published: rows of the topic table that the daemon publishes.
+        `waker` wakes the control loop when a command or a stop arrives.
         """
-        self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
-        self._access, self._silent = access, silent
-        self._topics, self._published = topics, published
-        self._alive = full_key(robot_id, "alive")
-        prefix = full_key(robot_id, "")
+        self._config, self._id = config, config.robot.id
+        self._alive = full_key(self._id, "alive")
+        prefix = full_key(self._id, "")
         self._replies = Replies(prefix)
+        sources = tuple(source.name for source in config.commands.sources)
         self._inbox = Inbox(prefix, self._replies, sources, waker)
-        self._outlets, self._links = Outlets(), RouterLinks(bus, self._inbox)
+        self._outlets, self._links = Outlets(), RouterLinks(config.bus, self._inbox)
         self._session: zenoh.Session
         self._kept: list[object] = []
         """Declared entities. Zenoh undeclares an entity when nothing refers to it."""
@@ -117,15 +95,15 @@ class ZenohBus:
 
     async def __aenter__(self) -> ZenohBus:
         # In client mode the daemon can do nothing without its router, so it waits for the router.
-        patience_s = OPEN_TIMEOUT_S if self._settings.mode == "peer" else None
+        patience_s = OPEN_TIMEOUT_S if self._config.bus.mode == "peer" else None
         self._session = await in_thread(self._open, patience_s)
         return self
 
     def _open(self) -> zenoh.Session:
-        settings, limited = self._settings, command_keys(self._ros)
-        session = daemon_session(settings, self._id, self._sources, limited, self._access)
-        if settings.connect:
-            conflict = self._conflict(_others(session, self._alive, claims(self._ros)))
+        config, ros = self._config, self._config.ros
+        session = daemon_session(config)
+        if config.bus.connect:
+            conflict = self._conflict(_others(session, self._alive, claims(ros)))
             if conflict:
                 session.close()
                 raise InUseError(conflict)
@@ -134,9 +112,9 @@ class ZenohBus:
         self._replies.start(session)
         self._declare_native(session)
         zid = str(session.zid())
-        for endpoint in endpoints(self._ros, zid, self._silent):
+        for endpoint in endpoints(ros, zid, left_out(config)):
             self._declare_ros(session, endpoint)
-        for token in (self._alive, *claims(self._ros), *node_tokens(self._ros, zid)):
+        for token in (self._alive, *claims(ros), *node_tokens(ros, zid)):
             self._kept.append(session.liveliness().declare_token(token))
         self._outlets.start()
         self._links.start(session)
@@ -158,7 +136,8 @@ class ZenohBus:
         if transports:
             off = " and ".join(f"ros.{name} = false" for name in transports)
             return (
-                f'another robot on this bus already has ros.namespace = "{self._ros.namespace}": '
+                "another robot on this bus already has ros.namespace = "
+                f'"{self._config.ros.namespace}": '
                 f"one cmd_vel of ROS over {' or '.join(transports)} would drive both; give this "
                 "robot its own namespace, with [ros] namespace or `acsard run --namespace NAME`, "
                 f"or set {off}"
@@ -167,14 +146,14 @@ class ZenohBus:
 
     def _declare_native(self, session: zenoh.Session) -> None:
         inbox = self._inbox
-        for topic in self._topics:
+        for topic in offered(self._config):
             key = full_key(self._id, topic.pattern)
             if topic.direction == "in":
                 self._kept.append(session.declare_subscriber(key, direct(inbox.on_sample)))
             elif topic.key not in ("alive", json_key("<key>")):
                 on_query = direct(partial(inbox.on_query, topic.key))
                 self._kept.append(session.declare_queryable(key, on_query))
-        for topic in self._published:
+        for topic in published(self._config):
             key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
             signed = Signature(OWN).pack() if topic.key == IMU else b""
             self._outlets.declare(
@@ -215,12 +194,7 @@ class ZenohBus:
 
     # Closing the session.
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._replies.stop()
         try:
             await in_thread(self._close, CLOSE_TIMEOUT_S)

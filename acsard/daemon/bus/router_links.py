@@ -10,6 +10,7 @@ import zenoh
 from acsard.core.config.settings import BusConfig
 from acsard.core.values import RoutersStatus
 from acsard.daemon.bus.inbox import Inbox
+from acsard.host.mailbox import Mailbox
 
 POLL_S = 0.5
 """Time between two polls, s. One poll takes Zenoh 0.1 ms."""
@@ -29,20 +30,14 @@ class RouterLinks:
         """Prepare the thread, which writes the ids of connected routers to `inbox.routers`."""
         self._bus, self._inbox = bus, inbox
         self._status: RoutersStatus | None = None
-        self._changed = False
-        """True if the status has changed. It is set after the status, so that the control loop
-        misses no change.
-        """
+        self._changes = Mailbox[RoutersStatus](1, lambda: None)
         self._over = Event()
         self._thread = Thread(target=self._run, name="links", daemon=True)
         self._session: zenoh.Session
 
     def changed(self) -> RoutersStatus | None:
         """Return the status if it has changed since the last call, else None. Never wait."""
-        if not self._changed:
-            return None
-        self._changed = False
-        return self._status
+        return self._changes.pop()
 
     def start(self, session: zenoh.Session) -> None:
         """Start polling.
@@ -64,7 +59,8 @@ class RouterLinks:
         while True:
             status = self._poll()
             if reports and status != self._status:
-                self._status, self._changed = status, True
+                self._status = status
+                self._changes.put(status)
             reports = bool(self._bus.connect)
             if self._over.wait(POLL_S):
                 return

@@ -121,14 +121,11 @@ def _decoded(directory: str) -> dict[str, Any]:
     server_context.verify_mode = ssl.CERT_REQUIRED
     # The name of an expired certificate is needed to say how to replace it.
     server_context.verify_flags |= NO_CHECK_TIME
-    client_context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    client_context.check_hostname, client_context.verify_mode = False, ssl.CERT_NONE
     to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
     try:
         server_context.load_verify_locations(f"{directory}/{CA}")
-        for context in (server_context, client_context):
-            context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
-        client = client_context.wrap_bio(to_client, to_server)
+        _load(server_context, directory)
+        client = _trusting(directory).wrap_bio(to_client, to_server)
         server = server_context.wrap_bio(to_server, to_client, server_side=True)
         for end in (client, server, client, server):
             with suppress(ssl.SSLWantReadError):
@@ -179,17 +176,26 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     except ImportError:
         return None
     host, port = _place(endpoint)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
-        context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
         with (
             socket.create_connection((host, int(port)), PATIENCE_S) as plain,
-            context.wrap_socket(plain) as link,
+            _trusting(directory).wrap_socket(plain) as link,
         ):
             return _ends_ns(x509.load_der_x509_certificate(link.getpeercert(True) or b""))
     except (OSError, ValueError, x509.InvalidVersion):
         return None
+
+
+def _trusting(directory: str) -> ssl.SSLContext:
+    """Return the context of a client with the certificate in `directory` that verifies nothing."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    _load(context, directory)
+    return context
+
+
+def _load(context: ssl.SSLContext, directory: str) -> None:
+    context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
 
 
 def _ends_ns(certificate: Any) -> int:
@@ -263,7 +269,7 @@ def trouble(endpoint: str, directory: str) -> str:
 def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.load_verify_locations(f"{directory}/{CA}")
-    context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
+    _load(context, directory)
     try:
         with context.wrap_socket(plain, server_hostname=host) as link:
             link.settimeout(REFUSAL_S)

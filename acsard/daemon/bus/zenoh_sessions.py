@@ -14,8 +14,10 @@ from pathlib import Path
 
 import zenoh
 
-from acsard.core.config.settings import TLS, BusConfig
+from acsard.core.config.settings import TLS, Config
 from acsard.core.messages.topics import full_key, source_keys
+from acsard.core.ros.transports import command_keys
+from acsard.daemon.bus.access import access_control, gateway_access
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, require_usable, trouble
 from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
 from acsard.host.terminal_modes import coloured
@@ -35,28 +37,16 @@ MESSAGE_BYTES = 65536
 """Largest message that a link accepts, bytes. The limit for commands is far lower."""
 
 
-def daemon_session(
-    bus: BusConfig,
-    robot_id: str,
-    sources: tuple[str, ...],
-    limited: tuple[str, ...],
-    access: dict[str, object],
-) -> zenoh.Session:
+def daemon_session(config: Config) -> zenoh.Session:
     """Open the daemon's session: a peer or client without multicast discovery.
 
     A client over TLS connects to the TLS gateway, not to this session. In client mode this call
     blocks until the router answers, so call it in a thread.
 
-    Args:
-        bus: the table `[bus]`.
-        robot_id: `robot.id`.
-        sources: names of the configured command sources.
-        limited: ROS keys on which commands arrive.
-        access: the value of Zenoh's `access_control`.
-
     Raises:
         InUseError: the session cannot listen, for example because another program uses the address.
     """
+    bus = config.bus
     settings = _base(bus.mode) | {
         "listen/endpoints": list(bus.plain),
         "connect/endpoints": list(bus.connect),
@@ -66,7 +56,7 @@ def daemon_session(
         "timestamping/enabled": True,
         "queries_default_timeout": 3000,
     }
-    settings |= _listening() | _limits(robot_id, sources, limited, access)
+    settings |= _listening() | _limits(config, access_control(config))
     if any(endpoint.startswith(TLS) for endpoint in bus.connect):
         settings |= _tls(bus.tls)
     if bus.connect:
@@ -74,22 +64,18 @@ def daemon_session(
     return _opened(settings, bus.plain)
 
 
-def gateway_session(
-    bus: BusConfig,
-    robot_id: str,
-    sources: tuple[str, ...],
-    limited: tuple[str, ...],
-    access: dict[str, object],
-) -> zenoh.Session:
+def gateway_session(config: Config) -> zenoh.Session:
     """Open the TLS gateway's session: a router between TLS clients and the daemon on this machine.
 
-    The arguments and the exception are those of `daemon_session`.
+    Raises:
+        InUseError: the session cannot listen.
     """
+    bus = config.bus
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
     # The limit counts puts only. Otherwise a flood of DELETE messages, which are not stops, would
     # use up the limit of the stops. The daemon's own session does not limit stops.
-    stops = _rate_limit("stops", ["put"], [full_key(robot_id, "stop")])
-    settings |= _limits(robot_id, sources, limited, access, stops)
+    stops = _rate_limit("stops", ["put"], [full_key(config.robot.id, "stop")])
+    settings |= _limits(config, gateway_access(config), stops)
     settings |= {
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
@@ -157,18 +143,13 @@ def _listening() -> dict[str, object]:
 
 
 def _limits(
-    robot_id: str,
-    sources: tuple[str, ...],
-    limited: tuple[str, ...],
-    access: dict[str, object],
-    *more: dict[str, object],
+    config: Config, access: dict[str, object], *more: dict[str, object]
 ) -> dict[str, object]:
     """Return the access rules and the rate limits as Zenoh settings.
 
     The rate limits are those of the commands, and `more`.
     """
-    limits = [_command_limits(robot_id, sources, limited), *more]
-    return {"access_control": access, "downsampling": limits}
+    return {"access_control": access, "downsampling": [_command_limits(config), *more]}
 
 
 def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Session:
@@ -264,19 +245,17 @@ def _tls(directory: str) -> dict[str, object]:
     }
 
 
-def _command_limits(
-    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
-) -> dict[str, object]:
-    """Return the rate limits of the command keys, of the gyro's key and of the keys `limited`.
+def _command_limits(config: Config) -> dict[str, object]:
+    """Return the rate limits of the command keys, native and of ROS, and of the gyro's key.
 
     Each configured source has a limit of its own, so that no source uses up another's limit. All
     other sources share one limit. All certificates of a source share the limit of the source. Zenoh
     applies the limits to each connection separately.
     """
-    names = [*sources, "*"]
+    names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), "imu"]
-    keys = [full_key(robot_id, key) for key in below]
-    return _rate_limit("commands", ["put", "delete"], [*keys, *limited])
+    keys = [full_key(config.robot.id, key) for key in below]
+    return _rate_limit("commands", ["put", "delete"], [*keys, *command_keys(config.ros)])
 
 
 def _rate_limit(name: str, messages: list[str], keys: list[str]) -> dict[str, object]:

@@ -20,9 +20,9 @@ from pathlib import Path
 import zenoh
 
 from acsard.core.values import ROLES, Role
-from acsard.daemon.bus.certificate_files import CertificateFiles
+from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.zenoh_sessions import first_line
-from acsard.daemon.gateway.session_health import Events, Observation, SessionHealth
+from acsard.daemon.gateway.listener_process import Events, Listener, Observation
 from acsard.host import clock
 from acsard.host.errors import InUseError, RouterFileError, UsageError
 
@@ -123,7 +123,7 @@ def reason(error: zenoh.ZError) -> str:
     return first_line(error)
 
 
-class Router:
+class Router(Listener):
     """The router that zenohd would run with a configuration file, but without plugins."""
 
     events = ROUTER_EVENTS
@@ -155,12 +155,8 @@ class Router:
                 'listen: { endpoints: ["tls/..."] }'
             )
         self._endpoints: list[str] = endpoints
-        self._files = self._certificate_files()
+        self.files = self._certificate_files()
         self.where = ", ".join(endpoints)
-
-    def ready(self) -> bool:
-        """Return True: a router does not wait for a daemon."""
-        return True
 
     def open(self) -> zenoh.Session:
         """Open the router's session and listen.
@@ -204,18 +200,7 @@ class Router:
         named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]
         return CertificateFiles(*named) if len(named) == len(CERTIFICATE_FILES) else None
 
-    def renewed(self) -> bool:
-        """Return whether new certificates are in the files that the configuration names."""
-        return self._files is not None and self._files.renewed()
-
-    def refused(self) -> str:
-        """Return why the new certificates cannot be used, or "" if they can."""
-        return "" if self._files is None else self._files.refused()
-
     def observe(self, session: zenoh.Session) -> Observation:
         """Return the connections of the router."""
         holders = tuple(link.auth_identifier or "" for link in session.info.links())
         return Observation(clock.mono_ns(), holders, linked=True)
-
-    def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Do nothing: a router has no daemon to report to, and the log has all its events."""

@@ -14,17 +14,133 @@ import resource
 import select
 import signal
 import threading
-from typing import Protocol
+from collections import Counter
+from collections.abc import Sequence
+from typing import Literal
 
 import zenoh
+from msgspec import Struct
 
-from acsard.core.values import Event
-from acsard.daemon.gateway.session_health import Events, Observation, SessionHealth
+from acsard.core.values import NS_PER_S, Event, EventName
+from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.host import clock
-from acsard.host.child import Parent, end_with_parent
+from acsard.host.child import Parent, Silence, end_with_parent
 from acsard.host.errors import Exit
 from acsard.host.logs import Log
+from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.systemd import Systemd
+
+STUCK_NS = NS_PER_S
+"""Time without a new observation after which Zenoh counts as stuck, ns.
+
+An observation takes a millisecond.
+"""
+
+FIRST_NS = 5 * NS_PER_S
+"""Longest time after the start until the daemon connects, ns. Other clients connect then too."""
+
+ALONE_NS = NS_PER_S
+"""Longest later time without a connection of the daemon, ns."""
+
+REPORTS = Rate(1 / 60)
+"""Rate of the events that all connections are taken: one a minute."""
+
+MAX_UNANSWERED = 4
+"""Number of consecutive unanswered queries that show a dead connection. Each is a second old.
+
+The connection to the daemon is then still open, but data does not reach the daemon.
+"""
+
+NAMES = 5
+"""Largest number of clients that an event names: those with the most connections."""
+
+Incident = Literal["open", "full", "stuck", "alone"]
+
+Events = dict[Incident, EventName]
+"""Name of the log event for each incident."""
+
+GATEWAY_EVENTS: Events = {
+    "open": "gateway_open",
+    "full": "gateway_full",
+    "stuck": "gateway_stuck",
+    "alone": "gateway_lost_daemon",
+}
+
+
+class Observation(Struct, frozen=True):
+    """State of the Zenoh session at a time."""
+
+    at_ns: int
+    """Monotonic time, ns."""
+    holders: tuple[str, ...] = ()
+    """Common name in the certificate of each connection from the network.
+
+    It is "" if Zenoh does not report the name.
+    """
+    linked: bool = False
+    """True if the daemon is connected. A router, which needs no daemon, always has True."""
+    unanswered: int = 0
+    """Number of consecutive queries to the daemon that have not ended."""
+
+
+class SessionHealth:
+    """Judges one observation of the session after the other."""
+
+    def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
+        """Begin at the monotonic time `opened_ns`, at which the session was opened.
+
+        `most` is the largest number of connections from the network. `events` names the log events.
+        """
+        self._most, self._events = most, events
+        self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
+        self._last_ns, self._silence = 0, Silence(STUCK_NS)
+        self._reports = Bucket(REPORTS)
+        self.full = 0
+        """Number of observations in which all connections were taken."""
+
+    def full_event(self, observed: Observation) -> Event | None:
+        """Return an event if all connections are taken and the last event is a minute old."""
+        if len(observed.holders) < self._most:
+            return None
+        self.full += 1
+        if not self._reports.take(observed.at_ns):
+            return None
+        text = (
+            f"all {self._most} connections are taken, {connection_counts(observed.holders)}: no "
+            "other client is admitted; close programs that are not needed"
+        )
+        return Event(self._events["full"], text, "warning")
+
+    def restart_event(self, observed: Observation, passed_ns: int) -> Event | None:
+        """Return an event that says why the process must restart, or None if it need not.
+
+        `observed` is the newest observation, perhaps the same as in the last call. `passed_ns` is
+        the time since the last call.
+        """
+        new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
+        stuck = self._silence.too_long(new, passed_ns)
+        if observed.linked:
+            self._linked_ns, self._patience_ns = observed.at_ns, ALONE_NS
+        if stuck:
+            text = "Zenoh hangs, because a client takes all its time; all clients are disconnected"
+            return Event(self._events["stuck"], text, "error")
+        if observed.at_ns - self._linked_ns > self._patience_ns:
+            text = "the daemon is not connected any more; all clients are disconnected"
+            return Event(self._events["alone"], text, "warning")
+        if observed.unanswered >= MAX_UNANSWERED:
+            text = (
+                f"the daemon is connected, but has left {observed.unanswered} queries unanswered; "
+                "all clients are disconnected"
+            )
+            return Event(self._events["alone"], text, "warning")
+        return None
+
+
+def connection_counts(holders: Sequence[str]) -> str:
+    """Describe how many connections each client has; `holders` has a name for each connection."""
+    most = Counter(holders).most_common(NAMES)
+    return ", ".join(f"{count} by {name or 'an unnamed client'}" for name, count in most)
+
 
 PERIOD_S = 0.25
 """Time between two observations of the session, and between two checks."""
@@ -40,7 +156,7 @@ NICE = 5
 """Niceness, so that the daemon and the programs of people run before this process."""
 
 
-class Listener(Protocol):
+class Listener:
     """A session that listens to the network: the TLS gateway, or the router of a fleet."""
 
     where: str
@@ -49,21 +165,20 @@ class Listener(Protocol):
     """Largest number of connections from the network."""
     events: Events
     """Names of the log events."""
+    files: CertificateFiles | None
+    """The certificate files of the session, or None if it has none."""
 
     def ready(self) -> bool:
         """Return whether clients may be admitted now."""
+        return True
 
     def open(self) -> zenoh.Session:
         """Open the session and listen. This call blocks."""
+        raise NotImplementedError
 
     def observe(self, session: zenoh.Session) -> Observation:
         """Return the state of the session. This call may never return."""
-
-    def renewed(self) -> bool:
-        """Return whether the session must be opened again, because it has a new certificate."""
-
-    def refused(self) -> str:
-        """Return why a session cannot be opened with the new certificate, or "" if it can."""
+        raise NotImplementedError
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
         """Publish the state for the daemon, if there is one. This call may never return."""
@@ -113,20 +228,26 @@ class ListenerProcess:
             if event is not None:
                 self._log.event(event)
                 return Exit.FAILURE
-            if self._listener.renewed() and not self._refused():
+            if self._renewed():
                 text = "opens again with its new certificate; all clients are disconnected"
                 self._log.info(self._listener.events["open"], text=text)
                 return Exit.FAILURE
             before_ns = now_ns
         return Exit.OK
 
-    def _refused(self) -> bool:
-        """Return whether the new certificate cannot be used, and log why."""
-        why = self._listener.refused()
+    def _renewed(self) -> bool:
+        """Return whether the session must be opened again, because it has a new certificate.
+
+        Zenoh cannot use it in an open session. If it cannot be used at all, the log says why.
+        """
+        files = self._listener.files
+        if files is None or not files.renewed():
+            return False
+        why = files.refused()
         if why:
             text = f"goes on with its old certificate, because it cannot use the new one: {why}"
             self._log.event(Event(self._listener.events["open"], text, "warning"))
-        return bool(why)
+        return not why
 
     def _leave(self, *_: object) -> None:
         self._leaving = True

@@ -18,13 +18,16 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import GatewayState
 from acsard.core.messages.topics import full_key
-from acsard.core.ros.transports import command_keys
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.access import gateway_access
-from acsard.daemon.bus.certificate_files import CertificateFiles
+from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.tls import ends, files_in, require_usable
 from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
-from acsard.daemon.gateway.session_health import GATEWAY_EVENTS, Observation, SessionHealth
+from acsard.daemon.gateway.listener_process import (
+    GATEWAY_EVENTS,
+    Listener,
+    Observation,
+    SessionHealth,
+)
 from acsard.host import clock
 
 CONNECT_S = 1.0
@@ -40,7 +43,7 @@ gateway has to wait for a core.
 """
 
 
-class Gateway:
+class Gateway(Listener):
     """The TLS gateway: opens once the daemon runs, and reports its connections to the daemon."""
 
     most = MAX_SESSIONS - 1
@@ -54,7 +57,7 @@ class Gateway:
         """
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
-        self._files = CertificateFiles(*files_in(config.bus.tls))
+        self.files = CertificateFiles(*files_in(config.bus.tls))
         self._opened_ns = 0
         self._publisher: Any = None
         self._ends_ns = 0
@@ -74,10 +77,7 @@ class Gateway:
 
     def open(self) -> zenoh.Session:
         """Open the session between the network and the daemon."""
-        config = self._config
-        sources = tuple(source.name for source in config.commands.sources)
-        limited, access = command_keys(config.ros), gateway_access(config)
-        session = gateway_session(config.bus, config.robot.id, sources, limited, access)
+        session = gateway_session(self._config)
         self._opened_ns = clock.mono_ns()
         return session
 
@@ -89,14 +89,6 @@ class Gateway:
         holders = tuple(link.auth_identifier or "" for link in links if link not in local)
         unanswered = self._probe.unanswered(session, clock.mono_ns()) if local else 0
         return Observation(clock.mono_ns(), holders, bool(local), unanswered)
-
-    def renewed(self) -> bool:
-        """Return whether new certificates are in `bus.tls`. Zenoh cannot use them in a session."""
-        return self._files.renewed()
-
-    def refused(self) -> str:
-        """Return why the new certificates cannot be used, or "" if they can."""
-        return self._files.refused()
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
         """Publish the number of connections. The daemon shows it in `state`."""

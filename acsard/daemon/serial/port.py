@@ -13,7 +13,6 @@ import itertools
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from types import TracebackType
 
 import serial
 import serial_asyncio
@@ -228,12 +227,7 @@ class SerialPort:
 
     # Closing.
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Send STOP as the last line, whatever ended the block. It takes at most `FAREWELL_S`."""
         deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":

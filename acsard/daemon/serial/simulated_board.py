@@ -14,8 +14,7 @@ import os
 import pty
 import termios
 import tty
-from types import TracebackType
-from typing import get_args
+from typing import Self, get_args
 
 from acsard.core.config.settings import Baud, Config
 from acsard.core.incoming.bus_interface import Bus
@@ -85,7 +84,7 @@ class SimPty:
         self.path = ""
         self._timer = TimerFd()
 
-    def __enter__(self) -> SimPty:
+    def __enter__(self) -> Self:
         self._end = PtyEnd()
         self.path = self._end.path
         self._set_speed()
@@ -95,12 +94,7 @@ class SimPty:
         self._arm()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._end.fileno())
         loop.remove_reader(self._timer.fileno())
@@ -140,24 +134,16 @@ class SimPty:
 POSE = "sim/pose"
 
 
-class Simulated:
-    """The simulator.
-
-    Entering it creates the device at `path`; `tell` sets the bus to publish on.
-    """
+class Simulated(SimPty):
+    """The simulator, which also publishes the board's true state on the bus that `tell` sets."""
 
     def __init__(self, config: Config) -> None:
-        self._pty = SimPty(WatchedMcu(config, clock.mono_ns(), self._see))
+        super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))
         self._frame, self._noise = config.odometry.base_frame, config.sim.gyro_noise
         self._gyro = config.odometry.gyro
         self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
         self._bus: Bus | None = None
         self._last: tuple[Sight, int] | None = None
-
-    @property
-    def path(self) -> str:
-        """The path of the serial device."""
-        return self._pty.path
 
     def tell(self, bus: Bus) -> None:
         """Publish on this bus from now on."""
@@ -166,18 +152,6 @@ class Simulated:
     def current(self, key: str) -> Message | None:
         """Return the present value of a key that the simulator publishes, else None."""
         return true_pose(*self._last) if key == POSE and self._last is not None else None
-
-    def __enter__(self) -> Simulated:
-        self._pty.__enter__()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._pty.__exit__(kind, error, trace)
 
     def _see(self, sight: Sight) -> None:
         now, bus = clock.now(), self._bus

@@ -10,7 +10,8 @@ import msgspec
 import pytest
 
 from acsard.cli import main
-from acsard.cli.echo import Quota, _print, _shown, json_line
+from acsard.cli.echo import Quota, _print, _shown
+from acsard.cli.replies import json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Twist, TwistStamped, Vector3
 from acsard.host.errors import Exit

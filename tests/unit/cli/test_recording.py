@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli import main
 from acsard.cli.recording import SERVICE
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import NS_PER_S, Event
@@ -26,6 +25,7 @@ from acsard.recording.recovery import recover
 from acsard.recording.timeline import is_serious
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
+from tests.system.typed import typed
 
 HARMED = 40
 """Number of damaged files; every verb processes each of them."""
@@ -53,17 +53,14 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return where
 
 
-def log(capsys: pytest.CaptureFixture[str], where: Path, *words: str) -> tuple[int, str, str]:
-    code = main(["recording", *words, "--directory", str(where)])
-    told = capsys.readouterr()
-    return code, told.out, told.err
+def log(where: Path, *words: str) -> tuple[int, str, str]:
+    told = typed("recording", *words, "--directory", str(where))
+    return told.code, told.out, told.err
 
 
-def test_the_list_has_a_line_for_each_recording_with_its_events(
-    where: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_list_has_a_line_for_each_recording_with_its_events(where: Path) -> None:
     set_age(where, 60.0)
-    code, out, _ = log(capsys, where)
+    code, out, _ = log(where)
     first, second = out.splitlines()
     assert code == 0
     assert "000001-20270115T080000Z.mcap" in first
@@ -72,7 +69,7 @@ def test_the_list_has_a_line_for_each_recording_with_its_events(
         "    start, 1 change of commander  [no end: cut off, or still being recorded]"
     )
     set_age(where, 2.0)
-    assert log(capsys, where)[1].endswith("start, 1 change of commander  [being recorded]\n")
+    assert log(where)[1].endswith("start, 1 change of commander  [being recorded]")
 
 
 def set_age(where: Path, seconds: float) -> None:
@@ -82,13 +79,11 @@ def set_age(where: Path, seconds: float) -> None:
 
 
 @pytest.mark.parametrize("cut", ["crash", "bug", "disk"])
-def test_the_list_marks_a_crash(
-    cut: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_list_marks_a_crash(cut: str, tmp_path: Path) -> None:
     """A full disk leaves the robot with its daemon."""
     writing = Writing(tmp_path / "000001-20270115T080000Z.mcap", About("acsar", "1", "3", 1, 2))
     writing.finish(cut, "why")
-    (row,) = log(capsys, tmp_path)[1].splitlines()
+    (row,) = log(tmp_path)[1].splitlines()
     assert ("  ! [cut" in row) is (cut != "disk")
 
 
@@ -98,9 +93,7 @@ def test_a_client_with_the_name_of_a_fault_marks_no_recording() -> None:
     assert not is_serious("start, 1 wheel fault (stopped by x, 1 fault)")
 
 
-def test_the_list_takes_only_the_recordings_of_a_time(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_list_takes_only_the_recordings_of_a_time(tmp_path: Path) -> None:
     """The three recordings are a day apart, and the last one is not finished."""
     for number in (1, 2, 3):
         noon_ns = int(time.mktime((2027, 1, 14 + number, 12, 0, 0, 0, 0, -1))) * NS_PER_S
@@ -120,43 +113,39 @@ def test_the_list_takes_only_the_recordings_of_a_time(
         ("--from 2027-01-18", ""),
         ("--from 2027-01-15 --to 2027-01-15", "1"),
     ):
-        code, out, _ = log(capsys, tmp_path, *words.split())
+        code, out, _ = log(tmp_path, *words.split())
         assert code == 0
         assert [row[5] for row in out.splitlines() if row.startswith("00000")] == [*numbers]
         assert numbers or "no recordings from 2027-01-18 00:00:00 in" in out
 
 
-def test_the_list_takes_no_seconds_and_a_replay_no_time(
-    where: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, _, err = log(capsys, where, "--from", "5")
+def test_the_list_takes_no_seconds_and_a_replay_no_time(where: Path) -> None:
+    code, _, err = log(where, "--from", "5")
     assert (code, "counts from the beginning of one recording" in err) == (Exit.USAGE, True)
     for words in (["replay", "1"], ["recover", "1", "new.mcap"]):
-        code = main(["recording", "--from", "14:05", "--directory", str(where), *words])
-        assert (code, "leave out --from and --to" in capsys.readouterr().err) == (Exit.USAGE, True)
+        told = typed("recording", "--from", "14:05", "--directory", str(where), *words)
+        assert "leave out --from and --to" in told.err
+        assert told.code == Exit.USAGE
 
 
 def test_the_configuration_names_the_directory_of_the_recordings(
-    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    where: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(f'[record]\ndirectory = "{where}"\n')
     other = tmp_path / "other.toml"
     other.write_text("")
-    assert main(["recording", "--config", str(file)]) == 0
-    assert "000001-20270115T080000Z.mcap" in capsys.readouterr().out
+    assert "000001-20270115T080000Z.mcap" in typed("recording", "--config", str(file)).out
     for words in (
         ["--config", str(file), "show", "1"],
         ["show", "1", "--config", str(file)],
         ["--config", str(file), "replay", "1", "--config", str(other)],
     ):
-        assert main(["recording", *words]) == 0
-        assert capsys.readouterr().out
+        told = typed("recording", *words)
+        assert (told.code, bool(told.out)) == (0, True)
 
 
-def test_the_list_tells_a_start_from_a_file_that_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_list_tells_a_start_from_a_file_that_goes_on(tmp_path: Path) -> None:
     """The files are whole, truncated, recovered into a second file, and recovered in place."""
     tape = Tape(every=200)
     world = World(recorder=tape)
@@ -171,7 +160,7 @@ def test_the_list_tells_a_start_from_a_file_that_goes_on(
             if place > 1:
                 cut = part.rename(tmp_path / "cut")
                 assert recover(cut, part, "crash", room=place == 2) == ""
-    rows = log(capsys, tmp_path)[1].splitlines()
+    rows = log(tmp_path)[1].splitlines()
     assert len(rows) == 8
     for row in rows:
         starts = row.partition("-")[0].endswith("0")
@@ -179,39 +168,35 @@ def test_the_list_tells_a_start_from_a_file_that_goes_on(
         assert ("start" in row) is starts
 
 
-def test_where_nothing_was_ever_recorded_it_says_what_records(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, out, err = log(capsys, tmp_path / "never")
+def test_where_nothing_was_ever_recorded_it_says_what_records(tmp_path: Path) -> None:
+    code, out, err = log(tmp_path / "never")
     assert (code, out) == (1, "")
     assert "nothing is recorded in" in err
     assert "acsard run --record DIRECTORY" in err
 
 
-def test_a_timeline_is_in_order_as_sentences_or_json(
-    where: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, out, err = log(capsys, where, "show", "1")
+def test_a_timeline_is_in_order_as_sentences_or_json(where: Path) -> None:
+    code, out, err = log(where, "show", "1")
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].endswith("start: the daemon starts")
     assert any("drive: drove 0.85 m in 2.0 s (by app)" in line for line in lines)
-    _, out, _ = log(capsys, where, "show", "1", "--json")
+    _, out, _ = log(where, "show", "1", "--json")
     told = [json.loads(line) for line in out.splitlines()]
     assert len(told) == len(lines)
     assert [one["seconds"] for one in told] == sorted(one["seconds"] for one in told)
 
 
 def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
-    where: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    where: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def names(*words: str) -> set[str]:
-        _, out, _ = log(capsys, where, "show", "1", "--json", *words)
+        _, out, _ = log(where, "show", "1", "--json", *words)
         return {json.loads(line)["name"] for line in out.splitlines()}
 
     assert "start" in names("--to", "1")
     assert names("--from", "1.5", "--to", "2.5") == {"stop", "drive", "mode"}
-    _, first = log(capsys, where, "show", "1")[1].partition("  ")[0].split(" ")
+    _, first = log(where, "show", "1")[1].partition("  ")[0].split(" ")
     hours, minutes, seconds = first.split(":")
     after = f"{hours}:{minutes}:{float(seconds) + 1.5:09.6f}"
     assert names("--from", after) == names("--from", "1.5")
@@ -250,15 +235,12 @@ def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
     [(None, "00:00"), ((14, 3, 0.0, 20), "14:03"), ((6, 0, 0.0, -3), "06:00")],
 )
 def test_a_time_of_day_is_found_over_midnight_and_where_the_clock_was_set(
-    set_to: tuple[int, int, float, int] | None,
-    hour: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    set_to: tuple[int, int, float, int] | None, hour: str, tmp_path: Path
 ) -> None:
     taped(tmp_path, set_to)
 
     def names(*words: str) -> set[str]:
-        _, out, _ = log(capsys, tmp_path, "show", "1", "--json", *words)
+        _, out, _ = log(tmp_path, "show", "1", "--json", *words)
         return {json.loads(line)["name"] for line in out.splitlines()}
 
     assert names("--to", "23:59:59") >= {"start"}
@@ -273,23 +255,23 @@ def test_a_time_of_day_is_found_over_midnight_and_where_the_clock_was_set(
 
 @pytest.mark.slow
 def test_a_time_of_day_is_found_over_midnight_for_a_table_and_for_pictures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     taped(tmp_path, None)
     rows = {}
     for name, words in (("all", ()), ("new", ("--from", "00:00")), ("old", ("--to", "00:00"))):
-        assert log(capsys, tmp_path, "export", "1", f"{name}.csv", "--csv", *words)[0] == 0
+        assert log(tmp_path, "export", "1", f"{name}.csv", "--csv", *words)[0] == 0
         rows[name] = len((tmp_path / f"{name}.csv").read_text().splitlines()) - 1
     assert abs(rows["old"] + rows["new"] - rows["all"]) <= 1
     assert 1.2 < rows["new"] / rows["old"] < 1.8  # 3 s and 2 s, and one start
-    assert log(capsys, tmp_path, "report", "1", "new.html", "--from", "00:00")[0] == 0
+    assert log(tmp_path, "report", "1", "new.html", "--from", "00:00")[0] == 0
     assert re.search(r"<dt>Duration</dt><dd>(2\.9|3) s", (tmp_path / "new.html").read_text())
 
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_what_a_kill_has_cut_says_so_once_it_is_whole(
-    cut: bool, where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    cut: bool, where: Path, tmp_path: Path
 ) -> None:
     part = tmp_path / "000002-20270115T080000Z.mcap.part"
     (data,) = [path.read_bytes() for path in where.glob("000001*")]
@@ -299,27 +281,23 @@ def test_what_a_kill_has_cut_says_so_once_it_is_whole(
         (tmp_path / part.stem).write_bytes(data)
     Ring(RecordConfig(str(tmp_path))).close()
     told = "cut: the daemon or the computer ended without notice"
-    _, out, _ = log(capsys, tmp_path)
+    _, out, _ = log(tmp_path)
     assert (told in out) is cut
-    _, out, err = log(capsys, tmp_path, "show")
+    _, out, err = log(tmp_path, "show")
     assert (out.splitlines()[-1].endswith(f"  ! {told}"), told in err) == (cut, cut)
-    _, out, _ = log(capsys, tmp_path, "show", "--json")
+    _, out, _ = log(tmp_path, "show", "--json")
     last = json.loads(out.splitlines()[-1])
     assert (last["name"] == "cut", last["text"] == told.removeprefix("cut: ")) == (cut, cut)
     if cut:
         new = tmp_path / "new.html"
-        _, _, err = log(capsys, tmp_path, "report", "2", str(new))
+        _, _, err = log(tmp_path, "report", "2", str(new))
         assert (told in err, told in new.read_text()) == (True, True)
     copy = tmp_path / "copy.mcap"
-    assert (
-        log(capsys, tmp_path, "recover", str(next(tmp_path.glob("*2-*.mcap"))), str(copy))[0] == 0
-    )
-    assert (told in log(capsys, tmp_path, "show", str(copy))[1]) is cut
+    assert log(tmp_path, "recover", str(next(tmp_path.glob("*2-*.mcap"))), str(copy))[0] == 0
+    assert (told in log(tmp_path, "show", str(copy))[1]) is cut
 
 
-def test_what_a_stranger_recorded_moves_no_cursor(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_stranger_recorded_moves_no_cursor(tmp_path: Path) -> None:
     tape = Tape()
     World(recorder=tape).run(0.3)
     inputs, outputs, left = tape.taken[5]
@@ -327,7 +305,7 @@ def test_what_a_stranger_recorded_moves_no_cursor(
     tape.taken[5] = Taken(inputs, replace(outputs, events=(event,)), left)
     tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
     for words in ((), ("show", "1"), ("show", "1", "--json")):
-        code, out, _ = log(capsys, tmp_path, *words)
+        code, out, _ = log(tmp_path, *words)
         assert (code, "stop" in out) == (0, True)
         assert all(line.isprintable() for line in out.splitlines())
 
@@ -341,18 +319,14 @@ def test_what_a_stranger_recorded_moves_no_cursor(
     ],
 )
 def test_a_text_that_is_not_a_time_is_refused_with_examples(
-    where: Path, when: str, words: str, capsys: pytest.CaptureFixture[str]
+    where: Path, when: str, words: str
 ) -> None:
-    with pytest.raises(SystemExit) as end:
-        log(capsys, where, "show", "1", f"--from={when}")
-    assert end.value.code == Exit.USAGE
-    assert words in capsys.readouterr().err
+    code, _, err = log(where, "show", "1", f"--from={when}")
+    assert (code, words in err) == (Exit.USAGE, True)
 
 
-def test_a_replay_says_that_all_is_the_same(
-    where: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, out, err = log(capsys, where, "replay", "1")
+def test_a_replay_says_that_all_is_the_same(where: Path) -> None:
+    code, out, err = log(where, "replay", "1")
     assert (code, err) == (0, "")
     same, _, rest = out.partition(" lines are the same, ")
     now, _, then = same.partition(" of ")
@@ -360,10 +334,8 @@ def test_a_replay_says_that_all_is_the_same(
     assert " poses, " in rest
 
 
-def test_a_replay_says_what_it_has_compared(
-    where: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _, out, _ = log(capsys, where, "replay", "1")
+def test_a_replay_says_what_it_has_compared(where: Path) -> None:
+    _, out, _ = log(where, "replay", "1")
     _, told = out.splitlines()
     for word in (
         "Each line to the board",
@@ -375,18 +347,18 @@ def test_a_replay_says_what_it_has_compared(
         assert word in told
 
 
-def test_a_replay_of_what_was_cut_says_so(where: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = log(capsys, where, "replay")  # without a name it takes the newest
+def test_a_replay_of_what_was_cut_says_so(where: Path) -> None:
+    code, _, err = log(where, "replay")  # without a name it takes the newest
     assert code == 0
     assert "no end" in err
 
 
 def test_with_another_configuration_it_tells_what_would_have_been(
-    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    where: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "slow.toml"
     other.write_text("[limits]\nlinear_speed = 0.3\n")
-    code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
+    code, out, _ = log(where, "replay", "1", "--config", str(other))
     assert code == 0
     assert " s after the beginning: line, sent line\n" in out
     assert "  recorded  ap" in out
@@ -394,11 +366,11 @@ def test_with_another_configuration_it_tells_what_would_have_been(
 
 
 def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
-    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    where: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "slow.toml"
     other.write_text("[limits]\nlinear_speed = 0.1\nlinear_acceleration = 0.5\n")
-    code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
+    code, out, _ = log(where, "replay", "1", "--config", str(other))
     assert code == 0
     (keys,) = [line for line in out.splitlines() if line.startswith("changed settings: ")]
     assert "limits.linear_speed was 1.0, is 0.1" in keys
@@ -412,32 +384,28 @@ def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_
     assert "a robot with this configuration need not have had that fault" in out
 
 
-def test_settings_that_change_no_line_are_told_all_the_same(
-    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_that_change_no_line_are_told_all_the_same(where: Path, tmp_path: Path) -> None:
     same = tmp_path / "same.toml"
     same.write_text("[rates]\nstate = 5.0\n")
-    code, out, _ = log(capsys, where, "replay", "1", "--config", str(same))
+    code, out, _ = log(where, "replay", "1", "--config", str(same))
     assert (code, "differs" in out) == (0, False)
     assert "computed with that configuration from the recorded inputs" in out
     assert out.splitlines()[-1].startswith("changed settings: rates.state was 10.0, is 5.0")
 
 
-def test_what_was_cut_is_written_as_a_finished_file(
-    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_cut_is_written_as_a_finished_file(where: Path, tmp_path: Path) -> None:
     new = tmp_path / "new.mcap"
     (cut,) = where.glob("*.part")
-    code, out, _ = log(capsys, where, "recover", str(cut), str(new))
+    code, out, _ = log(where, "recover", str(cut), str(new))
     assert code == 0
     assert f"messages in {new}" in out
-    assert main(["recording", "replay", str(new)]) == 0
-    assert "cut, or still being recorded, when it was recovered" in capsys.readouterr().err
-    assert log(capsys, where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
+    code, _, err = log(where, "replay", str(new))
+    assert (code, "cut, or still being recorded, when it was recovered" in err) == (0, True)
+    assert log(where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
 
 
 def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recording(
-    where: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    where: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     new = tmp_path / "new.mcap"
     (cut,) = where.glob("*.part")
@@ -449,40 +417,40 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
         finish(writing, *how)
 
     monkeypatch.setattr(Writing, "finish", looked)
-    assert log(capsys, where, "recover", str(cut), str(new))[0] == 0
+    assert log(where, "recover", str(cut), str(new))[0] == 0
     assert seen == [False]
     (other,) = where.glob("*.mcap")
     (held := tmp_path / "held.mcap").write_bytes(other.read_bytes())
-    code, _, err = log(capsys, where, "recover", str(cut), str(held), "--force")
+    code, _, err = log(where, "recover", str(cut), str(held), "--force")
     assert (code, "it is a recording; name another file" in err) == (1, True)
     assert held.read_bytes() == other.read_bytes()
     held.unlink()
     (mine := tmp_path / "mine").write_text("mine")
-    code, _, err = log(capsys, where, "recover", str(cut), str(mine))
+    code, _, err = log(where, "recover", str(cut), str(mine))
     assert (code, "--force" in err, mine.read_text()) == (1, True, "mine")
-    assert log(capsys, where, "recover", str(cut), str(mine), "--force")[0] == 0
+    assert log(where, "recover", str(cut), str(mine), "--force")[0] == 0
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
 
 
 def test_recover_replaces_its_own_earlier_result_only_on_request_and_says_so(
-    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    where: Path, tmp_path: Path
 ) -> None:
     new = tmp_path / "new.mcap"
     (cut,) = where.glob("*.part")
     (earlier := tmp_path / "earlier.mcap.part").write_bytes(cut.read_bytes()[:-2000])
-    assert log(capsys, where, "recover", str(earlier), str(new))[0] == 0
-    code, _, err = log(capsys, where, "recover", str(cut), str(new))
+    assert log(where, "recover", str(earlier), str(new))[0] == 0
+    code, _, err = log(where, "recover", str(cut), str(new))
     assert (code, "it exists; --force overwrites it" in err) == (1, True)
-    code, out, _ = log(capsys, where, "recover", str(cut), str(new), "--force")
+    code, out, _ = log(where, "recover", str(cut), str(new), "--force")
     assert (code, f"{new}, which replaces an earlier copy of the same recording" in out) == (
         0,
         True,
     )
     longer = new.read_bytes()
-    code, _, err = log(capsys, where, "recover", str(earlier), str(new), "--force")
+    code, _, err = log(where, "recover", str(earlier), str(new), "--force")
     assert (code, "it is a recording; name another file" in err) == (1, True)
     assert new.read_bytes() == longer, "the shorter copy lacks messages of the longer one"
-    code, _, err = log(capsys, where, "recover", str(cut), str(cut), "--force")
+    code, _, err = log(where, "recover", str(cut), str(cut), "--force")
     assert (code, "it is a recording; name another file" in err) == (1, True)
 
 
@@ -502,9 +470,7 @@ def harmed(data: bytes, dice: random.Random) -> bytes:
 
 
 @pytest.mark.slow
-def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(tmp_path: Path) -> None:
     """The recordings begin at a start, begin with a saved state, or end by an internal error."""
     tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
     world = World(recorder=tape)
@@ -527,27 +493,27 @@ def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
         path.write_bytes(harmed(sound[number % len(sound)].read_bytes(), dice))
         for verb, new in NEW.items():
             words = [verb, str(path), *([str(tmp_path / f"{number}{new}")] if new else [])]
-            code, out, err = log(capsys, where, *words)
+            code, out, err = log(where, *words)
             assert code in (Exit.OK, Exit.FAILURE, Exit.INCOMPLETE), (words, out, err)
             assert (bool(out or err), bool(err) or code == Exit.OK) == (True, True), words
             assert "Traceback" not in err
             ends[code] += 1
-    code, out, _ = log(capsys, where)
+    code, out, _ = log(where)
     assert (code, len(out.splitlines())) == (Exit.OK, HARMED)
     assert min(ends[Exit.OK], ends[Exit.FAILURE]) > HARMED / 2, ends
-    code, out, err = log(capsys, where, "show", "all")
+    code, out, err = log(where, "show", "all")
     assert (code, "  stop: " in out, "Traceback" in err) == (Exit.OK, True, False)
 
 
-def test_what_is_not_there_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert log(capsys, tmp_path)[:2] == (0, f"no recordings in {tmp_path}\n")
-    code, _, err = log(capsys, tmp_path, "show")
+def test_what_is_not_there_is_reported(tmp_path: Path) -> None:
+    assert log(tmp_path)[:2] == (0, f"no recordings in {tmp_path}")
+    code, _, err = log(tmp_path, "show")
     assert (code, "no recording in" in err) == (1, True)
-    code, _, err = log(capsys, tmp_path / "none")
+    code, _, err = log(tmp_path / "none")
     assert (code, "--directory" in err) == (1, True)
     (tmp_path / "x").write_bytes(b"x")
-    assert main(["recording", "replay", str(tmp_path / "x")]) == 1
-    assert "not a recording of acsard" in capsys.readouterr().err
+    code, _, err = log(tmp_path, "replay", str(tmp_path / "x"))
+    assert (code, "not a recording of acsard" in err) == (1, True)
 
 
 def test_it_looks_where_the_service_records() -> None:

@@ -12,21 +12,20 @@ from typing import Any
 
 import pytest
 
-from acsard.cli import main
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import steps
 from acsard.recording.recorded_steps import MICRO
 from tests.scenarios.taped import chunks
+from tests.system.typed import typed
 from tests.unit.report.seen import column
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 QUIET = RECORDINGS / "quiet.mcap"
 
 
-def report(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    code = main(["recording", "report", *map(str, words)])
-    told = capsys.readouterr()
-    return code, told.out, told.err
+def report(*words: object) -> tuple[int, str, str]:
+    told = typed("recording", "report", *map(str, words))
+    return told.code, told.out, told.err
 
 
 def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:
@@ -45,13 +44,13 @@ def ends_at() -> tuple[float, float]:
 
 @pytest.mark.slow
 def test_the_numbers_of_the_file_are_those_of_the_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, out, err = report(capsys, QUIET)
+    code, out, err = report(QUIET)
     assert code == 0
     assert "computes other words for reasons or events than the recorded ones" in err
-    assert err.count("\n") == 1
+    assert len(err.splitlines()) == 1
     path = tmp_path / "quiet.html"
     assert out.startswith("quiet.html: ")
     assert path.stat().st_size < 8e6
@@ -62,51 +61,43 @@ def test_the_numbers_of_the_file_are_those_of_the_recording(
     assert "Plotly" in text
 
 
-def test_nothing_is_overwritten_without_force(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
     new = tmp_path / "here.html"
     new.write_text("mine")
-    code, _, err = report(capsys, QUIET, new)
+    code, _, err = report(QUIET, new)
     assert code == 1
     assert f"cannot write {new}: it exists; --force overwrites it" in err
     assert new.read_text() == "mine"
-    assert report(capsys, QUIET, new, "--force")[0] == 0
+    assert report(QUIET, new, "--force")[0] == 0
     assert new.stat().st_size > 1e6
 
 
-def test_a_recording_never_goes_not_even_by_force(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_never_goes_not_even_by_force(tmp_path: Path) -> None:
     new = tmp_path / "other.mcap"
     shutil.copy(QUIET, new)
-    code, _, err = report(capsys, QUIET, new, "--force")
+    code, _, err = report(QUIET, new, "--force")
     assert code == 1
     assert f"cannot write {new}: it is a recording; name another file" in err
     assert new.read_bytes() == QUIET.read_bytes()
 
 
-def test_what_was_there_goes_only_when_all_of_the_new_one_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_there_goes_only_when_all_of_the_new_one_is(tmp_path: Path) -> None:
     new = tmp_path / "here.html"
     new.write_text("mine")
-    assert report(capsys, QUIET, new, "--force", "--from", "9999")[0] == 1
+    assert report(QUIET, new, "--force", "--from", "9999")[0] == 1
     assert new.read_text() == "mine"
     before = new.stat().st_ino
-    assert report(capsys, QUIET, new, "--force")[0] == 0
+    assert report(QUIET, new, "--force")[0] == 0
     # a new file replaces the old one; the old one is not overwritten
     assert new.stat().st_ino != before
     assert [*tmp_path.iterdir()] == [new]
 
 
-def test_a_part_of_the_time_and_what_was_cut(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_of_the_time_and_what_was_cut(tmp_path: Path) -> None:
     cut, new = tmp_path / "cut.mcap", tmp_path / "cut.html"
     shutil.copy(QUIET, cut)
     cut.write_bytes(cut.read_bytes()[:-4000])
-    code, _, err = report(capsys, cut, new, "--from", "1", "--to", "2")
+    code, _, err = report(cut, new, "--from", "1", "--to", "2")
     assert code == 0
     assert "no end: cut" in err
     assert "no end: cut" in new.read_text(encoding="utf-8")
@@ -114,15 +105,13 @@ def test_a_part_of_the_time_and_what_was_cut(
     assert times[-1] - times[0] == pytest.approx(1000, abs=30)
 
 
-def test_what_is_damaged_is_left_out_and_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_damaged_is_left_out_and_said(tmp_path: Path) -> None:
     bad, new = tmp_path / "bad.mcap", tmp_path / "bad.html"
     data = bytearray((RECORDINGS / "faults.mcap").read_bytes())
     (begin, end), _ = chunks(data)
     data[(begin + end) // 2 : (begin + end) // 2 + 20] = bytes(20)
     bad.write_bytes(data)
-    code, _, err = report(capsys, bad, new)
+    code, _, err = report(bad, new)
     assert code == 0
     assert "1 damaged place is left out" in err
     assert "steps are missing" in err
@@ -131,21 +120,17 @@ def test_what_is_damaged_is_left_out_and_said(
     assert "steps are missing" in text
 
 
-def test_of_a_time_without_steps_there_is_no_report(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_a_time_without_steps_there_is_no_report(tmp_path: Path) -> None:
     new = tmp_path / "none.html"
-    code, _, err = report(capsys, QUIET, new, "--from", "9999")
+    code, _, err = report(QUIET, new, "--from", "9999")
     assert code == 1
     assert "no step in that span of time" in err
     assert not new.exists()
 
 
-def test_without_the_library_it_says_what_to_type(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_the_library_it_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    code, _, err = report(capsys, QUIET)
+    code, _, err = report(QUIET)
     assert code == 1
     assert "needs the library plotly; run: " in err
     assert "[report]" in err

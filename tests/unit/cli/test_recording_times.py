@@ -9,10 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from acsard.cli import main
 from acsard.core.config.settings import Config
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
+from tests.system.typed import typed
+
+Ring = tuple[Path, list[str], list[float]]
+"""A directory, the names of its recordings, and the time of a stop in each, s after the start."""
 
 FILES = 30
 STEPS = 200
@@ -36,7 +39,7 @@ def rotated(tape: Tape, where: Path, count: int) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def ring(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str], list[float]]:
+def ring(tmp_path_factory: pytest.TempPathFactory) -> Ring:
     """Return a directory, the names of its 30 recordings, and the time of a stop in each.
 
     The times are seconds after the start of the world.
@@ -54,60 +57,49 @@ def ring(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str], lis
     return where, rotated(tape, where, FILES), stops
 
 
-def recording(capsys: pytest.CaptureFixture[str], where: Path, *words: str) -> tuple[int, str, str]:
-    code = main(["recording", *words, "--directory", str(where)])
-    told = capsys.readouterr()
-    return code, told.out, told.err
+def recording(where: Path, *words: str) -> tuple[int, str, str]:
+    told = typed("recording", *words, "--directory", str(where))
+    return told.code, told.out, told.err
 
 
-def test_a_time_is_found_in_every_file_of_the_ring(
-    ring: tuple[Path, list[str], list[float]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_time_is_found_in_every_file_of_the_ring(ring: Ring) -> None:
     where, names, stops = ring
     for number, stop in enumerate(stops):
         times = ("--from", local(stop - 0.05), "--to", local(stop + 0.05))
-        code, out, err = recording(capsys, where, "show", "--json", *times)
+        code, out, err = recording(where, "show", "--json", *times)
         events = [json.loads(line) for line in out.splitlines()]
         assert code == 0
         assert [event["name"] for event in events].count("stop") == 1, (number, events)
         assert all(abs(e["seconds"] - START.wall_ns / 1e9 - stop) < 0.06 for e in events)
-        assert f"1 of 30 recordings in {where}: {names[number]}\n" in err
+        assert f"1 of 30 recordings in {where}: {names[number]}" in err
 
 
-def test_a_range_over_several_files_names_all_of_them(
-    ring: tuple[Path, list[str], list[float]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_range_over_several_files_names_all_of_them(ring: Ring) -> None:
     where, names, stops = ring
     times = ("--from", local(stops[3] - 0.05), "--to", local(stops[6] + 0.05))
-    code, out, err = recording(capsys, where, "show", *times)
+    code, out, err = recording(where, "show", *times)
     assert (code, out.count("  stop: ")) == (0, 4)
-    assert f"4 of 30 recordings in {where}: {', '.join(names[3:7])}\n" in err
-    assert recording(capsys, where, "show", "all")[1].count("  stop: ") == FILES
+    assert f"4 of 30 recordings in {where}: {', '.join(names[3:7])}" in err
+    assert recording(where, "show", "all")[1].count("  stop: ") == FILES
 
 
 @pytest.mark.parametrize("verb", ["show", "export", "report"])
 def test_a_time_without_a_recording_is_refused_with_the_nearest_recordings(
-    verb: str,
-    ring: tuple[Path, list[str], list[float]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    verb: str, ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     where, names, _ = ring
-    code, out, err = recording(capsys, where, verb, "--from", local(3600.0))
+    code, out, err = recording(where, verb, "--from", local(3600.0))
     assert (code, out) == (1, "")
     assert f"nothing was recorded from {local(3600.0)[:19]}; the last recording before it is" in err
     assert f"is {names[-1]}, " in err
-    code, out, err = recording(capsys, where, verb, "--to", local(-3600.0))
+    code, out, err = recording(where, verb, "--to", local(-3600.0))
     assert (code, out) == (1, "")
     assert f"the first one after it is {names[0]}, {local(0.0)[:19]} to " in err
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_time_between_two_recordings_names_both(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_time_between_two_recordings_names_both(tmp_path: Path) -> None:
     tape, later = Tape(), Tape()
     World(recorder=tape).run(1.0)
     world = World(recorder=later)
@@ -116,41 +108,37 @@ def test_a_time_between_two_recordings_names_both(
     tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
     later.write(tmp_path / "000002-20270115T090000Z.mcap", Config())
     times = ("--from", local(600.0), "--to", local(700.0))
-    code, out, err = recording(capsys, tmp_path, "show", *times)
+    code, out, err = recording(tmp_path, "show", *times)
     assert (code, out) == (1, "")
     assert "before it is 000001-20270115T080000Z.mcap, " in err
     assert "after it is 000002-20270115T090000Z.mcap, " in err
     times = ("--from", local(-60.0), "--to", local(7200.0))
-    code, out, err = recording(capsys, tmp_path, "show", *times)
+    code, out, err = recording(tmp_path, "show", *times)
     begins = [line.split("  ")[0] for line in out.splitlines() if "  start: " in line]
     assert (code, begins) == (0, [local(0.0), local(3600.0)])
     gaps = ((-60.0, 0.0), (1.0, 3600.0), (3601.0, 7200.0))
     words = "; ".join(f"from {local(begin)[:19]} to {local(end)[:19]}" for begin, end in gaps)
-    assert f"nothing was recorded {words}\n" in err
-    assert "nothing was recorded" not in recording(capsys, tmp_path, "show", "--to", local(0.9))[2]
+    assert f"nothing was recorded {words}" in err
+    assert "nothing was recorded" not in recording(tmp_path, "show", "--to", local(0.9))[2]
 
 
 def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
-    ring: tuple[Path, list[str], list[float]],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    ring: Ring, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     where, names, stops = ring
     monkeypatch.setattr("time.time", lambda: START.wall_ns / 1e9 + 600.0)
     first, last = local(stops[7] - 0.05)[11:], local(stops[7] + 0.05)[11:]
-    code, out, err = recording(capsys, where, "show", "--from", first, "--to", last)
+    code, out, err = recording(where, "show", "--from", first, "--to", last)
     assert (code, out.count("  stop: "), names[7] in err) == (0, 1, True)
     monkeypatch.setattr("time.time", lambda: START.wall_ns / 1e9 + 86400 + 600.0)
-    code, out, err = recording(capsys, where, "show", "--from", first, "--to", last)
+    code, out, err = recording(where, "show", "--from", first, "--to", last)
     assert (code, out, "nothing was recorded" in err) == (1, "", True)
     times = ("--from", f"yesterday {first}", "--to", f"yesterday {last}")
-    code, out, err = recording(capsys, where, "show", *times)
+    code, out, err = recording(where, "show", *times)
     assert (code, out.count("  stop: "), names[7] in err) == (0, 1, True)
 
 
-def test_a_drive_across_a_rotation_is_one_drive(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drive_across_a_rotation_is_one_drive(tmp_path: Path) -> None:
     """The drive begins in the first of four files and ends in the last one."""
     tape = Tape(every=STEPS)
     world = World(recorder=tape)
@@ -161,17 +149,17 @@ def test_a_drive_across_a_rotation_is_one_drive(
     tape.write(tmp_path / "whole", Config())
     (drive,) = [
         line
-        for line in recording(capsys, tmp_path, "show", str(tmp_path / "whole"))[1].splitlines()
+        for line in recording(tmp_path, "show", str(tmp_path / "whole"))[1].splitlines()
         if "  drive: " in line
     ]
     # The range begins in the third file, two files after the one in which the drive began.
-    code, out, err = recording(capsys, tmp_path, "show", "--from", local(2.2))
+    code, out, err = recording(tmp_path, "show", "--from", local(2.2))
     assert (code, [line for line in out.splitlines() if "  drive: " in line]) == (0, [drive])
-    assert f"4 of 4 recordings in {tmp_path}: {', '.join(names)}\n" in err
+    assert f"4 of 4 recordings in {tmp_path}: {', '.join(names)}" in err
 
 
 def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
 ) -> None:
     tape = Tape(every=STEPS)
     world = World(recorder=tape)
@@ -179,9 +167,7 @@ def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
     world.drive(0.5, seconds=2.0)
     world.run(1.5)
     rotated(tape, tmp_path, 4)
-    first, second, last = (
-        recording(capsys, tmp_path, "show", number)[1].splitlines() for number in "124"
-    )
+    first, second, last = (recording(tmp_path, "show", number)[1].splitlines() for number in "124")
     assert "  drive: was driving, 0." in first[-1]
     assert first[-1].endswith(" so far (by app)")
     counted = ", counted from the beginning of this recording (by app)"
@@ -190,7 +176,7 @@ def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
 
 
 def test_an_export_goes_on_across_a_rotation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (where := tmp_path / "ring").mkdir()
@@ -198,12 +184,12 @@ def test_an_export_goes_on_across_a_rotation(
     World(recorder=tape).drive(0.5, seconds=6.0)
     rotated(tape, where, 3)
     tape.write(tmp_path / "whole", Config())
-    assert main(["recording", "export", "whole", "whole.csv", "--csv"]) == 0
-    code, _, err = recording(capsys, where, "export", "all", "ring.csv", "--csv")
+    assert typed("recording", "export", "whole", "whole.csv", "--csv").code == 0
+    code, _, err = recording(where, "export", "all", "ring.csv", "--csv")
     assert (code, f"3 of 3 recordings in {where}" in err) == (0, True)
     assert (tmp_path / "ring.csv").read_text() == (tmp_path / "whole.csv").read_text()
     times = ("--from", local(1.5), "--to", local(4.5))
-    assert recording(capsys, where, "export", "--csv", *times)[0] == 0
+    assert recording(where, "export", "--csv", *times)[0] == 0
     (part,) = tmp_path.glob("0*.csv")
     rows = part.read_text().splitlines()
     assert set(rows) < set((tmp_path / "whole.csv").read_text().splitlines())
@@ -211,23 +197,21 @@ def test_an_export_goes_on_across_a_rotation(
 
 
 def test_a_report_goes_on_across_a_rotation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (where := tmp_path / "ring").mkdir()
     tape = Tape(every=STEPS)
     World(recorder=tape).drive(0.5, seconds=3.0)
     names = rotated(tape, where, 3)
-    assert recording(capsys, where, "report", "all", "ring.html")[0] == 0
+    assert recording(where, "report", "all", "ring.html")[0] == 0
     text = (tmp_path / "ring.html").read_text(encoding="utf-8")
     assert f" s, {len(tape.taken)} steps</dd>" in text
     assert f"<dt>File</dt><dd>{', '.join(names)}</dd>" in text
     assert "<td>was driving, 1." in text
 
 
-def test_a_time_before_a_clock_that_was_set_back_is_found(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_time_before_a_clock_that_was_set_back_is_found(tmp_path: Path) -> None:
     tape = Tape()
     world = World(recorder=tape)
     world.run(1.0)
@@ -237,12 +221,12 @@ def test_a_time_before_a_clock_that_was_set_back_is_found(
     world.run(0.5)
     tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
     times = ("--from", local(1.4 - 3600), "--to", local(1.6 - 3600))
-    code, out, _ = recording(capsys, tmp_path, "show", *times)
+    code, out, _ = recording(tmp_path, "show", *times)
     assert (code, "  stop: " in out, "  start: " in out) == (0, True, False)
 
 
 def test_two_runs_of_the_daemon_become_two_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (where := tmp_path / "ring").mkdir()
@@ -250,14 +234,14 @@ def test_two_runs_of_the_daemon_become_two_files(
         tape = Tape()
         World(recorder=tape).run(1.0)
         tape.write(where / f"00000{number}-20270115T080000Z.mcap", Config())
-    code, _, err = recording(capsys, where, "export", "all", "both.csv", "--csv")
+    code, _, err = recording(where, "export", "all", "both.csv", "--csv")
     assert (code, "has 2 runs of the daemon" in err) == (2, True)
-    assert recording(capsys, where, "export", "all", "--csv")[0] == 0
+    assert recording(where, "export", "all", "--csv")[0] == 0
     assert len([*tmp_path.glob("00000[12]-*.csv")]) == 2
 
 
 def test_a_search_reports_the_drive_and_the_cut_at_the_end_of_the_newest_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
 ) -> None:
     tape = Tape(every=STEPS)
     World(recorder=tape).drive(0.5, seconds=3.0)
@@ -267,47 +251,41 @@ def test_a_search_reports_the_drive_and_the_cut_at_the_end_of_the_newest_recordi
     written_s = time.time() - 60.0
     os.utime(part, (written_s, written_s))
     for times in (("--from", local(2.0)), ("--from", local(0.5), "--to", local(60.0))):
-        code, out, err = recording(capsys, tmp_path, "show", *times)
+        code, out, err = recording(tmp_path, "show", *times)
         drive, cut = out.splitlines()[-2:]
         assert (code, "  drive: was driving, 1." in drive) == (0, True)
         assert cut.endswith("  ! cut: no end: cut off, or still being recorded")
         assert part.name in err
         os.utime(part)
-        code, out, err = recording(capsys, tmp_path, "show", *times)
+        code, out, err = recording(tmp_path, "show", *times)
         assert (code, out.splitlines()[-1]) == (0, drive)
-        assert err.endswith("[being recorded]\n")
+        assert err.endswith("[being recorded]")
         os.utime(part, (written_s, written_s))
-    _, out, _ = recording(capsys, tmp_path, "show", "--to", local(2.0))
+    _, out, _ = recording(tmp_path, "show", "--to", local(2.0))
     assert "  drive: was driving, 0." in out.splitlines()[-1]
 
 
-def test_a_file_that_cannot_be_read_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     tape = Tape()
     World(recorder=tape).run(1.0)
     tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
     (tmp_path / "000002-20270115T080000Z.mcap").write_bytes(b"no recording")
-    code, out, err = recording(capsys, tmp_path, "show", "--from", local(0.0))
+    code, out, err = recording(tmp_path, "show", "--from", local(0.0))
     assert (code, "start: " in out) == (0, True)
     assert "000002-20270115T080000Z.mcap is not a recording of acsard" in err
 
 
-def test_seconds_need_one_recording(
-    ring: tuple[Path, list[str], list[float]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_seconds_need_one_recording(ring: Ring) -> None:
     where, names, _ = ring
-    code, _, err = recording(capsys, where, "show", "--from", "0.1")
+    code, _, err = recording(where, "show", "--from", "0.1")
     assert code == 0
     assert names[-1] in err
     assert "a number of seconds counts from its beginning" in err
-    code, _, err = recording(capsys, where, "show", "all", "--from", "0.1")
+    code, _, err = recording(where, "show", "all", "--from", "0.1")
     assert (code, "name that recording, or write a time" in err) == (2, True)
 
 
-def test_a_recording_without_a_step_in_the_range_says_so(
-    ring: tuple[Path, list[str], list[float]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_without_a_step_in_the_range_says_so(ring: Ring) -> None:
     where, _, _ = ring
-    code, out, err = recording(capsys, where, "show", "3", "--from", "9999")
+    code, out, err = recording(where, "show", "3", "--from", "9999")
     assert (code, out, "has no step in that span of time" in err) == (1, "", True)

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from acsard.cli.waiting import explained
+from acsard.cli.connection import explained
 
 NEVER_S = 3600.0
 

@@ -16,9 +16,9 @@ from acsard.daemon.latencies import (
     PER_DECADE,
     SLOT_NS,
     SLOTS,
-    Figures,
     Histogram,
     LastMinute,
+    Stopwatch,
 )
 
 BUCKET = 10 ** (1 / PER_DECADE)
@@ -80,79 +80,79 @@ MINUTE_NS = SLOT_NS * SLOTS
 US = 1000
 
 
-def step_time(figures: Figures, now_ns: int) -> Measured:
-    return figures.measured(now_ns)["step_time"]
+def step_time(stopwatch: Stopwatch, now_ns: int) -> Measured:
+    return stopwatch.measured(now_ns)["step_time"]
 
 
 def test_every_figure_is_there_from_the_start() -> None:
-    assert Figures().measured(0) == dict.fromkeys(NAMES, Measured(Spread(), Spread()))
+    assert Stopwatch().measured(0) == dict.fromkeys(NAMES, Measured(Spread(), Spread()))
 
 
 def test_a_measurement_counts_for_both() -> None:
-    figures = Figures()
-    figures["step_time"].add(NS_PER_S, 250 * US)
-    one = step_time(figures, NS_PER_S)
+    stopwatch = Stopwatch()
+    stopwatch.figures["step_time"].add(NS_PER_S, 250 * US)
+    one = step_time(stopwatch, NS_PER_S)
     assert one.since_start == one.last_minute == Spread(1, 250.0, 250.0, 250.0)
 
 
 def test_after_a_minute_it_counts_for_the_start_alone() -> None:
-    figures = Figures()
-    figures["step_time"].add(0, 250 * US)
-    assert step_time(figures, MINUTE_NS - 1).last_minute.count == 1
-    one = step_time(figures, MINUTE_NS + NS_PER_S)
+    stopwatch = Stopwatch()
+    stopwatch.figures["step_time"].add(0, 250 * US)
+    assert step_time(stopwatch, MINUTE_NS - 1).last_minute.count == 1
+    one = step_time(stopwatch, MINUTE_NS + NS_PER_S)
     assert (one.since_start.count, one.last_minute.count) == (1, 0)
 
 
 def test_a_pause_of_any_length_leaves_nothing_old_in_the_minute() -> None:
     for pause in range(1, 3 * SLOTS):
-        figures = Figures()
+        stopwatch = Stopwatch()
         for slot in range(SLOTS):
-            figures["step_time"].add(slot * SLOT_NS, 100 * US)
+            stopwatch.figures["step_time"].add(slot * SLOT_NS, 100 * US)
         now_ns = (SLOTS - 1 + pause) * SLOT_NS
         left = max(0, SLOTS - pause)
-        assert step_time(figures, now_ns).last_minute.count == left
+        assert step_time(stopwatch, now_ns).last_minute.count == left
 
 
 def test_what_is_told_is_at_most_a_second_old() -> None:
-    figures = Figures()
-    figures["step_time"].add(0, 100 * US)
-    assert step_time(figures, 0).since_start.count == 1
-    figures["step_time"].add(1, 100 * US)
-    assert step_time(figures, NS_PER_S - 1).since_start.count == 1
-    assert step_time(figures, NS_PER_S).since_start.count == 2
+    stopwatch = Stopwatch()
+    stopwatch.figures["step_time"].add(0, 100 * US)
+    assert step_time(stopwatch, 0).since_start.count == 1
+    stopwatch.figures["step_time"].add(1, 100 * US)
+    assert step_time(stopwatch, NS_PER_S - 1).since_start.count == 1
+    assert step_time(stopwatch, NS_PER_S).since_start.count == 2
 
 
 @given(st.lists(st.tuples(st.integers(0, 20 * NS_PER_S), st.integers(0, 10**9)), max_size=60))
 def test_the_minute_is_what_a_histogram_of_its_measurements_says(
     measurements: list[tuple[int, int]],
 ) -> None:
-    figures, now_ns, kept = Figures(), 0, []
+    stopwatch, now_ns, kept = Stopwatch(), 0, []
     for wait_ns, duration_ns in measurements:
         now_ns += wait_ns
-        figures["mcu_round_trip"].add(now_ns, duration_ns)
+        stopwatch.figures["mcu_round_trip"].add(now_ns, duration_ns)
         kept.append((now_ns, duration_ns))
     minute = Histogram()
     for at_ns, duration_ns in kept:
         if now_ns // SLOT_NS - at_ns // SLOT_NS < SLOTS:
             minute.add(duration_ns / 1000)
-    assert figures.measured(now_ns)["mcu_round_trip"].last_minute == minute.spread()
+    assert stopwatch.measured(now_ns)["mcu_round_trip"].last_minute == minute.spread()
 
 
 def test_a_day_takes_no_more_memory_than_a_minute() -> None:
-    def size(figures: Figures) -> int:
+    def size(stopwatch: Stopwatch) -> int:
         return sum(
             sys.getsizeof(histogram._buckets)
-            for figure in figures._figures.values()
+            for figure in stopwatch.figures.values()
             for histogram in (figure._past, *figure._slots)
         )
 
-    figures = Figures()
+    stopwatch = Stopwatch()
     for second in range(60):
-        figures["period_lateness"].add(second * NS_PER_S, second * US)
-    after_a_minute = size(figures)
+        stopwatch.figures["period_lateness"].add(second * NS_PER_S, second * US)
+    after_a_minute = size(stopwatch)
     for second in range(60, 86_400, 7):
-        figures["period_lateness"].add(second * NS_PER_S, second * US)
-    assert size(figures) == after_a_minute
+        stopwatch.figures["period_lateness"].add(second * NS_PER_S, second * US)
+    assert size(stopwatch) == after_a_minute
 
 
 def test_what_happened_counts_for_a_minute_and_then_no_more() -> None:

@@ -48,6 +48,20 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
         one.close()
 
 
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Return a configuration file with `TEXT`."""
+    path = tmp_path / "acsard.toml"
+    path.write_text(TEXT)
+    return path
+
+
+@pytest.fixture
+def made(file: Path, started: Started) -> SettingsFile:
+    """Return the settings file of a daemon that has started with `file`."""
+    return started(file, parse(TEXT.encode()), {})
+
+
 def until(look: Callable[[], object]) -> None:
     deadline = time.monotonic() + 10.0
     while not look():
@@ -60,30 +74,23 @@ def with_speed(config: Config, speed: float) -> Config:
 
 
 def test_a_setting_that_was_changed_is_named_until_it_is_changed_back(
-    tmp_path: Path, started: Started
+    file: Path, made: SettingsFile
 ) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
     config = parse(file.read_bytes())
-    made = started(file, config, {})
     made.use(with_speed(config, 0.3))
     until(lambda: made.differ == LOWERED)
     made.use(config)
     until(lambda: made.differ == "")
 
 
-def test_an_edited_file_is_compared_again(tmp_path: Path, started: Started) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
+def test_an_edited_file_is_compared_again(file: Path, started: Started) -> None:
     made = started(file, with_speed(parse(TEXT.encode()), 0.3), {})
     until(lambda: made.differ == LOWERED)
     file.write_text(TEXT.replace("0.5", "0.30"))
     until(lambda: made.differ == "")
 
 
-def test_an_option_of_the_daemon_is_no_difference(tmp_path: Path, started: Started) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
+def test_an_option_of_the_daemon_is_no_difference(file: Path, started: Started) -> None:
     options: dict[str, object] = {"linear_speed": 0.4}
     config = parse(TEXT.encode(), {"limits": options})
     made = started(file, config, options)
@@ -108,11 +115,8 @@ def test_a_daemon_without_a_file_is_compared_with_its_start(started: Started) ->
     ],
 )
 def test_a_file_with_which_the_daemon_cannot_start_is_reported(
-    tmp_path: Path, started: Started, text: bytes | None, words: str
+    file: Path, made: SettingsFile, text: bytes | None, words: str
 ) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
     if text is None:
         file.unlink()
     else:
@@ -155,13 +159,26 @@ def result(made: SettingsFile, events: list[Event] | None = None) -> Request | A
     return one
 
 
+def check(made: SettingsFile) -> None:
+    """Request a change that can be written."""
+    made.keep(REQUEST, 0)
+    assert result(made) is REQUEST
+
+
+def refusal(made: SettingsFile) -> str:
+    """Return the text of the next result, which is a refusal."""
+    answer = result(made)
+    assert isinstance(answer, Answer)
+    assert not answer.success
+    return answer.message
+
+
 def test_a_setting_is_written_after_the_robot_has_obeyed(tmp_path: Path, started: Started) -> None:
     file = tmp_path / "acsard.toml"
     file.write_text(f"# mine\n{TEXT}")
     config, events = parse(file.read_bytes()), list[Event]()
     made = started(file, config, {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    check(made)
     assert file.read_text() == f"# mine\n{TEXT}"
     made.use(with_speed(config, 0.8))
     assert made.obeyed(OBEYED)
@@ -175,12 +192,8 @@ def test_a_setting_is_written_after_the_robot_has_obeyed(tmp_path: Path, started
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_a_setting_that_the_robot_refuses_is_not_written(tmp_path: Path, started: Started) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+def test_a_setting_that_the_robot_refuses_is_not_written(file: Path, made: SettingsFile) -> None:
+    check(made)
     assert not made.obeyed(Answer(7, False, "stop the robot first"))
     assert made.results(10**12, []) == []
     assert file.read_text() == TEXT
@@ -217,24 +230,19 @@ def tracked(file: Path) -> None:
     ],
 )
 def test_nothing_is_set_if_the_file_cannot_be_changed(
-    tmp_path: Path,
-    started: Started,
+    file: Path,
+    made: SettingsFile,
     spoil: Callable[[Path], None] | None,
     settings: dict[str, Plain],
     words: str,
 ) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
     if spoil is not None:
         spoil(file)
     before = file.read_text()
     made.keep(replace(REQUEST, settings=settings or REQUEST.settings), 0)
-    answer = result(made)
-    assert isinstance(answer, Answer)
-    assert not answer.success
-    assert answer.message.startswith("nothing is set: ")
-    assert words in answer.message
+    message = refusal(made)
+    assert message.startswith("nothing is set: ")
+    assert words in message
     assert file.read_text() == before
 
 
@@ -252,8 +260,7 @@ def test_a_file_beside_tracked_ones_is_changed(tmp_path: Path, started: Started)
     tracked(other)
     file.write_text(TEXT)
     made = started(file, parse(TEXT.encode()), {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    check(made)
 
 
 @pytest.mark.parametrize(
@@ -269,50 +276,34 @@ def test_settings_that_the_robot_would_refuse_are_refused_in_its_words(
 ) -> None:
     made = started(tmp_path / "absent.toml", Config(), {})
     made.keep(replace(REQUEST, settings={key: value}), 0)
-    answer = result(made)
-    assert isinstance(answer, Answer)
-    assert not answer.success
-    assert words in answer.message
-    assert "absent.toml" not in answer.message
+    message = refusal(made)
+    assert words in message
+    assert "absent.toml" not in message
 
 
 def test_a_file_that_changes_between_check_and_writing_keeps_both_changes(
-    tmp_path: Path, started: Started
+    file: Path, made: SettingsFile
 ) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    check(made)
     file.write_text(f"# new\n{TEXT}[rates]\nstate = 5.0\n")
     assert made.obeyed(OBEYED)
     assert result(made) == Answer(7, True, f"{OBEYED.message}; written to {file}")
     assert file.read_text() == f"# new\n{TEXT.replace('0.5', '0.8')}[rates]\nstate = 5.0\n"
 
 
-def test_a_failure_after_the_robot_has_obeyed_is_no_success(
-    tmp_path: Path, started: Started
-) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+def test_a_failure_after_the_robot_has_obeyed_is_no_success(file: Path, made: SettingsFile) -> None:
+    check(made)
     read_only(file)
     assert made.obeyed(OBEYED)
-    answer = result(made)
-    assert isinstance(answer, Answer)
-    assert not answer.success
-    assert answer.message.startswith(f"{OBEYED.message}; until the next start: {file} was not")
+    message = refusal(made)
+    assert message.startswith(f"{OBEYED.message}; until the next start: {file} was not")
 
 
 @pytest.mark.parametrize("obeyed", [False, True])
 def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch, obeyed: bool
+    file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch, obeyed: bool
 ) -> None:
-    file, begun, hangs = tmp_path / "acsard.toml", threading.Event(), threading.Event()
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
+    begun, hangs = threading.Event(), threading.Event()
 
     def hang(*_: object) -> Edit:
         begun.set()
@@ -320,8 +311,7 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
         return Edit(file, {}, b"", "")
 
     if obeyed:
-        made.keep(REQUEST, 0)
-        assert result(made) is REQUEST
+        check(made)
     monkeypatch.setattr(module, "keep", hang)
     monkeypatch.setattr(module, "keepable", hang)
     if obeyed:
@@ -341,15 +331,12 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
 
 
 def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
-    tmp_path: Path, started: Started
+    file: Path, started: Started
 ) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
     config, latches = parse(file.read_bytes()), Latches()
     made = started(file, config, {})
     assert made.latches(latches, with_speed(config, 0.3).limits) is latches
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    check(made)
     assert made.obeyed(OBEYED)
     result(made)
     kept, limits = with_speed(config, 0.8).limits, with_speed(config, 0.6).limits
@@ -366,10 +353,7 @@ def test_keep_is_recognized_in_every_notation() -> None:
     assert not keeps("application/json", text.replace(b"true", b"false"))
 
 
-def test_a_pipe_in_place_of_the_file_is_not_read(tmp_path: Path, started: Started) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
+def test_a_pipe_in_place_of_the_file_is_not_read(file: Path, made: SettingsFile) -> None:
     file.unlink()
     os.mkfifo(file)
     until(lambda: made.differ == "the file cannot be read: it is not a regular file")
@@ -379,10 +363,7 @@ def test_a_pipe_in_place_of_the_file_is_not_read(tmp_path: Path, started: Starte
     assert "it is not a regular file" in answer.message
 
 
-def test_a_request_that_is_checked_too_late_is_not_obeyed(tmp_path: Path, started: Started) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
+def test_a_request_that_is_checked_too_late_is_not_obeyed(made: SettingsFile) -> None:
     made.keep(REQUEST, 0)
     until(lambda: made._results.waiting)
     (answer,) = made.results(module.PATIENCE_NS + 1, [])
@@ -392,10 +373,9 @@ def test_a_request_that_is_checked_too_late_is_not_obeyed(tmp_path: Path, starte
 
 
 def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    file: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, hangs, checked = tmp_path / "acsard.toml", threading.Event(), list[object]()
-    file.write_text(TEXT)
+    hangs, checked = threading.Event(), list[object]()
 
     def slow(*words: object) -> Edit:
         checked.append(words)
@@ -418,14 +398,11 @@ def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
 
 
 def test_changed_settings_do_not_displace_a_change_of_the_file(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, hangs = tmp_path / "acsard.toml", threading.Event()
-    file.write_text(TEXT)
+    hangs = threading.Event()
     config = parse(TEXT.encode())
-    made = started(file, config, {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    check(made)
     read = SettingsFile._read
     monkeypatch.setattr(SettingsFile, "_read", lambda self: hangs.wait() and read(self))
     assert made.obeyed(OBEYED)
@@ -436,13 +413,10 @@ def test_changed_settings_do_not_displace_a_change_of_the_file(
 
 
 def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, hangs, done = tmp_path / "acsard.toml", threading.Event(), list[str]()
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    hangs, done = threading.Event(), list[str]()
+    check(made)
 
     def slow(*_: object) -> Edit:
         done.append("check")
@@ -461,13 +435,10 @@ def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
 
 
 def test_an_editor_that_writes_while_the_change_is_computed_loses_nothing(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, texts = tmp_path / "acsard.toml", ["# second\n"]
-    file.write_text(TEXT)
-    made = started(file, parse(TEXT.encode()), {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    texts = ["# second\n"]
+    check(made)
 
     def edited(text: str, keys: Mapping[str, object]) -> str:
         changed = edited_apart(text, keys)
@@ -485,19 +456,16 @@ def test_an_editor_that_writes_while_the_change_is_computed_loses_nothing(
 
 
 def test_the_directory_is_on_the_disk_before_the_answer(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, synced = tmp_path / "acsard.toml", list[tuple[Path, bool]]()
-    file.write_text(TEXT)
+    synced = list[tuple[Path, bool]]()
 
     def sync(path: Path) -> None:
         synced.append((path, "0.8" in file.read_text()))
         raise OSError(errno.EINVAL, "this file system cannot")
 
     monkeypatch.setattr(config_file, "sync", sync)
-    made = started(file, parse(TEXT.encode()), {})
-    made.keep(REQUEST, 0)
-    assert result(made) is REQUEST
+    check(made)
     assert made.obeyed(OBEYED)
     answer = result(made)
     assert isinstance(answer, Answer)
@@ -525,11 +493,9 @@ def test_the_text_is_computed_where_the_priority_cannot_be_lowered(
 
 
 def test_git_does_not_read_the_repository_of_another_user(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its configuration names programs, which would run with the rights of the daemon."""
-    file = tmp_path / "acsard.toml"
-    file.write_text(TEXT)
     tracked(file)
     assert config_file.is_tracked(file)
     monkeypatch.setenv("GIT_TEST_ASSUME_DIFFERENT_OWNER", "1")

@@ -9,7 +9,6 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
-from acsard.core.messages.signature import public_name
 from acsard.core.robot import Robot
 from acsard.recording.published import MEASURED, Published, Publisher
 from acsard.recording.replay import replay_step
@@ -75,21 +74,6 @@ def test_values_that_a_recording_lacks_are_not_published() -> None:
     assert not rows & MEASURED
     states = [m.message for m in published if m.channel.name == "state"]
     assert all(one.latencies == {} and one.certificate_expiry == "" for one in states)
-
-
-def test_the_log_says_that_a_sender_must_send_a_zero_first() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
-    world.drive(0.5, seconds=1.0)
-    world.call("stop")
-    world.run(1.0)
-    world.call("clear")
-    world.run(0.3)
-    world.hold(0.5, seconds=2.5)
-    lines = [m.message for m in said(tape, Config()) if m.channel.name == "log"]
-    (reason,) = [line.msg for line in lines if line.name == "reason"]
-    by = f"app ({public_name('somebody')})"
-    assert reason == f"ready: send a zero first: app must send a zero before it can drive (by {by})"
 
 
 def test_the_log_has_the_same_lines_as_the_timeline() -> None:

@@ -10,7 +10,7 @@ from acsard.recording.recorded_steps import (
     Unfinished,
     UnfinishedError,
     checksum,
-    microposes,
+    micropose,
     unfinished,
 )
 from tests.scenarios.taped import Tape
@@ -26,7 +26,7 @@ def estimates() -> list[Estimate]:
 def test_poses_are_rounded_to_millionths() -> None:
     (first, *_) = estimates()
     turned = replace(first, pose=Pose(1.0000004, -2.0000006, 3.1415926))
-    assert microposes([turned]) == ((1_000_000, -2_000_001, 3_141_593),)
+    assert micropose(turned) == (1_000_000, -2_000_001, 3_141_593)
 
 
 def test_a_checksum_continues_and_covers_every_bit() -> None:

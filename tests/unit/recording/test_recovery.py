@@ -13,9 +13,9 @@ import pytest
 from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
-from acsard.recording.chunks import GROWING_HEAD, LAST_BLOCK
 from acsard.recording.end_record import END, read_end
 from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, About, Recording, Writing
+from acsard.recording.mcap_records import GROWING_HEAD, LAST_BLOCK
 from acsard.recording.recovery import NOTHING_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import World

@@ -9,6 +9,7 @@ import math
 
 from acsard.core.values import NS_PER_S, Instant
 from acsard.recording.retention import (
+    AROUND_NS,
     KEPT_FILES,
     LEAST_BYTES,
     STEADY_NS,
@@ -16,6 +17,7 @@ from acsard.recording.retention import (
     ClockWatch,
     Disk,
     Ended,
+    IncidentWindow,
     Kind,
     share,
     to_delete,
@@ -107,3 +109,56 @@ def test_a_clock_is_trusted_a_while_after_its_last_jump() -> None:
     assert clock.trusted(Instant(STEADY_NS, DAY_NS))
     assert clock.jump_ns(Instant(STEADY_NS, 3 * DAY_NS + STEADY_NS + NS_PER_S)) == 2 * DAY_NS
     assert not clock.trusted(Instant(STEADY_NS + 1, 3 * DAY_NS))
+
+
+def kind(around: IncidentWindow[str]) -> Kind:
+    """Return the kind of the file that is being written now."""
+    return around.kind
+
+
+def test_a_file_that_ended_less_than_a_minute_before_an_incident_is_retained_once() -> None:
+    around = IncidentWindow[str]()
+    for number in range(4):
+        around.begin(number * AROUND_NS // 2)
+        around.end(str(number), (number + 1) * AROUND_NS // 2)
+    around.begin(2 * AROUND_NS)
+    assert around.happened(2 * AROUND_NS + 1) == ["2", "3"]
+    assert kind(around) == "kept"
+    assert around.happened(2 * AROUND_NS + 2) == []
+
+
+def test_a_file_that_begins_less_than_a_minute_after_an_incident_is_near() -> None:
+    around = IncidentWindow[str]()
+    around.begin(0)
+    assert kind(around) == "plain"
+    around.happened(10)
+    around.end("it", 20)
+    around.begin(9 + AROUND_NS)
+    assert kind(around) == "near"
+    around.end("near", 10 + AROUND_NS)
+    around.begin(10 + AROUND_NS)
+    assert kind(around) == "plain"
+    assert around.happened(10 + AROUND_NS) == []
+
+
+def test_incidents_count_over_a_restart() -> None:
+    around = IncidentWindow[str]()
+    around.earlier("plain", "plain", -5)
+    around.earlier("near", "near", -5)
+    around.begin(0)
+    assert kind(around) == "plain"
+    assert around.happened(1) == ["plain"]
+    other = IncidentWindow[str]()
+    other.earlier("kept", "kept", -5)
+    other.begin(0)
+    assert kind(other) == "near"
+
+
+def test_a_crash_before_this_run_is_an_incident() -> None:
+    around = IncidentWindow[str]()
+    around.earlier_happened(-AROUND_NS)
+    around.begin(0)
+    assert kind(around) == "plain"
+    around.earlier_happened(1 - AROUND_NS)
+    around.begin(0)
+    assert kind(around) == "near"

@@ -30,7 +30,7 @@ from acsard.core.values import (
     Request,
     Twist,
 )
-from acsard.recording.recorded_steps import Taken, microposes, status_of
+from acsard.recording.recorded_steps import Taken, micropose, status_of
 from acsard.recording.rows import MAX_ROWS, Batch, BatchError, Rare, decode, encode, first_of
 from tests.each import each
 from tests.scenarios.taped import Tape, drive_through_faults
@@ -108,7 +108,7 @@ def test_all_outputs_are_read_back() -> None:
             said, outputs = step.recorded, taken.outputs
             assert (said.line, said.sent) == (outputs.line, taken.sent)
             assert said.status == status_of(outputs)
-            assert said.poses == microposes(outputs.estimates)
+            assert said.poses == tuple(map(micropose, outputs.estimates))
             assert said.events == outputs.events
 
 

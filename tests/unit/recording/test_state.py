@@ -1,4 +1,4 @@
-"""A robot survives the round trip through bytes, and bytes from others run no code."""
+"""A robot survives the round trip through bytes and another configuration; no byte runs code."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
@@ -21,7 +22,7 @@ from acsard.recording.export import export
 from acsard.recording.file import Recording, Writing
 from acsard.recording.file_replay import DisplayReplay, replay_file
 from acsard.recording.rows import encode
-from acsard.recording.state import Checkpoint, State, StateError, freeze, thaw
+from acsard.recording.state import Checkpoint, State, StateError, adopt, freeze, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
 from acsard.report.report_data import ReportData
 from tests.each import each
@@ -205,3 +206,42 @@ def test_forged_states_behind_gaps_take_time_in_proportion_to_the_file(
     assert gap.skipped == 20
     drawn(Recording(path))
     assert len(thawed) <= 2 * (MAX_BYTES + 8 * path.stat().st_size) // len(forged.data)
+
+
+PLAIN = Config()
+
+
+def driven() -> Robot:
+    world = World()
+    world.drive(0.5, 0.2, seconds=2.0)
+    return world.loop.robot
+
+
+def test_the_same_configuration_changes_nothing() -> None:
+    robot = driven()
+    before = freeze(robot, Memory())
+    adopt(robot, Robot(PLAIN), Robot(PLAIN))
+    assert freeze(robot, Memory()) == before
+
+
+def test_configured_values_change_and_values_of_the_drive_stay() -> None:
+    other = replace(
+        PLAIN,
+        drive=replace(PLAIN.drive, wheel_radius=0.1),
+        limits=replace(PLAIN.limits, linear_speed=0.25),
+    )
+    robot = driven()
+    pose, counters = robot.snapshot(0).pose, robot.counters.copy()
+    adopt(robot, Robot(PLAIN), Robot(other))
+    assert robot.snapshot(0).pose == pose
+    assert robot.counters == counters
+    assert robot.session.link == "up"
+    assert vars(robot._kinematics) == vars(Robot(other)._kinematics)
+    assert robot._kinematics is robot._odometry._kinematics
+
+
+def test_a_part_that_the_state_lacks_comes_from_a_new_robot() -> None:
+    robot = driven()
+    del robot._answered
+    adopt(robot, Robot(PLAIN), Robot(PLAIN))
+    assert vars(robot._answered) == vars(Robot(PLAIN)._answered)

@@ -9,10 +9,10 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import Received
-from acsard.recording.chunks import MAX_MESSAGE_BYTES
 from acsard.recording.directory import listed
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import steps
+from acsard.recording.mcap_records import MAX_MESSAGE_BYTES
 from acsard.recording.step_writer import BATCH, StepWriter
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World

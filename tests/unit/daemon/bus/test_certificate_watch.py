@@ -1,4 +1,4 @@
-"""The daemon knows the ends of certificates that were replaced while it ran."""
+"""Renewed certificate files are noticed, and the daemon knows the ends of replaced certificates."""
 
 from __future__ import annotations
 
@@ -11,9 +11,72 @@ import pytest
 
 from acsard.core.config.settings import BusConfig
 from acsard.daemon.bus import certificate_watch as module
-from acsard.daemon.bus.certificate_watch import watch_certificates
-from acsard.daemon.bus.tls import ends
+from acsard.daemon.bus.certificate_watch import FILES_LOOK_NS, CertificateFiles, watch_certificates
+from acsard.daemon.bus.tls import ends, files_in
+from acsard.host import clock
 from acsard.machine.authority import Authority
+
+
+class Files:
+    """The files of a robot, looked at by a clock that each look advances."""
+
+    def __init__(self, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.where, self._now_ns = where, 0
+        self.authority = Authority.make(where, "test", 10)
+        self.issue()
+        monkeypatch.setattr(clock, "mono_ns", lambda: self._now_ns)
+        self._files = CertificateFiles(*files_in(str(where)))
+
+    def issue(self) -> None:
+        self.authority.issue(self.where, "robot", [], 10)
+
+    def renewed(self) -> bool:
+        self._now_ns += FILES_LOOK_NS
+        return self._files.renewed()
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
+    return Files(tmp_path, monkeypatch)
+
+
+def test_a_new_certificate_is_noticed_once(files: Files) -> None:
+    assert [files.renewed() for _ in range(3)] == [False, False, False]
+    files.issue()
+    # The first look sees that the files change, and the second that they no longer do.
+    assert [files.renewed() for _ in range(4)] == [False, True, False, False]
+
+
+def test_each_further_certificate_is_noticed(files: Files) -> None:
+    for _ in range(3):
+        files.issue()
+        assert [files.renewed() for _ in range(2)] == [False, True]
+
+
+@pytest.mark.parametrize("missing", ["certificate.pem", "key.pem"])
+def test_files_that_are_copied_one_after_the_other_count_when_all_are_there(
+    files: Files, missing: str
+) -> None:
+    file = files.where / missing
+    old = file.read_bytes()
+    files.issue()
+    new = file.read_bytes()
+    file.write_bytes(old)
+    assert [files.renewed() for _ in range(4)] == [False] * 4
+    file.unlink()
+    assert [files.renewed() for _ in range(4)] == [False] * 4
+    file.write_bytes(new)
+    assert [files.renewed() for _ in range(2)] == [False, True]
+
+
+def test_the_files_are_not_looked_at_more_often(
+    files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files.renewed()
+    files.issue()
+    monkeypatch.setattr(module, "FILES_LOOK_NS", 0)
+    assert not any(files._files.renewed() for _ in range(10))
+
 
 ROUTER = "tls/router.local:7447"
 
@@ -30,7 +93,7 @@ def test_new_files_and_a_new_router_are_known_and_an_absent_one_takes_nothing_aw
     authority = Authority.make(tmp_path, "test", 10)
     authority.issue(tmp_path, "robot", [], 10)
     router: list[int | None] = [None]
-    monkeypatch.setattr(module, "LOOK_S", 0.0)
+    monkeypatch.setattr(module, "ENDS_LOOK_S", 0.0)
     monkeypatch.setattr(module, "ROUTER_LOOKS", 2)
     monkeypatch.setattr(module, "peer_ends_ns", lambda endpoint, tls: router[0])
 
@@ -64,7 +127,7 @@ def test_a_disk_that_hangs_takes_one_thread(
         answers.wait()
         return {"": 8}
 
-    monkeypatch.setattr(module, "LOOK_S", 0.0)
+    monkeypatch.setattr(module, "ENDS_LOOK_S", 0.0)
     monkeypatch.setattr(module, "PATIENCE_S", 0.0, raising=False)
     monkeypatch.setattr(module, "ends", hang)
 
@@ -84,7 +147,7 @@ def test_the_robots_own_end_is_left_to_its_gateway(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Authority.make(tmp_path, "test", 10).issue(tmp_path, "robot", [], 10)
-    monkeypatch.setattr(module, "LOOK_S", 0.0)
+    monkeypatch.setattr(module, "ENDS_LOOK_S", 0.0)
 
     async def story() -> None:
         known = {"": 7}

@@ -13,9 +13,10 @@ from mcap.data_stream import ReadDataStream
 from mcap.records import Chunk
 from mcap.stream_reader import breakup_chunk
 
-from acsard.recording.chunks import (
+from acsard.recording.mcap_records import (
     GROWING_HEAD,
     LAST_BLOCK,
+    MAGIC,
     MAX_MESSAGE_BYTES,
     PARAMETERS,
     ZSTD,
@@ -23,8 +24,8 @@ from acsard.recording.chunks import (
     Message,
     chunk_places,
     read_chunk,
+    walk,
 )
-from acsard.recording.mcap_records import MAGIC, walk
 from tests.each import each
 
 DICE = random.Random(1)

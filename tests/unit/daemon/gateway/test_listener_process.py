@@ -5,7 +5,7 @@ The judgement logs incidents and gives the reasons to restart the gateway.
 
 from __future__ import annotations
 
-from acsard.daemon.gateway.session_health import (
+from acsard.daemon.gateway.listener_process import (
     ALONE_NS,
     FIRST_NS,
     MAX_UNANSWERED,
