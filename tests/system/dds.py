@@ -226,13 +226,6 @@ class DdsNode(Client):
             until(publisher.get_matched_subscriptions, ROUTE_S, f"a route from {name}")
         publisher.write(publisher.data_type.deserialize(payload))
 
-    def end_publisher(self, name: str) -> None:
-        """Delete the node's publisher of this topic."""
-        publisher = self._publishers.pop(name)
-        self._writers.remove(publisher)
-        _delete(publisher)
-        self._announce()
-
     @contextmanager
     def follow(self, name: str, type_name: str) -> Iterator[Samples]:
         with self._follow(name, type_name, _VOLATILE) as samples:
@@ -347,7 +340,7 @@ class _ServiceClient:
         try:
             until(answered, 5.0, f"an answer of {self.service}")
         except AssertionError:
-            pass  # the caller sees that there is none
+            pass  # the caller sees that no reply came
         return Called(replies, 0, time.monotonic() - begun)
 
 
