@@ -120,6 +120,7 @@ CALIBRATE = "tests/unit/cli/test_calibrate.py"
 BAG = Elsewhere(CALIBRATE, "test_a_bag_that_another_library_wrote_is_read")
 CLIENTS = "tests/system/test_languages.py"
 GUIDED = "tests/system/test_calibrate.py"
+BRIDGED = "tests/system/test_ros_dds.py"
 
 NO_ROS = Shown("needs ROS 2; the page says what was tried with it")
 TWO_MACHINES = Shown("needs a second machine")
@@ -218,6 +219,11 @@ COMMANDS: dict[str, How] = {
     "-m '(slow or network or systemd or firmware) and not (soak or nightly)'": PYTEST,
     ".venv/bin/pytest -m 'nightly and not soak'": PYTEST,
     ".venv/bin/pytest -m languages": PYTEST,
+    ".venv/bin/pytest -m bridge": PYTEST,
+    ".venv/bin/pip install -e '.[test,dds]'": Shown("downloads what only the tests of DDS need"),
+    "sudo apt install cmake g++ libclang-dev": Shown(
+        "installs what builds the bridge of the tests"
+    ),
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.screens": Elsewhere(
@@ -374,11 +380,13 @@ COMMANDS: dict[str, How] = {
         Run()
     ),
     f"zenoh-bridge-ros2dds -c {_BRIDGE_FILE}": Elsewhere(
-        "tests/system/test_ros_bridge.py",
-        "test_the_real_bridge_carries_odometry_commands_transforms_and_services",
-        "only where that program is on the PATH",
+        BRIDGED,
+        "test_a_bridge_that_starts_before_the_robot_joins_it_and_joins_it_again",
+        "by a program of the tests around the same plugin",
     ),
-    f"zenoh-bridge-ros2dds -c {_BRIDGE_FILE} -e tcp/ROBOT:7448 -n /robot1": TWO_MACHINES,
+    f"zenoh-bridge-ros2dds -c {_BRIDGE_FILE} -e tcp/ROBOT:7448 -n /robot1": Elsewhere(
+        BRIDGED, "test_a_command_to_one_robot_drives_only_that_one", "on one machine"
+    ),
     "python3 deploy/ros2/drive.py 0.2 0.0 3": Elsewhere(
         "tests/system/test_ros_drive.py",
         "test_the_line_of_the_pages_drives",

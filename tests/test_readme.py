@@ -22,7 +22,8 @@ def test_every_extra_is_named_on_a_page() -> None:
     """A reader learns from the pages which features each extra adds."""
     root = README.parent
     extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]
-    pages = "".join(page.read_text() for page in (README, *root.glob("deploy/*/README.md")))
+    files = (README, root / "tests/README.md", *root.glob("deploy/*/README.md"))
+    pages = "".join(page.read_text() for page in files)
     for extra in extras["optional-dependencies"]:
         assert re.search(rf"`{extra}`|\[(\w+,)*{extra}(,\w+)*\]", pages), extra
 

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from acsard.machine.authority import Authority
 from tests.system import cores
 from tests.system.browser import NAME, Page
+from tests.system.builds import ros2dds_bridge
 from tests.system.bystander import standing_by
 from tests.system.harness import Bus, Daemon, Peer, until
 from tests.system.hosts import Hosts, two_hosts
+
+if TYPE_CHECKING:
+    from tests.system.dds import NewDomain
 
 _before = cores.idle()
 """When the current test began."""
@@ -40,6 +46,24 @@ def bystander() -> Iterator[None]:
     """Measure all the time how much time the machine takes: `bystander.lost`."""
     with standing_by():
         yield
+
+
+@pytest.fixture(scope="session")
+def kept(request: pytest.FixtureRequest) -> Path:
+    """Return a directory for builds that take long. It outlives the test run."""
+    cache = request.config.cache
+    assert cache is not None
+    return Path(cache.mkdir("languages"))
+
+
+@pytest.fixture(scope="session")
+def dds(kept: Path) -> NewDomain:
+    """Return the maker of DDS domains with their bridges. It takes a directory for files."""
+    needed = "no Cyclone DDS for Python: .venv/bin/pip install -e '.[test,dds]'"
+    pytest.importorskip("cyclonedds", reason=needed)
+    from tests.system.dds import DdsDomain
+
+    return partial(DdsDomain, ros2dds_bridge(kept))
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,8 @@
 """Stand-ins for rclpy and geometry_msgs, as far as `drive.py` needs them; both need ROS.
 
 As in the real rclpy, a signal by default ends the context while a node may still be publishing. The
-messages go into a real daemon by the protocol of rmw_zenoh, or as a bridge puts them.
+messages go into a real daemon by the protocol of rmw_zenoh, as a bridge puts them, or over DDS to a
+real bridge.
 """
 
 from __future__ import annotations
@@ -15,6 +16,19 @@ import zenoh
 from rclpy.signals import SignalHandlerOptions
 from tests.system.harness import client_config
 from tests.system.ros_clients import TWIST, BridgeHalf, RmwClient, twist
+
+class OverDds:
+    def __init__(self, topic):
+        from tests.system.dds import DdsNode
+        self.node = DdsNode(int(os.environ["DOMAIN"])).__enter__()
+        self.topic = topic
+        self.publisher = self.node.publisher(topic, TWIST)
+
+    def get_subscription_count(self):
+        return len(self.publisher.get_matched_subscriptions())
+
+    def publish(self, message):
+        self.node.put(self.topic, TWIST, twist(message.linear.x, message.angular.z))
 
 class Publisher:
     def __init__(self, topic):
@@ -35,7 +49,7 @@ class Publisher:
 class Node:
     def create_publisher(self, kind, topic, depth):
         assert kind.__name__ == "Twist"
-        return Publisher(topic)
+        return OverDds(topic) if os.environ["WAY"] == "dds" else Publisher(topic)
 
 valid = False
 

@@ -1,4 +1,4 @@
-"""ROS 2 as strangers speak it over Zenoh: rmw_zenoh's side, the bridge's side, and DDS behind it.
+"""ROS 2 as strangers speak it over Zenoh: rmw_zenoh's side and the bridge's side.
 
 Nothing of acsard is imported: keys, tokens and attachments are written here a second time, CDR is
 made and read by rosbags. The programs run in processes of their own.
@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import socket
 import struct
 import subprocess
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ import zenoh
 import zenoh.ext
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.system.harness import Bus, Daemon, Program, client_config, environment, until
+from tests.system.harness import ROOT, Bus, Daemon, Program, client_config, environment, until
 from tests.system.strangers import words
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -88,6 +88,15 @@ WHEELS = [f"{where}_wheel_joint" for where in ("front_right", "front_left", "rea
 WHEELS.append("rear_right_wheel_joint")
 
 
+BRIDGE_FILE = ROOT / "deploy/ros2/zenoh-bridge-ros2dds.json5"
+"""The configuration of the bridge."""
+
+ROUTE_S = 5.0
+"""The longest time in which a bridge has made a route for a new publisher or client.
+
+The bridge reads the nodes of its domain ten times a second.
+"""
+
 QUICK = {
     "limits": {
         "linear_acceleration": 5.0,
@@ -104,12 +113,41 @@ _store: Any = get_typestore(Stores.ROS2_JAZZY)
 for _name, _text in {
     "std_srvs/msg/TriggerReply": "bool success\nstring message",
     "rcl_interfaces/msg/ListRequest": "string[] prefixes\nuint64 depth",
+    "rcl_interfaces/msg/ListReply": "rcl_interfaces/ListParametersResult result",
     "rcl_interfaces/msg/GetRequest": "string[] names",
     "rcl_interfaces/msg/GetReply": "rcl_interfaces/ParameterValue[] values",
+    "rcl_interfaces/msg/DescribeReply": "rcl_interfaces/ParameterDescriptor[] descriptors",
+    "rcl_interfaces/msg/GetTypesReply": "uint8[] types",
     "rcl_interfaces/msg/SetRequest": "rcl_interfaces/Parameter[] parameters",
     "rcl_interfaces/msg/SetReply": "rcl_interfaces/SetParametersResult[] results",
+    "rcl_interfaces/msg/SetAtomicallyReply": "rcl_interfaces/SetParametersResult result",
 }.items():
     _store.register(get_types_from_msg(_text, _name))
+
+REQUESTS = {
+    TRIGGER: ("std_msgs/msg/Empty", "std_srvs/msg/TriggerReply"),
+    LIST: ("rcl_interfaces/msg/ListRequest", "rcl_interfaces/msg/ListReply"),
+    GET: ("rcl_interfaces/msg/GetRequest", "rcl_interfaces/msg/GetReply"),
+    "rcl_interfaces/srv/DescribeParameters": (
+        "rcl_interfaces/msg/GetRequest", "rcl_interfaces/msg/DescribeReply",
+    ),
+    "rcl_interfaces/srv/GetParameterTypes": (
+        "rcl_interfaces/msg/GetRequest", "rcl_interfaces/msg/GetTypesReply",
+    ),
+    "rcl_interfaces/srv/SetParameters": (
+        "rcl_interfaces/msg/SetRequest", "rcl_interfaces/msg/SetReply",
+    ),
+    "rcl_interfaces/srv/SetParametersAtomically": (
+        "rcl_interfaces/msg/SetRequest", "rcl_interfaces/msg/SetAtomicallyReply",
+    ),
+}  # fmt: skip
+"""The messages of each service: its request and its reply."""
+
+
+def fields_of(type_name: str) -> list[tuple[str, Any]]:
+    """Return the fields of a message: the name, and rosbags' description of the type."""
+    fields: list[tuple[str, Any]] = _store.fielddefs[type_name][1]
+    return fields
 
 
 def make(type_name: str, **fields: Any) -> Any:
@@ -236,13 +274,17 @@ class Samples:
     def add(self, sample: zenoh.Sample) -> None:
         """Take a sample; Zenoh calls this."""
         attachment, stamp = sample.attachment, sample.timestamp
-        seen = Sample(
-            time.monotonic(),
-            str(sample.key_expr),
-            sample.payload.to_bytes(),
-            b"" if attachment is None else attachment.to_bytes(),
-            "" if stamp is None else str(stamp.get_id()),
+        self.take(
+            Sample(
+                time.monotonic(),
+                str(sample.key_expr),
+                sample.payload.to_bytes(),
+                b"" if attachment is None else attachment.to_bytes(),
+                "" if stamp is None else str(stamp.get_id()),
+            )
         )
+
+    def take(self, seen: Sample) -> None:
         with self._news:
             self.seen.append(seen)
             self._news.notify_all()
@@ -290,71 +332,41 @@ def released(ros: Client) -> None:
     until(lambda: ros.call("acsard/clear").trigger()[0], 5.0, "a plain clear is obeyed")
 
 
-# clients of the two trees, over a plain session
+# clients
 
 
-class Client:
-    """The common part of both kinds of client. `namespace` is put in front of every name."""
+class Client(ABC):
+    """A ROS node that publishes, subscribes and calls. `namespace` is put in front of every name.
 
-    def __init__(self, session: zenoh.Session, namespace: str = "") -> None:
-        self.session = session
+    Payloads are messages in CDR.
+    """
+
+    PAUSE_S = 0.0
+    """The time from one message of `heard` to the next, in which the daemon counts it."""
+
+    def __init__(self, namespace: str = "") -> None:
         self.namespace = namespace
 
     def full(self, name: str) -> str:
         return f"{self.namespace}/{name}" if self.namespace else name
 
-    def key(self, name: str, type_name: str) -> str:
-        raise NotImplementedError
-
-    def attachment(self) -> bytes | None:
-        """Return the attachment of the next sample, or None for a sample without one."""
-        raise NotImplementedError
-
+    @abstractmethod
     def put(self, name: str, type_name: str, payload: bytes) -> None:
-        self.session.put(self.key(name, type_name), payload, attachment=self.attachment())
+        """Publish a message."""
 
+    @abstractmethod
     def call(self, name: str, type_name: str = TRIGGER, payload: bytes = EMPTY_REQUEST) -> Called:
-        raise NotImplementedError
+        """Call a service and wait for its reply."""
 
-    @contextmanager
-    def follow(self, name: str, type_name: str) -> Iterator[Samples]:
+    @abstractmethod
+    def follow(self, name: str, type_name: str) -> AbstractContextManager[Samples]:
         """Subscribe while entered."""
-        samples = Samples()
-        subscriber = self.session.declare_subscriber(self.key(name, type_name), samples.add)
-        try:
-            yield samples
-        finally:
-            subscriber.undeclare()
 
-    @contextmanager
-    def follow_late(self, name: str, type_name: str, depth: int = 100) -> Iterator[Samples]:
+    @abstractmethod
+    def follow_late(
+        self, name: str, type_name: str, depth: int = 100
+    ) -> AbstractContextManager[Samples]:
         """Subscribe as transient local, which includes earlier samples."""
-        samples = Samples()
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            self.session,
-            self.key(name, type_name),
-            samples.add,
-            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
-            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-            subscriber_detection=True,
-        )
-        try:
-            yield samples
-        finally:
-            subscriber.undeclare()
-
-    def _ask(self, key: str, payload: bytes, attachment: bytes | None, **how: Any) -> Called:
-        replies, errors, begun = [], 0, time.monotonic()
-        for reply in self.session.get(
-            key, payload=payload, attachment=attachment, timeout=5.0, **how
-        ):
-            if reply.ok is None:
-                errors += 1
-                continue
-            samples = Samples()
-            samples.add(reply.ok)
-            replies += samples.seen
-        return Called(replies, errors, time.monotonic() - begun)
 
     def heard(
         self, bus: Bus, name: str, type_name: str, payload: bytes | Callable[[], bytes]
@@ -363,10 +375,13 @@ class Client:
 
         A new sender must show its delays first.
         """
-        before = bus.count("commands")
+        before, sent = bus.count("commands"), 0.0
 
         def taken() -> bool:
-            self.put(name, type_name, payload if isinstance(payload, bytes) else payload())
+            nonlocal sent
+            if time.monotonic() >= sent + self.PAUSE_S:
+                self.put(name, type_name, payload if isinstance(payload, bytes) else payload())
+                sent = time.monotonic()
             return bus.count("commands") > before
 
         until(taken, 5.0, f"a command on {name}")
@@ -400,7 +415,64 @@ class Client:
             thread.join()
 
 
-class RmwClient(Client):
+class ZenohClient(Client):
+    """The common part of the clients of both trees, over a plain session."""
+
+    def __init__(self, session: zenoh.Session, namespace: str = "") -> None:
+        super().__init__(namespace)
+        self.session = session
+
+    @abstractmethod
+    def key(self, name: str, type_name: str) -> str:
+        """Return the key of a topic or a service."""
+
+    @abstractmethod
+    def attachment(self) -> bytes | None:
+        """Return the attachment of the next sample, or None for a sample without one."""
+
+    def put(self, name: str, type_name: str, payload: bytes) -> None:
+        self.session.put(self.key(name, type_name), payload, attachment=self.attachment())
+
+    @contextmanager
+    def follow(self, name: str, type_name: str) -> Iterator[Samples]:
+        samples = Samples()
+        subscriber = self.session.declare_subscriber(self.key(name, type_name), samples.add)
+        try:
+            yield samples
+        finally:
+            subscriber.undeclare()
+
+    @contextmanager
+    def follow_late(self, name: str, type_name: str, depth: int = 100) -> Iterator[Samples]:
+        samples = Samples()
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self.session,
+            self.key(name, type_name),
+            samples.add,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
+            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            subscriber_detection=True,
+        )
+        try:
+            yield samples
+        finally:
+            subscriber.undeclare()
+
+    def _ask(self, key: str, payload: bytes, attachment: bytes | None, **how: Any) -> Called:
+        replies, errors, begun = [], 0, time.monotonic()
+        for reply in self.session.get(
+            key, payload=payload, attachment=attachment, timeout=5.0, **how
+        ):
+            if reply.ok is None:
+                errors += 1
+                continue
+            samples = Samples()
+            samples.add(reply.ok)
+            replies += samples.seen
+        return Called(replies, errors, time.monotonic() - begun)
+
+
+class RmwClient(ZenohClient):
     """A node of rmw_zenoh, written from its protocol."""
 
     def __init__(self, session: zenoh.Session, namespace: str = "", domain: int = 0) -> None:
@@ -439,8 +511,8 @@ class RmwClient(Client):
             yield found
 
 
-class BridgeHalf(Client):
-    """The Zenoh half of zenoh-bridge-ros2dds."""
+class BridgeHalf(ZenohClient):
+    """The Zenoh half of zenoh-bridge-ros2dds, emulated. `dds.py` has the real one."""
 
     def key(self, name: str, type_name: str) -> str:
         return self.full(name)
@@ -735,215 +807,7 @@ class Sdk(Program):
         return json.loads(line.split(" ", 2)[2])
 
 
-# DDS, behind the real bridge
-
-CYCLONE = """\
-<CycloneDDS><Domain Id="any">
-<General><AllowMulticast>false</AllowMulticast>
-<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>
-<Discovery><ParticipantIndex>auto</ParticipantIndex>
-<MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
-</Domain></CycloneDDS>
-"""
-"""Cyclone DDS on loopback, without multicast."""
-
-DDS = """\
-import sys, time
-from dataclasses import dataclass
-
-from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float64, int32, int64, sequence, uint8, uint32, uint64
-from cyclonedds.pub import DataWriter
-from cyclonedds.qos import Policy, Qos
-from cyclonedds.sub import DataReader
-from cyclonedds.topic import Topic
-from cyclonedds.util import duration
-
-def message(package, name):
-    kind = "srv" if name.startswith("Trigger") else "msg"
-    return {"typename": f"{package}::{kind}::dds_::{name}_"}
-
-@dataclass
-class Time(IdlStruct, **message("builtin_interfaces", "Time")):
-    sec: int32
-    nanosec: uint32
-
-@dataclass
-class Header(IdlStruct, **message("std_msgs", "Header")):
-    stamp: Time
-    frame_id: str
-
-@dataclass
-class Vector3(IdlStruct, **message("geometry_msgs", "Vector3")):
-    x: float64 = 0.0
-    y: float64 = 0.0
-    z: float64 = 0.0
-
-@dataclass
-class Point(IdlStruct, **message("geometry_msgs", "Point")):
-    x: float64
-    y: float64
-    z: float64
-
-@dataclass
-class Quaternion(IdlStruct, **message("geometry_msgs", "Quaternion")):
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-@dataclass
-class Twist(IdlStruct, **message("geometry_msgs", "Twist")):
-    linear: Vector3
-    angular: Vector3
-
-@dataclass
-class Pose(IdlStruct, **message("geometry_msgs", "Pose")):
-    position: Point
-    orientation: Quaternion
-
-@dataclass
-class PoseWithCovariance(IdlStruct, **message("geometry_msgs", "PoseWithCovariance")):
-    pose: Pose
-    covariance: array[float64, 36]
-
-@dataclass
-class TwistWithCovariance(IdlStruct, **message("geometry_msgs", "TwistWithCovariance")):
-    twist: Twist
-    covariance: array[float64, 36]
-
-@dataclass
-class Odometry(IdlStruct, **message("nav_msgs", "Odometry")):
-    header: Header
-    child_frame_id: str
-    pose: PoseWithCovariance
-    twist: TwistWithCovariance
-
-@dataclass
-class Transform(IdlStruct, **message("geometry_msgs", "Transform")):
-    translation: Vector3
-    rotation: Quaternion
-
-@dataclass
-class TransformStamped(IdlStruct, **message("geometry_msgs", "TransformStamped")):
-    header: Header
-    child_frame_id: str
-    transform: Transform
-
-@dataclass
-class TFMessage(IdlStruct, **message("tf2_msgs", "TFMessage")):
-    transforms: sequence[TransformStamped]
-
-@dataclass
-class Request(IdlStruct, **message("std_srvs", "Trigger_Request")):
-    guid: uint64
-    number: int64
-    nothing: uint8
-
-@dataclass
-class Response(IdlStruct, **message("std_srvs", "Trigger_Response")):
-    guid: uint64
-    number: int64
-    success: bool
-    message: str
-
-@dataclass
-class Gid(IdlStruct, **message("rmw_dds_common", "Gid")):
-    data: array[uint8, 16]
-
-@dataclass
-class Node(IdlStruct, **message("rmw_dds_common", "NodeEntitiesInfo")):
-    node_namespace: str
-    node_name: str
-    reader_gid_seq: sequence[Gid]
-    writer_gid_seq: sequence[Gid]
-
-@dataclass
-class Graph(IdlStruct, **message("rmw_dds_common", "ParticipantEntitiesInfo")):
-    gid: Gid
-    node_entities_info_seq: sequence[Node]
-
-participant = DomainParticipant(int(sys.argv[1]))
-reliable = Policy.Reliability.Reliable(duration(seconds=1))
-volatile = Qos(reliable, Policy.History.KeepLast(10))
-latched = Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
-readers, writers = [], []
-
-def reader(topic, kind, qos=volatile):
-    readers.append(DataReader(participant, Topic(participant, topic, kind), qos=qos))
-    return readers[-1]
-
-def writer(topic, kind, qos=volatile):
-    writers.append(DataWriter(participant, Topic(participant, topic, kind), qos=qos))
-    return writers[-1]
-
-graph = DataWriter(participant, Topic(participant, "ros_discovery_info", Graph), qos=latched)
-
-def announce():
-    # The bridge makes routes for endpoints of nodes only.
-    gids = [[Gid(list(e.guid.bytes)) for e in ends] for ends in (readers, writers)]
-    node = Node("/", "tester", *gids)
-    graph.write(Graph(Gid(list(participant.guid.bytes)), [node]))
-
-def until(look, what, within=8.0):
-    end = time.monotonic() + within
-    while time.monotonic() < end:
-        got = look()
-        if got:
-            return got
-        time.sleep(0.01)
-    sys.exit("no " + what)
-
-last = []
-
-def newest():
-    last[:] = odometry.take(50)[-1:] or last
-    return last and last[-1]
-
-def drive(speed, wanted):
-    count = [0]
-    def step():
-        asked = speed if count[0] > 20 else 0.0
-        commands.write(Twist(Vector3(asked), Vector3()))
-        count[0] += 1
-        got = newest()
-        return got if got and got.twist.twist.linear.x > wanted else None
-    return until(step, "motion")
-
-def call(name):
-    request = writer("rq/acsard/" + name + "Request", Request)
-    reply = reader("rr/acsard/" + name + "Reply", Response)
-    announce()
-    guid = int.from_bytes(bytes(request.guid.bytes[-8:]), "little")
-    until(lambda: request.get_matched_subscriptions() and reply.get_matched_publications(), name)
-    request.write(Request(guid, 7, 0))
-    got = until(lambda: reply.take(1), "answer of " + name)[0]
-    assert (got.guid, got.number) == (guid, 7), got
-    return got
-
-odometry, commands = reader("rt/odom", Odometry), writer("rt/cmd_vel", Twist)
-announce()
-got = until(newest, "odometry")
-print("odometry", got.header.frame_id, got.child_frame_id, got.pose.pose.orientation.w, flush=True)
-got = drive(0.3, 0.2)
-print("drove", got.twist.twist.linear.x, flush=True)
-static = reader("rt/tf_static", TFMessage, latched)
-announce()
-begun = time.monotonic()
-(got, *_) = until(lambda: static.take(1), "tf_static")
-print("static", time.monotonic() - begun, *[t.child_frame_id for t in got.transforms], flush=True)
-got = call("stop")
-print("called stop", got.success, got.message, flush=True)
-stopped = time.monotonic()
-until(lambda: time.monotonic() > stopped + 2.1, "time to look at a robot that was stopped")
-got = call("clear")
-print("called clear", got.success, got.message, flush=True)
-sys.stdin.read()
-"""
-"""A ROS node on DDS, as far as the bridge can tell: receives odometry, drives, joins late, calls.
-"""
+# networks
 
 
 class Relay:
@@ -992,41 +856,3 @@ class Relay:
 def _address(endpoint: str) -> tuple[str, int]:
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
     return host, int(port)
-
-
-class Bridge(Program):
-    """The real zenoh-bridge-ros2dds as a client of `endpoint`, on a DDS domain of its own."""
-
-    def __init__(self, program: str, where: Path, endpoint: str) -> None:
-        # Use a domain whose ports are below those that the kernel assigns.
-        self.domain = 20 + os.getpid() % 80
-        self.cyclone = where / "cyclone.xml"
-        self.cyclone.write_text(CYCLONE)
-        config = where / "bridge.json5"
-        settings = {
-            "mode": "client",
-            "connect": {"endpoints": [endpoint]},
-            "scouting": {"multicast": {"enabled": False}},
-            "plugins": {"ros2dds": {"domain": self.domain}},
-        }
-        config.write_text(json.dumps(settings))
-        env = self.environment | {"ROS_DISTRO": "jazzy", "RUST_LOG": "zenoh_plugin_ros2dds=debug"}
-        super().__init__([program, "-c", str(config)], where, env)
-
-    @property
-    def environment(self) -> dict[str, str]:
-        """Return the environment for the bridge and for any node on its domain."""
-        return bare_environment() | {"CYCLONEDDS_URI": f"file://{self.cyclone}"}
-
-    @property
-    def log(self) -> list[str]:
-        """Return the bridge's log without colours."""
-        return [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in [*self.out, *self.err]]
-
-    def logs(self, *texts: str, within: float = 10.0) -> str:
-        """Return the first log line that contains all of these."""
-        return until(
-            lambda: next((line for line in self.log if all(t in line for t in texts)), None),
-            within,
-            f"{texts} in the bridge's log",
-        )

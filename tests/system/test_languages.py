@@ -21,6 +21,7 @@ import pytest
 
 from tests.pages import blocks
 from tests.system.browser import Page
+from tests.system.builds import program, run
 from tests.system.harness import (
     ROOT,
     Bus,
@@ -33,31 +34,6 @@ from tests.system.harness import (
 
 CLIENTS = ROOT / "deploy/clients"
 BRIDGE = "zenoh-bridge-remote-api"
-
-
-@pytest.fixture(scope="module")
-def kept(request: pytest.FixtureRequest) -> Path:
-    """Return a directory for builds that take long."""
-    cache = request.config.cache
-    assert cache is not None
-    return Path(cache.mkdir("languages"))
-
-
-def program(name: str, needed: str) -> str:
-    """Return the path of a tool; skips the test if it is not installed."""
-    found = shutil.which(name)
-    if found is None:
-        pytest.skip(f"no {name} on the PATH: {needed}")
-    return found
-
-
-def run(words: Sequence[str], where: Path, **more: str) -> str:
-    """Run it to the end, which must be successful."""
-    done = subprocess.run(
-        words, cwd=where, env=environment(**more), capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
 
 
 # the examples

@@ -1,5 +1,8 @@
 """ROS 2 drives the robot in the same way over both transports, rmw_zenoh and the bridge.
 
+The bridge is here twice: its Zenoh half, emulated, and the real one with ROS nodes on DDS. The real
+one takes long to build, so its tests have the mark `bridge` instead of `network`.
+
 `test_rmw.py` and `test_ros_bridge.py` test the protocol of each transport.
 """
 
@@ -8,20 +11,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from acsard.core.motion.lifecycle import LOOK_FIRST_S
+from tests.system.builds import BUILD_S
 from tests.system.harness import Bus, Daemon, until
 from tests.system.ros_clients import (
     EMPTY_REQUEST,
     JOINTS,
     ODOMETRY,
+    PARAMETER_SERVICES,
     PUBLISHED,
     QUICK,
-    SERVICES,
+    REQUESTS,
     STAMPED,
     TF,
     TRIGGER,
@@ -31,6 +36,7 @@ from tests.system.ros_clients import (
     BridgeHalf,
     Client,
     RmwClient,
+    ZenohClient,
     behind,
     changes,
     decode,
@@ -45,9 +51,13 @@ from tests.system.ros_clients import (
     unharmed,
 )
 
-pytestmark = pytest.mark.network
+if TYPE_CHECKING:
+    from tests.system.dds import DdsDomain, NewDomain
 
-TRANSPORTS: dict[str, type[Client]] = {"rmw": RmwClient, "bridge": BridgeHalf}
+EMULATED: dict[str, type[ZenohClient]] = {"rmw": RmwClient, "bridge": BridgeHalf}
+
+NETWORK = [pytest.param(name, marks=pytest.mark.network) for name in EMULATED]
+REAL = pytest.param("real bridge", marks=[pytest.mark.bridge, pytest.mark.timeout(BUILD_S)])
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +67,30 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
         yield daemon
 
 
-@pytest.fixture(params=TRANSPORTS)
-def ros(request: pytest.FixtureRequest, bus: Bus) -> Client:
-    return TRANSPORTS[request.param](bus.session)
+@pytest.fixture(scope="module")
+def domain(
+    shared: Daemon, dds: NewDomain, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[DdsDomain]:
+    """A DDS domain with a bridge to `shared`."""
+    with dds(tmp_path_factory.mktemp("dds")) as domain, domain.bridge(shared.endpoint):
+        yield domain
+
+
+@pytest.fixture(params=[*NETWORK, REAL])
+def ros(request: pytest.FixtureRequest, bus: Bus) -> Iterator[Client]:
+    """A ROS node of each kind."""
+    if request.param in EMULATED:
+        yield EMULATED[request.param](bus.session)
+        return
+    domain: DdsDomain = request.getfixturevalue("domain")
+    with domain.node() as node:
+        yield node
+
+
+@pytest.fixture(params=NETWORK)
+def zenoh_ros(request: pytest.FixtureRequest, bus: Bus) -> ZenohClient:
+    """A client that puts any bytes on any key, as no ROS node does."""
+    return EMULATED[request.param](bus.session)
 
 
 @pytest.fixture
@@ -146,17 +177,38 @@ def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: Client) -> 
     settled(bus)
 
 
+GO = twist(0.5)
+
+WRONG = {
+    "NaN": ("cmd_vel", TWIST, twist(float("nan")), "not_finite", "NaN"),
+    "a wheel missing": (
+        "joint_commands", JOINTS, joints(6.0, WHEELS[:3]), "wrong_wheels", "rear_right",
+    ),
+    "a wheel of another robot": (
+        "joint_commands", JOINTS, joints(6.0, [*WHEELS[:3], "wheel_4"]), "wrong_wheels",
+        "rear_right",
+    ),
+}  # fmt: skip
+"""Messages that a node can send: topic, type, payload, counter and a word of the logged reason."""
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_command_is_counted_and_reported_and_moves_nothing(
+    bus: Bus, ros: Client, name: str
+) -> None:
+    topic, kind, payload, reason, said = WRONG[name]
+    ros.zeros(bus)
+    refused_without_motion(bus, lambda: ros.put(topic, kind, payload), reason, said)
+
+
 class Bad(NamedTuple):
-    """A command, the counter of its refusal, and a word of the logged reason."""
+    """Bytes on `cmd_vel`, the counter of their refusal, and a word of the logged reason."""
 
     payload: bytes
     reason: str
     said: str
-    topic: str = "cmd_vel"
     kind: str = TWIST
 
-
-GO = twist(0.5)
 
 BAD = {
     "a twist cut short": Bad(GO[:-1], "malformed", "ends after 51"),
@@ -164,27 +216,16 @@ BAD = {
     "nothing": Bad(b"", "malformed", "header"),
     "JSON": Bad(b'{"linear":{"x":0.5},"angular":{}}', "malformed", "header"),
     "5 kB": Bad(GO + bytes(5000), "too_big", "bytes"),
-    "NaN": Bad(twist(float("nan")), "not_finite", "NaN"),
-    "a wheel missing": Bad(
-        joints(6.0, WHEELS[:3]), "wrong_wheels", "rear_right", "joint_commands", JOINTS
-    ),
-    "a wheel of another robot": Bad(
-        joints(6.0, [*WHEELS[:3], "wheel_4"]),
-        "wrong_wheels",
-        "rear_right",
-        "joint_commands",
-        JOINTS,
-    ),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_command_is_counted_and_reported_and_moves_nothing(
-    bus: Bus, ros: Client, name: str
+def test_damaged_bytes_are_counted_and_reported_and_moves_nothing(
+    bus: Bus, zenoh_ros: ZenohClient, name: str
 ) -> None:
     bad = BAD[name]
-    ros.zeros(bus)
-    send: Callable[[], None] = lambda: ros.put(bad.topic, bad.kind, bad.payload)  # noqa: E731
+    zenoh_ros.zeros(bus)
+    send: Callable[[], None] = lambda: zenoh_ros.put("cmd_vel", bad.kind, bad.payload)  # noqa: E731
     refused_without_motion(bus, send, bad.reason, bad.said)
 
 
@@ -192,12 +233,12 @@ def test_a_bad_command_is_counted_and_reported_and_moves_nothing(
     ("topic", "kind"), [("cmd_vel", TWIST), ("cmd_vel_teleop", TWIST), ("joint_commands", JOINTS)]
 )
 def test_a_delete_is_counted_and_reported_and_moves_nothing(
-    bus: Bus, ros: Client, topic: str, kind: str
+    bus: Bus, zenoh_ros: ZenohClient, topic: str, kind: str
 ) -> None:
-    ros.zeros(bus)
-    key, attachment = ros.key(topic, kind), ros.attachment()
+    zenoh_ros.zeros(bus)
+    key, attachment = zenoh_ros.key(topic, kind), zenoh_ros.attachment()
     refused_without_motion(
-        bus, lambda: ros.session.delete(key, attachment=attachment), "not_a_put", "DELETE"
+        bus, lambda: zenoh_ros.session.delete(key, attachment=attachment), "not_a_put", "DELETE"
     )
 
 
@@ -207,13 +248,13 @@ WILDCARDS = {
 }
 
 
-def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: Client) -> None:
-    for key in WILDCARDS[type(ros)]:
-        ros.zeros(bus)
+def test_a_command_by_wildcard_drives_nothing(bus: Bus, zenoh_ros: ZenohClient) -> None:
+    for key in WILDCARDS[type(zenoh_ros)]:
+        zenoh_ros.zeros(bus)
         before = bus.state()
-        bus.session.put(key, GO, attachment=ros.attachment())
-        bus.session.delete(key, attachment=ros.attachment())
-        behind(bus, lambda: ros.put("cmd_vel", TWIST, b""), "malformed")
+        bus.session.put(key, GO, attachment=zenoh_ros.attachment())
+        bus.session.delete(key, attachment=zenoh_ros.attachment())
+        behind(bus, lambda: zenoh_ros.put("cmd_vel", TWIST, b""), "malformed")
         after = bus.state()
         # Either the access rules keep it out, or the daemon's code refuses it.
         mine = {"command_malformed", "command_wildcard", "command_no_attachment"}
@@ -226,15 +267,16 @@ def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: Client) -> None:
 # services
 
 EMPTY = (b"\0\1\0\0", EMPTY_REQUEST, b"\0\1\0\0\0\0\0\0")
-"""The forms of an empty request."""
+"""The forms of an empty request. Cyclone DDS for Python knows only the second one."""
 
 
 @pytest.mark.parametrize("verb", TRIGGERS)
 def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
     bus: Bus, ros: Client, verb: str
 ) -> None:
+    forms = EMPTY if isinstance(ros, ZenohClient) else (EMPTY_REQUEST,)
     # A Trigger has no latch number, so `clear` only works 2 s after a stop.
-    for request in EMPTY[:1] if verb == "clear" else EMPTY:
+    for request in forms[:1] if verb == "clear" else forms:
         if verb == "clear":
             bus.get("srv/stop")
             stopped = time.monotonic()
@@ -247,17 +289,44 @@ def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
         assert called.seconds < 1.0
 
 
+def asked(ros: Client, service: str, **request: Any) -> Any:
+    """Return the reply of a service of the parameters."""
+    kind = PARAMETER_SERVICES[service]
+    question, answer = REQUESTS[kind]
+    called = ros.call(f"acsard/{service}", kind, encode(make(question, **request)))
+    assert (len(called.replies), called.errors) == (1, 0), called
+    return decode(answer, called.replies[0].payload)
+
+
+def test_the_parameters_are_listed_described_and_read(bus: Bus, ros: Client) -> None:
+    names = asked(ros, "list_parameters", prefixes=[], depth=0).result.names
+    assert len(names) > 100
+    assert "limits.linear_speed" in names
+    described = asked(ros, "describe_parameters", names=names).descriptors
+    types = asked(ros, "get_parameter_types", names=names).types
+    values = asked(ros, "get_parameters", names=names).values
+    assert [one.name for one in described] == names
+    assert [one.type for one in described] == list(types) == [one.type for one in values]
+    (limit,) = (one for one in described if one.name == "limits.linear_speed")
+    assert (limit.floating_point_range[0].from_value, limit.read_only) == (0.0, False)
+    value = values[names.index("limits.linear_speed")].double_value
+    assert value == bus.get("config")["limits"]["linear_speed"]
+    atomically = asked(ros, "set_parameters_atomically", parameters=[_limit(value)]).result
+    assert atomically.successful, atomically.reason
+
+
+def _limit(value: float) -> Any:
+    """Return the parameter that limits the robot's speed."""
+    none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "string_value": ""}
+    lists = ("byte_array", "bool_array", "integer_array", "double_array", "string_array")
+    none |= {f"{kind}_value": np.array([]) for kind in lists}
+    double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
+    return make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
+
+
 def test_a_parameter_is_set_as_by_anybody(bus: Bus, ros: Client) -> None:
     def ask(value: float) -> Any:
-        none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "string_value": ""}
-        lists = ("byte_array", "bool_array", "integer_array", "double_array", "string_array")
-        none |= {f"{kind}_value": np.array([]) for kind in lists}
-        double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
-        wish = make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
-        request = encode(make("rcl_interfaces/msg/SetRequest", parameters=[wish]))
-        name = "acsard/set_parameters"
-        (reply,) = ros.call(name, SERVICES[name], request).replies
-        return decode("rcl_interfaces/msg/SetReply", reply.payload).results[0]
+        return asked(ros, "set_parameters", parameters=[_limit(value)]).results[0]
 
     before = bus.get("config")["limits"]["linear_speed"]
     try:
@@ -276,16 +345,18 @@ QUERIES = {
 }
 
 
-def test_a_query_on_all_keys_stops_nothing(bus: Bus, ros: Client) -> None:
+def test_a_query_on_all_keys_stops_nothing(bus: Bus, zenoh_ros: ZenohClient) -> None:
     before = bus.state()
-    for key in QUERIES[type(ros)]:
-        for _ in bus.session.get(key, payload=EMPTY_REQUEST, attachment=ros.attachment()):
+    for key in QUERIES[type(zenoh_ros)]:
+        for _ in bus.session.get(key, payload=EMPTY_REQUEST, attachment=zenoh_ros.attachment()):
             pass
     after = bus.state()
     assert after["mode"] != "stopped"
     assert changes(before, after) == {}
 
 
+@pytest.mark.bridge
+@pytest.mark.network
 def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
     unharmed(shared)
     bus.at_rest()

@@ -1,8 +1,10 @@
-"""ROS 2 by zenoh-bridge-ros2dds: an emulation of its Zenoh half, and the real one if installed."""
+"""What a zenoh-bridge-ros2dds may put, call and read in Zenoh, to the byte, by an emulated one.
+
+`test_ros_dds.py` has the real one.
+"""
 
 from __future__ import annotations
 
-import shutil
 import struct
 import time
 from collections.abc import Iterator
@@ -10,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.harness import Bus, Daemon, Program, until
+from tests.system.harness import Bus, Daemon, until
 from tests.system.ros_clients import (
-    DDS,
     HASHES,
     JOINTS,
     ODOMETRY,
@@ -20,9 +21,7 @@ from tests.system.ros_clients import (
     QUICK,
     SERVICES,
     TWIST,
-    Bridge,
     BridgeHalf,
-    Relay,
     RmwClient,
     changes,
     decode,
@@ -33,7 +32,6 @@ from tests.system.ros_clients import (
     twist,
     unharmed,
 )
-from tests.system.strangers import words
 
 pytestmark = pytest.mark.network
 
@@ -190,64 +188,3 @@ def test_a_tree_that_is_switched_off_does_not_exist(tmp_path: Path) -> None:
             assert (rmw, bridge) == ([], [])
         after = bus.state()
         assert (after["mode"], changes(before, after)) == ("ready", {})
-
-
-# the real bridge
-
-
-@pytest.fixture(scope="module")
-def bridge_program() -> str:
-    found = shutil.which("zenoh-bridge-ros2dds")
-    if found is None:
-        pytest.skip("zenoh-bridge-ros2dds is not on PATH")
-    return found
-
-
-ANNOUNCED = {"ros": {"announce": True, "cmd_vel_type": "twist"}}
-
-
-def test_the_real_bridge_carries_odometry_commands_transforms_and_services(
-    tmp_path: Path, bridge_program: str
-) -> None:
-    pytest.importorskip("cyclonedds", reason="no Cyclone DDS for Python")
-    with (
-        Daemon(tmp_path) as daemon,
-        Bus(daemon.endpoint) as bus,
-        Bridge(bridge_program, tmp_path, daemon.endpoint) as bridge,
-    ):
-        program = words(DDS, bridge.domain)
-        with Program(program, tmp_path, bridge.environment, stdin=-1) as dds:
-            assert dds.says("odometry").split()[1:3] == ["odom", "base_link"]
-            assert float(dds.says("drove").split()[1]) > 0.2
-            static = dds.says("static").split()
-            assert static[2:] == ["lidar_link"]
-            assert float(static[1]) < 4.0
-            assert dds.says("called stop").split()[2] == "True"
-            assert dds.says("called clear").split()[2] == "True"
-        assert bus.state()["mode"] == "ready"
-        assert [key for key in bus.state()["counters"] if key.startswith("command_")] == []
-
-
-def test_the_real_bridge_makes_routes_of_what_is_announced_and_takes_nothing_unasked(
-    tmp_path: Path, bridge_program: str
-) -> None:
-    with (
-        Daemon(tmp_path, config=ANNOUNCED) as daemon,
-        Bus(daemon.endpoint) as bus,
-        Relay(daemon.endpoint) as relay,
-        Bridge(bridge_program, tmp_path, relay.endpoint) as bridge,
-    ):
-        for name in PUBLISHED:
-            bridge.logs(f"Route Subscriber (Zenoh:{name} -> ROS:/{name}) created")
-        for name in ("cmd_vel", "cmd_vel_teleop", "joint_commands"):
-            bridge.logs(f"Route Publisher (ROS:/{name} -> Zenoh:{name}) created")
-        for name in SERVICES:
-            bridge.logs("Route Service Client", f"Zenoh:{name}) created")
-        bus.linked()
-        quiet = relay.came
-        sent = bus.count("lines_sent")
-        until(lambda: bus.count("lines_sent") >= sent + 50, 5.0, "50 periods")
-        came = relay.came - quiet
-        print(f"announced and unheard: {came} bytes in 50 periods")
-        assert came < 2000
-        assert not [line for line in bridge.log if "WARN" in line or "ERROR" in line]

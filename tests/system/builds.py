@@ -1,0 +1,55 @@
+"""Programs that the tests build with the tools of other languages, and keep in pytest's cache."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.system.harness import ROOT, environment
+
+BUILD_S = 3600
+"""Time limit of a test that may have to build a bridge first."""
+
+LIBCLANG = "no libclang: it builds the bridge's bindings (Debian: apt install libclang-dev)"
+
+
+def program(name: str, needed: str) -> str:
+    """Return the path of a tool; skips the test if it is not installed."""
+    found = shutil.which(name)
+    if found is None:
+        pytest.skip(f"no {name} on the PATH: {needed}")
+    return found
+
+
+def finished(words: Sequence[str], where: Path, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run it to the end. `more` are variables of its environment."""
+    return subprocess.run(
+        words, cwd=where, env=environment(**more), capture_output=True, text=True, check=False
+    )
+
+
+def run(words: Sequence[str], where: Path, **more: str) -> str:
+    """Run it to the end, which must be successful, and return its output."""
+    done = finished(words, where, **more)
+    assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def ros2dds_bridge(kept: Path) -> str:
+    """Return the installed zenoh-bridge-ros2dds, or build the program in `tests/ros2dds`."""
+    if (found := shutil.which("zenoh-bridge-ros2dds")) is not None:
+        return found
+    cargo = program("cargo", "it builds the bridge in tests/ros2dds")
+    for tool in ("cmake", "c++"):
+        program(tool, "it builds the Cyclone DDS of the bridge")
+    target = kept / "ros2dds"
+    words = [cargo, "build", "--quiet", "--locked"]
+    done = finished(words, ROOT / "tests/ros2dds", CARGO_TARGET_DIR=str(target))
+    if done.returncode != 0 and "Unable to find libclang" in done.stderr:
+        pytest.skip(LIBCLANG)
+    assert done.returncode == 0, done.stderr
+    return str(target / "debug/ros2dds")

@@ -1,0 +1,379 @@
+"""The real zenoh-bridge-ros2dds joins ROS nodes on DDS to robots, with the file of deploy/ros2.
+
+`pytest -m bridge` runs these tests, and those of `test_ros.py` that need the same bridge. The first
+run builds it.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import pytest
+
+from tests.system import rclpy_stand_in
+from tests.system.builds import BUILD_S
+from tests.system.harness import ROOT, Bus, Daemon, Program, Tables, free_endpoint, until
+from tests.system.ros_clients import (
+    BRIDGE_FILE,
+    ODOMETRY,
+    PUBLISHED,
+    QUICK,
+    ROUTE_S,
+    SERVICES,
+    STAMPED,
+    TF,
+    TWIST,
+    Relay,
+    Samples,
+    changes,
+    decode,
+    encode,
+    make,
+    refused_without_motion,
+    released,
+    stamped,
+    twist,
+    unharmed,
+)
+from tests.system.strangers import ROUTER, words
+from tests.system.test_ros_drive import LINE
+
+if TYPE_CHECKING:
+    from tests.system.dds import DdsDomain, DdsNode, NewDomain
+
+pytestmark = [pytest.mark.bridge, pytest.mark.timeout(BUILD_S)]
+
+
+@pytest.fixture(scope="module")
+def domain(
+    shared: Daemon, dds: NewDomain, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[DdsDomain]:
+    """A DDS domain with a bridge to `shared`."""
+    with dds(tmp_path_factory.mktemp("dds")) as domain, domain.bridge(shared.endpoint):
+        yield domain
+
+
+@pytest.fixture
+def driven(bus: Bus) -> Iterator[Bus]:
+    """`bus`, whose robot stands afterwards."""
+    yield bus
+    bus.at_rest()
+
+
+def test_a_bridge_that_starts_before_the_robot_joins_it_and_joins_it_again(
+    tmp_path: Path, dds: NewDomain
+) -> None:
+    endpoint = free_endpoint()
+    with (
+        dds(tmp_path) as domain,
+        domain.bridge(endpoint),
+        domain.node() as node,
+        node.follow("odom", ODOMETRY) as odometry,
+        node.follow_late("tf_static", TF) as static,
+    ):
+        for name in ("first", "second"):
+            begun = time.monotonic()
+            with Daemon(tmp_path, endpoint=endpoint, name=name):
+                for samples in (odometry, static):
+                    samples.first(f"of the {name}", lambda s: s.at > begun, 15.0)  # noqa: B023
+                called = node.call("acsard/stop")
+                # The bridge 1.10 may deliver a call twice after that, and then both are answered.
+                assert called._replace(replies=called.replies[:1]).trigger()[0]
+
+
+def test_what_is_announced_has_routes_and_nothing_is_sent_unasked(
+    tmp_path: Path, dds: NewDomain
+) -> None:
+    announced = {"ros": {"announce": True, "cmd_vel_type": "twist"}}
+    with (
+        Daemon(tmp_path, config=announced) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Relay(daemon.endpoint) as relay,
+        dds(tmp_path) as domain,
+        domain.bridge(relay.endpoint) as bridge,
+    ):
+        for name in PUBLISHED:
+            bridge.logs(f"Route Subscriber (Zenoh:{name} -> ROS:/{name}) created")
+        for name in ("cmd_vel", "cmd_vel_teleop", "joint_commands"):
+            bridge.logs(f"Route Publisher (ROS:/{name} -> Zenoh:{name}) created")
+        for name in SERVICES:
+            bridge.logs("Route Service Client", f"Zenoh:{name}) created")
+        bus.linked()
+        quiet = relay.came
+        sent = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") >= sent + 50, 5.0, "50 periods")
+        came = relay.came - quiet
+        print(f"announced and unheard: {came} bytes in 50 periods")
+        assert came < 2000
+        assert not [line for line in bridge.log if "WARN" in line or "ERROR" in line]
+
+
+def test_a_command_has_the_time_at_which_the_bridge_sent_it(driven: Bus, domain: DdsDomain) -> None:
+    samples = Samples()
+    subscribers = [driven.session.declare_subscriber(key, samples.add) for key in ("cmd_vel", "tf")]
+    with domain.node() as node:
+        node.heard(driven, "cmd_vel", TWIST, twist(0.0))
+        command = samples.first("a command", lambda s: s.key == "cmd_vel")
+    of_daemon = samples.first("a transform", lambda s: s.key == "tf").origin
+    for subscriber in subscribers:
+        subscriber.undeclare()
+    assert (command.payload, command.attachment) == (twist(0.0), b"")
+    assert of_daemon in map(str, driven.session.info.peers_zid())
+    assert command.origin not in ("", of_daemon)
+
+
+# two publishers
+
+
+@contextmanager
+def sending(first: DdsNode, speed: float, second: DdsNode, its_speed: float) -> Iterator[None]:
+    """Send both speeds 20 times a second while entered, the second one 10 ms after the first."""
+    ended = threading.Event()
+
+    def send() -> None:
+        while not ended.is_set():
+            first.put("cmd_vel", TWIST, twist(speed))
+            ended.wait(0.01)
+            second.put("cmd_vel", TWIST, twist(its_speed))
+            ended.wait(0.04)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def speeds(bus: Bus) -> list[float]:
+    """Return the robot's speeds in a second that begins in a second."""
+    with bus.follow("state") as states:
+        sent = bus.count("lines_sent")
+        until(lambda: bus.count("lines_sent") >= sent + 200, 10.0, "200 periods")
+        last = states.seen[-1].at
+        return [seen.value["linear"] for seen in states.seen if seen.at > last - 1.0]
+
+
+def test_two_publishers_are_one_sender_and_the_robot_follows_the_newest_message(
+    driven: Bus, domain: DdsDomain
+) -> None:
+    with domain.node(name="nav") as nav, domain.node(name="other") as other:
+        with sending(nav, 0.0, other, 0.0):
+            until(lambda: driven.state()["source"] == "nav", 5.0, "zeros are followed")
+            speeds(driven)
+        with sending(nav, 0.4, other, 0.1):
+            slow = speeds(driven)
+        with sending(other, 0.1, nav, 0.4):
+            fast = speeds(driven)
+        with sending(other, 0.0, nav, 0.4):
+            not_held = speeds(driven)
+        with sending(nav, 0.4, other, 0.0):
+            held = speeds(driven)
+        refused = [key for key in driven.state()["counters"] if key.startswith("command_")]
+    for name, got in {"slow": slow, "fast": fast, "not held": not_held, "held": held}.items():
+        print(f"{name}: {min(got):.3f} to {max(got):.3f} m/s")
+    assert 0.05 < min(slow) <= max(slow) < 0.2
+    # The zeros of one publisher do not hold the robot if the other one's messages come last.
+    assert min(*fast, *not_held) > 0.3
+    assert max(held) < 0.05
+    assert refused == []
+
+
+def test_an_idle_publisher_of_the_other_type_shuts_twist_out_until_both_have_ended(
+    driven: Bus, domain: DdsDomain
+) -> None:
+    def ignored(node: DdsNode) -> None:
+        before, sent = driven.state(), driven.count("lines_sent")
+
+        def two_seconds() -> bool:
+            publisher.write(publisher.data_type.deserialize(twist(0.3)))
+            return driven.count("lines_sent") >= sent + 200
+
+        until(two_seconds, 10.0, "200 periods")
+        assert changes(before, driven.state()) == {}
+
+    with domain.node(name="driver") as driver:
+        with domain.node(name="idle") as idle:
+            route = idle.publisher("cmd_vel", STAMPED).get_matched_subscriptions
+            until(route, ROUTE_S, "the idle one has the route")
+            publisher = driver.publisher("cmd_vel", TWIST)
+            ignored(driver)
+            idle.heard(driven, "cmd_vel", STAMPED, lambda: stamped(0.0))
+        ignored(driver)
+    with (
+        domain.node(name="driver") as driver,
+        driven.follow("state") as states,
+        driver.driving(driven, "cmd_vel", TWIST, 0.3),
+    ):
+        states.find(lambda s: (s["linear"] or 0.0) > 0.1, 5.0, "it drives")
+
+
+def test_a_publisher_of_a_type_that_is_no_command_moves_nothing(
+    driven: Bus, domain: DdsDomain
+) -> None:
+    with domain.node() as node:
+        node.heard(driven, "cmd_vel", TWIST, twist(0.0))
+    with domain.node() as node:
+        text = encode(make("std_msgs/msg/String", data="forward"))
+        send = lambda: node.put("cmd_vel", "std_msgs/msg/String", text)  # noqa: E731
+        refused_without_motion(driven, send, "malformed", "")
+
+
+# two robots
+
+
+class Robot(NamedTuple):
+    """A robot of the fleet, and a node on the side of ROS that reaches it."""
+
+    daemon: Daemon
+    bus: Bus
+    node: DdsNode
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, Daemon]]]:
+    """The address of a router, and two robots that meet there, by name."""
+    where = tmp_path_factory.mktemp("robots")
+    meeting = free_endpoint()
+
+    def robot(name: str, mode: str) -> Daemon:
+        config: Tables = {
+            "robot": {"id": name},
+            "bus": {"connect": [meeting], "mode": mode},
+            "ros": {"namespace": name},
+            **QUICK,
+        }
+        return Daemon(where, config=config, name=name, ready=False)
+
+    with Program(words(ROUTER, meeting), where) as router:
+        router.says("routing")
+        with robot("robot1", "peer") as first, robot("robot2", "client") as second:
+            for daemon in (first, second):
+                daemon.says("bus ")
+            yield meeting, {"robot1": first, "robot2": second}
+
+
+def one_domain_each(
+    stack: ExitStack, dds: NewDomain, where: Path, meeting: str
+) -> dict[str, DdsNode]:
+    """Start a bridge for each robot: in its own domain its names are the plain ones."""
+    nodes = {}
+    for name in ("robot1", "robot2"):
+        domain = stack.enter_context(dds(where))
+        stack.enter_context(domain.bridge(meeting, "-n", f"/{name}"))
+        nodes[name] = stack.enter_context(domain.node())
+    return nodes
+
+
+def one_domain_for_both(
+    stack: ExitStack, dds: NewDomain, where: Path, meeting: str
+) -> dict[str, DdsNode]:
+    """Start one bridge, which shows the names of both robots with their namespaces."""
+    file = where / "both.json5"
+    # `allow` with an expression for both robots, as the page says.
+    file.write_text(re.sub(r'"/(\w+)', r'"/robot[12]/\1', BRIDGE_FILE.read_text()))
+    domain = stack.enter_context(dds(where))
+    stack.enter_context(domain.bridge(meeting, file=file))
+    return {name: stack.enter_context(domain.node(name)) for name in ("robot1", "robot2")}
+
+
+WAYS = {"a domain each": one_domain_each, "one domain": one_domain_for_both}
+
+
+@pytest.fixture(scope="module", params=WAYS)
+def fleet(
+    request: pytest.FixtureRequest,
+    robots: tuple[str, dict[str, Daemon]],
+    dds: NewDomain,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[Robot, Robot]]:
+    meeting, daemons = robots
+    with ExitStack() as stack:
+        nodes = WAYS[request.param](stack, dds, tmp_path_factory.mktemp("fleet"), meeting)
+        found = []
+        for name, daemon in daemons.items():
+            bus = stack.enter_context(Bus(meeting, name))
+            until(lambda: bus.ask("info"), 5.0, f"{name} over the router")  # noqa: B023
+            bus.linked()
+            found.append(Robot(daemon, bus, nodes[name]))
+        one, two = found
+        yield one, two
+
+
+def test_a_command_to_one_robot_drives_only_that_one(fleet: tuple[Robot, Robot]) -> None:
+    driven, other = fleet
+    before = other.bus.at_rest()
+    with (
+        driven.node.follow("odom", ODOMETRY) as moving,
+        other.node.follow("odom", ODOMETRY) as standing,
+        driven.node.driving(driven.bus, "cmd_vel", TWIST, 0.3),
+    ):
+        moving.first("motion", lambda s: decode(ODOMETRY, s.payload).twist.twist.linear.x > 0.2)
+        standing.first("odometry of the other")
+        assert {decode(ODOMETRY, s.payload).twist.twist.linear.x for s in standing.seen} == {0.0}
+    after = other.bus.state()
+    assert changes(before, after) == {}
+    for key in ("x", "mode", "wheels"):
+        assert after[key] == before[key], key
+    driven.bus.at_rest()
+
+
+def test_a_stop_of_one_robot_stops_only_that_one(fleet: tuple[Robot, Robot]) -> None:
+    one, two = fleet
+    assert one.node.call("acsard/stop").trigger()[0]
+    assert (one.bus.state()["mode"], two.bus.state()["mode"]) == ("stopped", "ready")
+    released(one.node)
+
+
+def test_each_robot_has_all_its_topics_and_its_own_static_transforms(
+    fleet: tuple[Robot, Robot],
+) -> None:
+    for robot in fleet:
+        for name, (kind, _, late) in PUBLISHED.items():
+            follow = robot.node.follow_late if late else robot.node.follow
+            with follow(name, kind) as samples:
+                decode(kind, samples.first(name).payload)
+
+
+def test_nothing_of_that_was_an_exception(fleet: tuple[Robot, Robot]) -> None:
+    for robot in fleet:
+        unharmed(robot.daemon)
+
+
+# the first drive
+
+
+@pytest.mark.parametrize("number", [None, signal.SIGINT], ids=["to its end", "Ctrl-C"])
+def test_the_line_of_the_pages_drives(
+    tmp_path: Path, dds: NewDomain, number: signal.Signals | None
+) -> None:
+    rclpy_stand_in.write(tmp_path)
+    line = [sys.executable, *shlex.split(LINE)[1:]]
+    with (
+        Daemon(tmp_path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        dds(tmp_path) as domain,
+        domain.bridge(daemon.endpoint),
+    ):
+        bus.linked()
+        given = {"WAY": "dds", "DOMAIN": str(domain.number)}
+        paths = {"PYTHONPATH": f"{tmp_path}:{domain.environment['PYTHONPATH']}"}
+        with Program(line, ROOT, domain.environment | given | paths) as drive:
+            if number is not None:
+                until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 20.0, "it drives")
+                drive.signal(number)
+            assert drive.ended(30.0) == (0 if number is None else 128 + number), drive
+            assert "Traceback" not in drive.stderr, drive.stderr
+        until(lambda: bus.state()["linear"] == 0.0, 3.0, "it stands")
+        if number is None:
+            assert 0.4 < bus.state()["x"] < 0.7
