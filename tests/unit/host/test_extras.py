@@ -61,6 +61,6 @@ def test_all_has_every_convenience_and_the_tests_have_them_too() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = {name: set(wanted) for name, wanted in project["optional-dependencies"].items()}
     each = [extras[name] for name in get_args(Extra)]
-    assert set(extras) == {*get_args(Extra), "all", "test"}
+    assert set(extras) == {*get_args(Extra), "all", "test", "dds"}
     assert set.union(*each) == extras["all"]
     assert extras["all"] <= extras["test"]
