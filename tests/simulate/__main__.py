@@ -1,4 +1,4 @@
-"""Lets the machine look for what nobody thought of: random plans against the whole daemon.
+"""Play random plans against the whole daemon, and print a line for each broken promise.
 
 `tests/README.md` says how to use it.
 """
@@ -26,7 +26,7 @@ LARGEST = ("largest container", "largest text")
 """Counts of which the table has the largest value of all runs, and not the sum."""
 
 MOST_SHRUNK = 3
-"""Findings whose plans a run shrinks. To shrink one plan takes up to 400 runs of it."""
+"""Number of findings whose plans a run shrinks. To shrink one plan takes up to 400 runs of it."""
 
 
 def commit() -> str:
@@ -39,7 +39,7 @@ def commit() -> str:
 
 
 def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterator[Result]:
-    """Play this seed and those behind it until so much time is simulated or has passed."""
+    """Play this seed and the following ones, for simulated `seconds` or for real `within_s`."""
     end = time.monotonic() + within_s
     with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
         running = {pool.submit(_play, seed + n) for n in range(workers)}
@@ -65,7 +65,7 @@ def show(result: Result) -> None:
 
 
 def table(counts: Counter[str]) -> str:
-    """Return what was covered, a line for each group of counts."""
+    """Return the counts of all that was played and judged, a line for each group."""
     groups: dict[str, list[str]] = {}
     for name, count in sorted(counts.items()):
         group, _, rest = name.partition(" ")
@@ -76,7 +76,7 @@ def table(counts: Counter[str]) -> str:
 def explore(
     seed: int, hours: float, workers: int, within_s: float = math.inf, plans: Path | None = None
 ) -> int:
-    """Play seeds for so many simulated hours; return the number of findings.
+    """Play seeds for this number of simulated hours; return the number of findings.
 
     The plan of each finding goes into the directory `plans`.
     """
@@ -108,11 +108,17 @@ def explore(
 
 
 def keep_plans(broken: list[Result], where: Path) -> None:
-    """Write the plan of each finding into a directory: the first ones shrunk, the others whole."""
-    for number, result in enumerate(broken):
-        plan = made(result.seed)
-        small = shrink.shrunk(plan, result) if number < MOST_SHRUNK else plan
-        print(shrink.kept(small, result, commit(), where / f"{result.seed}.json"), flush=True)
+    """Write the plan of each finding into a directory, and then the first ones once more, shrunk.
+
+    To shrink them may take an hour, in which a job may be ended.
+    """
+    found_by = commit()
+    for result in broken:
+        path = where / f"{result.seed}.json"
+        print(shrink.kept(made(result.seed), result, found_by, path), flush=True)
+    for result in broken[:MOST_SHRUNK]:
+        small = shrink.shrunk(made(result.seed), result)
+        shrink.kept(small, result, found_by, where / f"{result.seed}.json")
 
 
 def replay(what: str) -> int:
@@ -125,7 +131,7 @@ def replay(what: str) -> int:
 
 
 def reduce(seed: int, keep: str) -> int:
-    """Shrink the plan of a seed that breaks a promise, and print or keep what is left."""
+    """Shrink the plan of a seed that breaks a promise, and print or keep the result."""
     plan = made(seed)
     result = played(plan)
     if not result.finding:
@@ -148,13 +154,13 @@ def main() -> int:
     parser.add_argument(
         "--within", type=float, default=math.inf, metavar="MINUTES", help="real time for new seeds"
     )
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--replay", metavar="SEED", help="play one seed, or a plan's file, again")
-    parser.add_argument("--shrink", metavar="SEED", type=int, help="drop what a finding can spare")
-    parser.add_argument("--keep", metavar="NAME", default="", help="with --shrink: into corpus/")
     parser.add_argument(
-        "--plans", metavar="DIR", type=Path, help="keep the plan of each finding, shrunk"
+        "--workers", type=int, default=os.cpu_count() or 1, help="processes; one for each core"
     )
+    parser.add_argument("--replay", metavar="SEED", help="play one seed, or a plan's file, again")
+    parser.add_argument("--shrink", metavar="SEED", type=int, help="find the smallest plan")
+    parser.add_argument("--keep", metavar="NAME", default="", help="with --shrink: into corpus/")
+    parser.add_argument("--plans", metavar="DIR", type=Path, help="keep the plan of each finding")
     parser.add_argument("--against", metavar="TREE", help="compare with another checkout")
     parser.add_argument(
         "--adapter",

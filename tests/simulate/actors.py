@@ -34,7 +34,7 @@ from tests.simulate.roads import NS, Message, messages, parameters, read_reply, 
 from tests.simulate.spread import Spread
 
 RELEASING = {"clear", "activate", "deactivate", "set"}
-"""Calls that change what the robot may do, from when on is not known until the answer. A `stop`
+"""Calls after which the robot may do more or less. Only the answer shows from when on. A `stop`
 counts from its arrival on."""
 
 PLACING = {"set_pose", "reset_odometry"}
@@ -106,7 +106,7 @@ class Run:
         self._names: set[str] = set()
         """Names of the active faults."""
         self._troubling: list[str] = []
-        """Names of those that came in this plan and are no dialect."""
+        """Names of the active faults that the plan has begun, without dialects."""
         self._fed_ns = 0
         self._ended = b""
         """The last byte of the board that reached the daemon."""
@@ -387,7 +387,7 @@ class Run:
                     self._restart(event, after_ns)
 
     def _look(self) -> None:
-        """Judge what `state` says, unless the daemon has just slept or stood still."""
+        """Judge the speeds and the pose in `state`, unless the host has just slept or stalled."""
         product, since_ns = self.product, self.true_ns - NS // 10
         # An echo of zeros looks like a board at rest.
         if self.echo.on or not product.alive:
@@ -506,7 +506,7 @@ class Run:
 
         self.at(after_ns + 1000, start)
 
-    # what the product shows
+    # steps and bytes of the product
 
     def _fed(self, at_ns: int, data: bytes) -> None:
         before, self._ended = self._ended, data[-1:]
@@ -591,7 +591,7 @@ class Run:
         self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.linked = seen.link == "up"
-        # A line without the check that the configuration requires is no link.
+        # Lines without the check that the configuration requires make no link.
         self._linked |= witness.linked
         witness.cut |= not witness.linked
         self._whole = bool(seen.lines) and seen.lines[-1][1].endswith(b"\n")

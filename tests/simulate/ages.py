@@ -1,4 +1,4 @@
-"""What is known of each sender: its zeros, and how old a command may be by the true clock.
+"""The zeros of each sender, and how old its commands may be by the true clock.
 
 The robot cannot see a true age, because it compares delays by two clocks. This module allows what
 `deploy/clients/README.md` promises and no more. A command is fresh if its true age exceeds the
@@ -24,11 +24,11 @@ BURST_NS = 1_000_000
 """Messages within this time count as one, with the lowest of their delays."""
 
 REMEMBERED = 1000
-"""The robot remembers 1024 clocks. A sender that pauses while so many new names command is new."""
+"""Number of new names after which a sender that paused is new. The robot remembers 1024 clocks."""
 
 
 class Wish:
-    """A command that arrived, and what the omniscient view thinks of it."""
+    """A command that arrived, as the omniscient view judges it."""
 
     __slots__ = ("armed_ns", "arrived_ns", "certain", "fresh", "identity", "shared", "v", "w")
 

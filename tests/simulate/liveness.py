@@ -40,7 +40,7 @@ PAUSE_NS = 3 * NS // 20
 
 
 class Liveness:
-    """Watches one run for what ought to happen."""
+    """Judges that a lawful sender drives, and counts and memory at the end of a plan."""
 
     def __init__(self, run: Run) -> None:
         self.run = run

@@ -1,4 +1,4 @@
-"""The promises about the lines of the log: what is logged, and that nothing floods the log.
+"""The promises about the log: it has each change of the mode, and nothing floods it.
 
 `deploy/systemd/README.md` has them. Times are in ns of the robot's monotonic clock.
 """
@@ -33,7 +33,7 @@ class LogLines:
         """Judge the lines of one step."""
         now_ns = seen.decided_ns
         if seen.mode != self._mode:
-            # The first mode of a daemon is no change.
+            # A daemon that starts does not log its first mode as a change.
             self._awaited = f"-> {seen.mode}" if self._mode else ""
             self._mode, self._since_ns = seen.mode, now_ns
         for name, level, text in seen.events:

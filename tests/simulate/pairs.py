@@ -1,4 +1,4 @@
-"""Plays the same plans on two checkouts and compares all that comes out, bit by bit.
+"""Plays the same plans on two checkouts and compares their steps bit by bit.
 
 Each side is a process of its own with its own `acsard`. The other side brings its own virtual
 world and its own `product.py` where it has them, since both follow the layout of the product. A
@@ -46,7 +46,7 @@ if product.exists():
 from tests.simulate.pairs import serve
 serve(Path(acsard.__file__))
 """
-"""What the process of one side runs. `tree` is a checkout or where a wheel was installed."""
+"""Program of the process of one side. `tree` is a checkout, or the directory of a wheel."""
 
 Step = dict[str, Any]
 
@@ -196,7 +196,7 @@ def compare(
     adapter: Path | None = None,
     show: Callable[[str], None] = print,
 ) -> int:
-    """Compare this checkout with another one for so many s; return 1 if they differ."""
+    """Compare this checkout with another one for `seconds`; return 1 if they differ."""
     began, differing, runs, total = time.perf_counter(), 0, 0, 0.0
     pairs = [Pair(OURS, tree, adapter) for _ in range(max(1, workers // 2))]
     try:

@@ -282,7 +282,7 @@ def _phases(dice: random.Random, seconds: float, lawful: bool) -> list[list[Any]
 def _tried_again(
     dice: random.Random, phases: list[list[Any]], congestion: list[list[Any]]
 ) -> list[list[Any]]:
-    """Return the phases of a person who lets go and tries again when the robot does not follow."""
+    """Return the phases of an operator who releases the stick and tries again."""
     if all(speed != 0.0 for _, speed, _ in phases):
         return phases
     for begin, end, _, _ in congestion:
@@ -341,7 +341,7 @@ def _sender(
         if dice.random() < 0.1 and not shared:
             sender["hz"] = 400.0
         elif sender["churn"]:
-            sender["hz"] = 100.0  # enough names to fill a table that has no bound
+            sender["hz"] = 100.0  # enough names to fill a table without a bound
     if "congestion" in kinds:
         # A sender whose first messages wait is new to the daemon when they pour in.
         first = max(begin, sender["phases"][0][0])
@@ -398,7 +398,7 @@ def _events(
     changes, drives = [phase[0] for phase in phases], [phase[0] for phase in phases if phase[1]]
 
     def moment() -> float:
-        """Return a bad moment: half of them lie just behind what a sender or an event begins."""
+        """Return a time. Half of them lie just behind a change of a sender or another event."""
         chance = dice.random()
         if chance < 0.3 and changes:
             at = dice.choice(changes) + dice.choice((0.3, 3.0)) * dice.random()
@@ -588,7 +588,7 @@ def _events(
         typed = dice.choice((1, 1, 2, 3, 0))
         call(at, dice.choice(("clear", "clear", "activate")), named=True, typed=typed)
     if not config["control"].get("auto_activate", True):
-        # Without this a robot that waits for its first `activate` would stand until the end.
+        # Otherwise a robot that waits for its first `activate` would stand until the end.
         call(round(dice.uniform(0.5, 5.0), 3), "activate", named=False)
     return events
 

@@ -153,7 +153,7 @@ def broken_again(fault: Fault, row: Row) -> str:
 
 @cache
 def sound_finding(seed: int) -> str:
-    """Return what this seed finds in the product without a fault."""
+    """Return the finding of this seed in the product without a fault, "" for none."""
     return played(made(seed)).finding
 
 
@@ -169,7 +169,7 @@ class Play(NamedTuple):
 def plays(tree: Path, seed: int, seconds: float) -> Iterator[Play]:
     """Yield one run in `tree` after another.
 
-    Ends when the time is over, or early if somebody else ends the process.
+    Ends when the time is over, or early if another program ends the process.
     """
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     child = subprocess.Popen(

@@ -95,7 +95,7 @@ class CrashError(Exception):
 
 
 class Disk:
-    """The latch file: what a process that is killed now leaves for the next one."""
+    """The latch file, from which the next daemon starts."""
 
     def __init__(self) -> None:
         self.full = False
@@ -169,8 +169,6 @@ class Product:
         self._lasting = ExitStack()
         self.disk = Disk()
         self.alive = True
-        self.fed_ns = START_NS
-        """When bytes of the board last reached the daemon."""
         self.fed: Callable[[int, bytes], None] = lambda at_ns, data: None
         self.dropped = 0
         """Samples that the inbox had no room for, of this daemon."""
@@ -189,7 +187,6 @@ class Product:
 
         def noticed(received: Received) -> None:
             self.fed(received.at.mono_ns, received.data)
-            self.fed_ns = received.at.mono_ns
             feed(received)
 
         world.port.feed = noticed  # type: ignore[method-assign]
@@ -308,7 +305,7 @@ class Product:
         return found
 
     def state(self) -> dict[str, Any]:
-        """Return what `state` says now, as a client reads it."""
+        """Return the present `state`, as a client reads it."""
         found: dict[str, Any] = msgspec.json.decode(encode_message(self._world.state, "json"))
         return found
 

@@ -1,4 +1,4 @@
-"""What the robot says of itself, held against what really happened.
+"""The robot's reports about itself, compared with the true events.
 
 The lines on the wire do not show which of several commands the robot follows, or what `state` says
 of its speed while the board says nothing.

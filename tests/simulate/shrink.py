@@ -1,7 +1,8 @@
-"""Drops from a plan what its finding can spare: delta debugging (Zeller & Hildebrandt, 2002).
+"""Drops each part of a plan that its finding does not need.
 
-A part of a plan is named by its path: a sender, an event, a phase of a sender, a setting. Each
-sender draws its chances by its own name, so the others do the same without it.
+The method is delta debugging (Zeller & Hildebrandt, 2002). A part of a plan is named by its path: a
+sender, an event, a phase of a sender, a setting. Each sender draws its chances by its own name, so
+the others do the same without it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from tests.simulate.product import problems
 Part = tuple[Any, ...]
 
 MOST_RUNS = 400
-"""Plans that are tried; what is left then is small enough to read."""
+"""Number of plans that are tried. The plan is small enough to read then."""
 
 
 class _Search:

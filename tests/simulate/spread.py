@@ -25,7 +25,7 @@ UNKNOWN_RAD = 1.0
 are larger than those of first order then, make it far too uncertain rather than too certain."""
 
 CALM_NS = NS
-"""For this time after trouble the wheels of a side may still seem to slip."""
+"""Time after trouble in which the wheels of a side may still seem to slip."""
 
 SHORTEST_NS = 10_000_000
 """Shortest period in which the counts of an encoder do not look like slip."""
