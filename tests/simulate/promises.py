@@ -26,6 +26,9 @@ MODES = {"shutdown", "fault", "stopped", "inactive", "waiting", "driving", "read
 RAMP_NS = 300_000_000
 """Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
 
+WATCHDOG_NS = 300_000_000
+"""A board stops its motors this long after the last line, so a robot starts over from rest."""
+
 BLOCKED_NS = 500_000_000
 """Time after which the daemon must report that the kernel takes no line.
 
@@ -41,6 +44,9 @@ END_NS = NS
 RAMPS_NS = NS // 2
 """A ramp of an orderly end that takes at most this time is not cut short."""
 
+LOOK_NS = 2 * NS
+"""A call without a number is refused for this time, in which its sender may not know the latch."""
+
 STAND_NS = 2 * NS
 """After a ramp to rest: time for motors with a lag of 0.4 s to stand."""
 
@@ -48,7 +54,7 @@ HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
     "stalls", "sparse_replies", "echo", "plain_only", "endless", "wrong_baud",
 }  # fmt: skip
-"""Troubles of the board that are no reason to latch a fault."""
+"""Troubles of the board for which the robot may not latch a fault."""
 
 DISOBEYS_NS = NS
 """Within this time, `feedback.fault_time` and three time constants of a motor, in which a dead one
@@ -58,7 +64,7 @@ CLEARLY = 4.0
 """rad/s. From this speed on, a wheel that does not obey cannot be taken for one that does."""
 
 DIALECTS = {"unpadded", "spaces", "trailing_comma", "no_sample", "no_check"}
-"""Forms of the protocol that are no trouble at all."""
+"""Forms of the protocol that give the daemon no trouble."""
 
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
 """Refused messages that may have been speeds of a program that shares its identity, so a zero
@@ -74,7 +80,7 @@ class BrokenError(AssertionError):
 
 
 class Witness:
-    """Holds every line and every step against what really happened."""
+    """Compares every line and every step with the true events."""
 
     def __init__(self, config: dict[str, Any]) -> None:
         self.config = config
@@ -132,7 +138,7 @@ class Witness:
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
         self.lies: list[tuple[str, tuple[Any, ...]]] = []
-        """The faults that the board has now, beside its lasting properties."""
+        """The present faults of the board, without its lasting properties."""
         self.lying_ns = 0
         """When the last fault of the board began."""
         fault_time = config.get("feedback", {}).get("fault_time", 0.5)
@@ -162,10 +168,13 @@ class Witness:
         self._decoded: dict[bytes, tuple[float, ...]] = {}
         self.new_life(0)
 
-    # what happened
+    # events
 
     def new_life(self, at_ns: int) -> None:
         """Note that the daemon started."""
+        self.born_ns = at_ns
+        self.unfaulted_ns = -LOOK_NS
+        """When a clear last released a fault and left the stop."""
         self.timeout = dict(self.file_timeout)
         self.pause_ns = self.file_pause_ns
         for name, value in self.file.items():
@@ -254,6 +263,7 @@ class Witness:
         if self.fault_ns is not None and self.fault_ns <= asked_ns:
             self.fault_ns = None
         if "still" in text:
+            self.unfaulted_ns = asked_ns
             return
         self.perhaps_latched = False
         self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
@@ -271,16 +281,18 @@ class Witness:
     ) -> None:
         # A stop that arrived behind the call stays latched. The answer may be later than both.
         later = [at_ns for at_ns in latched if at_ns > asked_ns]
+        # The network may deliver one clear twice, and its sender may not know of a start.
+        last_ns = max(self.born_ns, self.unfaulted_ns if latched is self.stops else 0)
         for at_ns in latched[: len(latched) - len(later)]:
             seen = read_ns is not None and read_ns >= at_ns
-            late = read_ns is None and asked_ns >= at_ns + 2 * NS - MARGIN_NS
+            late = read_ns is None and asked_ns >= max(at_ns, last_ns) + LOOK_NS - MARGIN_NS
             if not (seen or late):
                 text = f"the call of {name} released what was latched at {at_ns / NS:.3f} s"
                 raise BrokenError(promise, asked_ns, text)
         latched[:] = later
 
     def set_limits(self, at_ns: int, settings: dict[str, float], asked_ns: int) -> None:
-        """Note settings that the daemon says it has taken; on a full disk it says so late."""
+        """Note settings that a `set` has changed. With a full disk its answer is late."""
         self.before, self.changed_ns = dict(self.limits), at_ns
         for key, value in settings.items():
             parts = key.split(".")
@@ -323,7 +335,7 @@ class Witness:
                         self.limits[name] = max(value, self.limits[name])
 
     def file_is_behind(self) -> None:
-        """Note that the daemon ended before the latch file had what was in force."""
+        """Note that the daemon ended before it wrote the latches in force into the file."""
         self.perhaps_latched = True
         self.stops.clear()
         self.offs.clear()
@@ -336,7 +348,7 @@ class Witness:
         self.unsure.clear()
         self.stops.append(at_ns)
 
-    # what the daemon showed
+    # the steps and lines of the daemon
 
     def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
         """Judge the mode and the words for it; `fed_ns` is when the board was last heard."""
@@ -386,7 +398,7 @@ class Witness:
 
     @property
     def _surely_held(self) -> tuple[int, str] | None:
-        """Return the same, but without what a call that waits for the disk may have released."""
+        """Like `held`, without each latch that a call that waits for the disk may have released."""
         if not self.pending:
             return self.held
         cleared_ns, active_ns = self.pending.get("clear", -1), self.pending.get("activate", -1)
@@ -442,7 +454,8 @@ class Witness:
             raise BrokenError(
                 "a silent board gets zeros", at_ns, f"last heard {fed_ns / NS:.3f} s: {line!r}"
             )
-        before, last_ns = self.last, self.last_ns
+        last_ns = self.last_ns
+        before = ZERO if made_ns - last_ns > WATCHDOG_NS else self.last
         grows = any(
             abs(new) > abs(old) + 0.001 or new * old < 0.0
             for new, old in zip(wheels, before, strict=True)
@@ -477,7 +490,7 @@ class Witness:
             raise BrokenError("a wheel that does not obey is a fault", at_ns, text)
 
     def stalls(self, begun_ns: int, ended_ns: int) -> None:
-        """Note a stall of the host: the daemon reads what came during it in the steps behind it."""
+        """Note a stall of the host. The steps behind it read the bytes that came meanwhile."""
         before = self._stalled
         if begun_ns <= before[1]:
             begun_ns, ended_ns = before[0], max(before[1], ended_ns)
@@ -673,7 +686,7 @@ class Witness:
     def _explains(
         self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], grows: bool
     ) -> tuple[Wish | None, str]:
-        """Return a wish that allows this line, or None and what is wrong with the latest one."""
+        """Return a wish that allows this line, or None and the reason against the latest one."""
         slack = self.period_ns + MARGIN_NS
         wishes, longest = self.wishes, max(self.timeout.values()) + slack
         while wishes and wishes[0][1].arrived_ns < at_ns - longest:

@@ -216,6 +216,19 @@ def test_a_ramp_that_takes_twice_as_long_as_from_its_own_speed_is_a_finding(
                 ramp(witness, fastest, share)
 
 
+@pytest.mark.parametrize(("gap_s", "finding"), [(0.29, False), (0.31, True)])
+def test_a_robot_goes_on_at_full_speed_only_if_its_board_cannot_have_stopped(
+    gap_s: float, finding: bool
+) -> None:
+    witness = witnessed()
+    witness.limits["linear_speed"] = 99.0
+    witness.last, witness.last_ns = (8.0,) * 4, NS
+    at_ns = NS + int(gap_s * NS)
+    promise = "no acceleration is over its limit"
+    with pytest.raises(BrokenError, match=promise) if finding else nullcontext():
+        witness.line(at_ns, b"ap08.00,bp08.00,cp08.00,dp08.00\r\n", at_ns, at_ns)
+
+
 @pytest.mark.parametrize(("speed", "raises"), [(5.0, True), (3.0, False)])
 def test_a_wheel_that_clearly_does_not_obey_must_become_a_fault(speed: float, raises: bool) -> None:
     witness = witnessed()
@@ -251,13 +264,33 @@ def test_a_pose_may_not_jump_although_the_encoders_missed_a_part_of_the_drive() 
     pose.see(NS // 5, [(NS // 5, 1.0, 1.0, 0.0, sure, ())], truth, 0, set())
 
 
+CLEARED = "cleared; each sender must send a zero"
+
+
 def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> None:
     witness = witnessed()
     witness.stops.append(5 * NS)
     with pytest.raises(BrokenError, match="releases no later stop"):
-        witness.cleared(9 * NS, 4 * NS, "cleared; each sender must send a zero", "ann")
-    witness.cleared(9 * NS, 6 * NS, "cleared; each sender must send a zero", "ann")
+        witness.cleared(9 * NS, 4 * NS, CLEARED, "ann")
+    witness.cleared(9 * NS, 6 * NS, CLEARED, "ann")
     assert witness.held is None
+
+
+@pytest.mark.parametrize(("at_s", "finding"), [(6.9, True), (7.0, False)])
+@pytest.mark.parametrize("what", ["start", "clear"])
+def test_a_clear_without_a_number_must_wait_behind_a_start_and_behind_the_clear_of_a_fault(
+    what: str, at_s: float, finding: bool
+) -> None:
+    witness = witnessed()
+    witness.stops.append(2 * NS)
+    if what == "start":
+        witness.new_life(5 * NS)
+    else:
+        witness.fault_ns = 3 * NS
+        witness.cleared(5 * NS, None, "fault cleared; still stopped by ann", "ann")
+    promise = "a clear releases no later stop"
+    with pytest.raises(BrokenError, match=promise) if finding else nullcontext():
+        witness.cleared(int(at_s * NS), None, CLEARED, "ann")
 
 
 @pytest.mark.parametrize(("junk", "armed"), [("not a number", False), ("stranger", True)])
