@@ -35,7 +35,10 @@ LEAST_ROLL = 3.0
 """Smallest angle by which the wheels must roll in all, together and against each other, rad."""
 
 ALIKE = 0.98
-"""Squared correlation of the sides' mean and difference from which all is one same curve."""
+"""Squared correlation of the mean and the difference of both sides at which a log is refused.
+
+Such a robot drives the same curve all the time.
+"""
 
 WORST = 0.2, 0.03
 """Largest useful standard deviations, as fractions: of the track, and of the ratio of the radii."""
