@@ -181,7 +181,7 @@ def prepared(
     steps = [positions.wheel_steps(run) for run in driven] if segments else []
     sources: list[Source] = []
     sides = by_positions = None
-    if headings is not None and len(rows.turned):
+    if headings is not None:
         plausibility.turns_like_the_wheels(headings.source, rows, base)
         plausibility.turns_enough(rows.turned)
         sides = heading.first(rows, base)
