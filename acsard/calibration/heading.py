@@ -114,10 +114,7 @@ class Rates(Struct, frozen=True):
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
-    """Return the headings by the column yaw_rate, or None if no run has it.
-
-    Raises `LogError` if the yaw rate never changes.
-    """
+    """Return the headings by yaw_rate, or None. Raises `LogError` if it never changes."""
     if not any(len(run.gyro) for run in driven):
         return None
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
@@ -307,10 +304,7 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def level(rows: Rows) -> Rows:
-    """Return the rows without the part of each column that is proportional to time.
-
-    The fit of these rows is independent of an unknown constant bias of the gyro.
-    """
+    """Return the rows without their part proportional to time: an unknown constant gyro bias."""
     share = rows.seconds / float(rows.seconds @ rows.seconds)
     turned, left, right, fast = (
         column - rows.seconds * float(share @ column)

@@ -117,10 +117,7 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
-    """Return the parameters with the track of the mean turn rate for all turn rates.
-
-    The odometry of the daemon has one track for all turn rates, unlike the fit.
-    """
+    """Return the parameters with the track of the mean turn rate for all, like the odometry."""
     fixed = parameters.copy()
     fixed[P.INVERSE_TRACK] *= 1.0 - fixed[P.TRACK_GROWTH] * rate.mean
     fixed[P.TRACK_GROWTH] = 0.0

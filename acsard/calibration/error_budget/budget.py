@@ -269,10 +269,7 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Return the covariance of the pose after these steps were repeated.
-
-        They are repeated until the robot has driven `metres` m or turned by `angle` rad.
-        """
+        """Return the pose's covariance after `metres` m or `angle` rad of these steps, repeated."""
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
