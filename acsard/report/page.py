@@ -24,10 +24,10 @@ from acsard.recording.file import Recording
 from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
 from acsard.recording.replay_text import verdict
 from acsard.recording.time_span import WHOLE, Span, clock, date
+from acsard.report.figures import TimeFigures
 from acsard.report.plot_elements import Figure
 from acsard.report.report_data import Mark, ReportData
 from acsard.report.report_text import Clock, Origin, differences, notes, reasons, rows, summary
-from acsard.report.time_figures import TimeFigures
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2127; --soft: #59636e; --paper: #fff; --card: #f5f7f9;
