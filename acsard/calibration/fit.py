@@ -1,17 +1,5 @@
 """Fits the parameters of the calibration to the evidence of all sensors.
 
-The parameters are an array of nine numbers. Their indices are:
-
-- LEFT, RIGHT: radius of the left and the right wheels, as ratios to the configured wheel radius.
-- INVERSE_TRACK: ratio of the wheel separation to the effective track. The parameter is this inverse
-  because the turns of the robot are linear in it.
-- TRACK_GROWTH: fraction by which the effective track grows with each rad/s of turn rate.
-- DELAY: delay of the positions behind the wheels, s.
-- SENSOR_X, SENSOR_Y: the place on the robot whose positions are measured, m ahead and m to the
-  left.
-- BIAS_ERROR: error of the gyro's bias, rad/s.
-- SCALE_ERROR: error of the gyro's scale, a fraction.
-
 The evidence of a sensor is the normal equations that it contributes. The fit is a Gauss-Newton fit
 on sums over blocks. The standard deviations come from a jackknife over the blocks (Quenouille and
 Tukey): each block is left out in turn, and the changes of the parameters show the effect of chance.
@@ -22,6 +10,7 @@ step. If there are few blocks, the standard deviation is widened to that of Stud
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -31,10 +20,30 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Complexes, Mask
 from acsard.core.config.settings import DriveConfig
 
-LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH, DELAY, SENSOR_X, SENSOR_Y, BIAS_ERROR, SCALE_ERROR = (
-    range(9)
-)
-COUNT = 9
+
+class P(IntEnum):
+    """Indices of the parameters, which are an array of `COUNT` numbers."""
+
+    LEFT = 0
+    """Radius of the left wheels, as a ratio to the configured wheel radius."""
+    RIGHT = 1
+    INVERSE_TRACK = 2
+    """Ratio of the wheel separation to the effective track. Turns are linear in it."""
+    TRACK_GROWTH = 3
+    """Fraction by which the effective track grows with each rad/s of turn rate."""
+    DELAY = 4
+    """Delay of the positions behind the wheels, s."""
+    SENSOR_X = 5
+    """Place on the robot whose positions are measured, m ahead."""
+    SENSOR_Y = 6
+    """The same place, m to the left."""
+    BIAS_ERROR = 7
+    """Error of the gyro's bias, rad/s."""
+    SCALE_ERROR = 8
+    """Error of the gyro's scale, a fraction."""
+
+
+COUNT = len(P)
 
 HUBER = 2.0
 """Size of a residual, in usual sizes, above which its weight falls (Huber's weight)."""
@@ -62,7 +71,7 @@ class Base(Struct, frozen=True):
 
     def start(self) -> Floats:
         """Return the parameters that agree with the configured multipliers."""
-        return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - TRACK_GROWTH)])
+        return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - P.TRACK_GROWTH)])
 
     @property
     def gain(self) -> float:
@@ -134,7 +143,7 @@ MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
 """Size of a step that ends the fit, and size below which the last step counts as converged."""
 
-USUAL = {TRACK_GROWTH: 0.06, DELAY: 1.0, SENSOR_X: 0.5, SENSOR_Y: 0.5}
+USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
 """Prior standard deviations of the parameters that a log may not determine, in their units."""
 
 GYRO_SCALE = 0.005
@@ -169,10 +178,10 @@ class Fit(Struct, frozen=True):
     """Right-hand sides, shape (blocks, COUNT)."""
     known: Floats
     """Prior information as normal equations, shape (COUNT, COUNT)."""
-    active: tuple[int, ...]
+    active: tuple[P, ...]
     """Indices of the parameters that were fitted."""
     converged: bool
-    usual: Mapping[int, float]
+    usual: Mapping[P, float]
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
@@ -189,10 +198,11 @@ class Fit(Struct, frozen=True):
         radii, and the inverse of the track.
         """
         total = self.normal.sum(axis=0) + self.known
-        rest = [index for index in self.active if index > INVERSE_TRACK]
-        inner, cross = total[np.ix_(rest, rest)], total[np.ix_([LEFT, RIGHT, INVERSE_TRACK], rest)]
+        rest = [index for index in self.active if index > P.INVERSE_TRACK]
+        inner, cross = total[np.ix_(rest, rest)], total[:3, rest]
         three = np.asarray(total[:3, :3] - cross @ np.linalg.solve(inner, cross.T))
-        free = np.eye(3) if DELAY in self.active else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
+        sized = P.DELAY in self.active
+        free = np.eye(3) if sized else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(free @ three @ free.T)
 
     def covariance(self) -> Floats:
@@ -238,17 +248,15 @@ def fit(
             on the bias.
         held: combinations of parameters that the fit does not change.
     """
-    active: tuple[int, ...] = (LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH, DELAY, SENSOR_X, SENSOR_Y)[
-        : None if places else 4
-    ]
+    active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
     usual = dict(USUAL)
     if gyro:
-        active, usual[SCALE_ERROR] = (*active, SCALE_ERROR), GYRO_SCALE
+        active, usual[P.SCALE_ERROR] = (*active, P.SCALE_ERROR), GYRO_SCALE
     if bias_std:
-        active, usual[BIAS_ERROR] = (*active, BIAS_ERROR), bias_std
+        active, usual[P.BIAS_ERROR] = (*active, P.BIAS_ERROR), bias_std
     if not places:
         both = np.zeros(COUNT)
-        both[[LEFT, RIGHT]] = 1.0
+        both[[P.LEFT, P.RIGHT]] = 1.0
         held = (*held, (both, float(both @ start)))
     parameters, size = start.copy(), np.inf
     for at in range(MOST_STEPS):
@@ -259,7 +267,7 @@ def fit(
         # Far from the solution, take only a part of the step: the linearization holds only near its
         # point. After a third of the steps, halve each step. Otherwise an outlier could count in
         # every other step only, and the fit would not converge.
-        size = float(np.max(np.abs(step[: TRACK_GROWTH + 1])))
+        size = float(np.max(np.abs(step[: P.DELAY])))
         whole = 1.0 if at < MOST_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
@@ -297,7 +305,7 @@ def _weight(part: Evidence) -> float:
 
 
 def _known(
-    parameters: Floats, held: Sequence[Held], usual: Mapping[int, float]
+    parameters: Floats, held: Sequence[Held], usual: Mapping[P, float]
 ) -> tuple[Floats, Floats]:
     """Return the prior information at the present parameters as normal equations."""
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)

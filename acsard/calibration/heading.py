@@ -18,19 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import (
-    BIAS_ERROR,
-    COUNT,
-    INVERSE_TRACK,
-    LEFT,
-    RIGHT,
-    SCALE_ERROR,
-    TRACK_GROWTH,
-    Base,
-    Evidence,
-    huber,
-    of_rows,
-)  # fmt: skip
+from acsard.calibration.fit import COUNT, Base, Evidence, P, huber, of_rows
 from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
@@ -126,10 +114,7 @@ class Rates(Struct, frozen=True):
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
-    """Return the headings by the column yaw_rate, or None if no run has it.
-
-    Raises `LogError` if the yaw rate never changes.
-    """
+    """Return the headings by yaw_rate, or None. Raises `LogError` if it never changes."""
     if not any(len(run.gyro) for run in driven):
         return None
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
@@ -319,10 +304,7 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def level(rows: Rows) -> Rows:
-    """Return the rows without the part of each column that is proportional to time.
-
-    The fit of these rows is independent of an unknown constant bias of the gyro.
-    """
+    """Return the rows without their part proportional to time: an unknown constant gyro bias."""
     share = rows.seconds / float(rows.seconds @ rows.seconds)
     turned, left, right, fast = (
         column - rows.seconds * float(share @ column)
@@ -346,32 +328,32 @@ Both are added as squares. A row with a much larger residual is an outlier.
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
     """Return the robot's turn in each row, rad, computed from the wheels and these parameters."""
-    left, right, inverse, growth = parameters[[LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]]
+    left, right, inverse, growth = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
     constant = base.gain * inverse * (right * rows.right - left * rows.left)
     return np.asarray(constant + growth * _by_growth(rows, base, parameters))
 
 
 def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
     """Return the derivative of each row's turn with respect to TRACK_GROWTH, rad2/s."""
-    left, right, inverse = parameters[[LEFT, RIGHT, INVERSE_TRACK]]
+    left, right, inverse = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK]]
     gain = base.gain * inverse * (left + right) / 2
     return np.asarray(-gain * abs(gain) * rows.fast)
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
     """Return the evidence of the rows at these parameters, for `blocks` blocks."""
-    turn = parameters[INVERSE_TRACK]
+    turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), COUNT))
-    jacobian[:, LEFT] = -base.gain * turn * rows.left
-    jacobian[:, RIGHT] = base.gain * turn * rows.right
-    jacobian[:, TRACK_GROWTH] = _by_growth(rows, base, parameters)
-    jacobian[:, INVERSE_TRACK] = (
-        by_wheels + jacobian[:, TRACK_GROWTH] * parameters[TRACK_GROWTH]
+    jacobian[:, P.LEFT] = -base.gain * turn * rows.left
+    jacobian[:, P.RIGHT] = base.gain * turn * rows.right
+    jacobian[:, P.TRACK_GROWTH] = _by_growth(rows, base, parameters)
+    jacobian[:, P.INVERSE_TRACK] = (
+        by_wheels + jacobian[:, P.TRACK_GROWTH] * parameters[P.TRACK_GROWTH]
     ) / turn
-    jacobian[:, BIAS_ERROR] = rows.seconds
-    jacobian[:, SCALE_ERROR] = by_wheels
-    gyro = by_wheels * (1 + parameters[SCALE_ERROR]) + parameters[BIAS_ERROR] * rows.seconds
+    jacobian[:, P.BIAS_ERROR] = rows.seconds
+    jacobian[:, P.SCALE_ERROR] = by_wheels
+    gyro = by_wheels * (1 + parameters[P.SCALE_ERROR]) + parameters[P.BIAS_ERROR] * rows.seconds
     residual = rows.turned - gyro
     return of_rows(jacobian, residual, _weight(rows, residual, by_wheels), rows.block, blocks)
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import INVERSE_TRACK, TRACK_GROWTH, Base, Fit, student_factor
+from acsard.calibration.fit import Base, Fit, P, student_factor
 from acsard.calibration.heading import TURNING, Rates, Rows, turned
 from acsard.calibration.log_table import Floats
 from acsard.calibration.positions import Segment, WheelSteps, path, segments, spread
@@ -117,13 +117,10 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
-    """Return the parameters with the track of the mean turn rate for all turn rates.
-
-    The odometry of the daemon has one track for all turn rates, unlike the fit.
-    """
+    """Return the parameters with the track of the mean turn rate for all, like the odometry."""
     fixed = parameters.copy()
-    fixed[INVERSE_TRACK] *= 1.0 - fixed[TRACK_GROWTH] * rate.mean
-    fixed[TRACK_GROWTH] = 0.0
+    fixed[P.INVERSE_TRACK] *= 1.0 - fixed[P.TRACK_GROWTH] * rate.mean
+    fixed[P.TRACK_GROWTH] = 0.0
     return fixed
 
 

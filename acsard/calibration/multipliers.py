@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.fit import INVERSE_TRACK, LEFT, RIGHT, TRACK_GROWTH, Base
+from acsard.calibration.fit import Base, P
 from acsard.calibration.heading import Rates
 from acsard.calibration.log_table import Floats, RefusedError
 
@@ -68,13 +68,13 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
     constant track there. The turns that skid more or less than usual belong to the noise of the
     odometry.
     """
-    inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
+    inverse, growth = parameters[P.INVERSE_TRACK], parameters[P.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
-    values = np.array([1 / (inverse * slower), parameters[LEFT], parameters[RIGHT]])
+    values = np.array([1 / (inverse * slower), parameters[P.LEFT], parameters[P.RIGHT]])
     jacobian = np.zeros((3, len(parameters)))
-    jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
-    jacobian[SEPARATION, INVERSE_TRACK] = -values[SEPARATION] / inverse
-    jacobian[SEPARATION, TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
+    jacobian[LEFT_RADIUS, P.LEFT] = jacobian[RIGHT_RADIUS, P.RIGHT] = 1.0
+    jacobian[SEPARATION, P.INVERSE_TRACK] = -values[SEPARATION] / inverse
+    jacobian[SEPARATION, P.TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
     return Multipliers(values, jacobian @ covariance @ jacobian.T)
 
 

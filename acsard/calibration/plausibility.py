@@ -13,15 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from acsard.calibration import heading
-from acsard.calibration.fit import (
-    INVERSE_TRACK,
-    LEAST_BLOCKS,
-    LEFT,
-    RIGHT,
-    Base,
-    Fit,
-    condition,
-)  # fmt: skip
+from acsard.calibration.fit import LEAST_BLOCKS, Base, Fit, P, condition
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats, RefusedError
 from acsard.calibration.multipliers import Multipliers
@@ -35,7 +27,10 @@ LEAST_ROLL = 3.0
 """Smallest angle by which the wheels must roll in all, together and against each other, rad."""
 
 ALIKE = 0.98
-"""Squared correlation of the sides' mean and difference from which all is one same curve."""
+"""Squared correlation of the mean and the difference of both sides at which a log is refused.
+
+Such a robot drives the same curve all the time.
+"""
 
 WORST = 0.2, 0.03
 """Largest useful standard deviations, as fractions: of the track, and of the ratio of the radii."""
@@ -191,8 +186,8 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
     """
     by_places = by_heading = ""
     if begun is not None:
-        turn = begun.parameters[INVERSE_TRACK]
-        by_places = by_heading = _wrong_sign(begun.parameters[[LEFT, RIGHT]] * turn)
+        turn = begun.parameters[P.INVERSE_TRACK]
+        by_places = by_heading = _wrong_sign(begun.parameters[[P.LEFT, P.RIGHT]] * turn)
     if sides is not None:
         by_heading = _wrong_sign(sides)
     for side in ("left", "right"):

@@ -21,20 +21,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.fit import (
-    COUNT,
-    DELAY,
-    INVERSE_TRACK,
-    LEFT,
-    RIGHT,
-    SENSOR_X,
-    SENSOR_Y,
-    TRACK_GROWTH,
-    Base,
-    Evidence,
-    fit,
-    huber,
-)  # fmt: skip
+from acsard.calibration.fit import COUNT, Base, Evidence, P, fit, huber
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
@@ -93,9 +80,9 @@ class Path(Struct, frozen=True):
     """Place x + iy of the robot at these times, m."""
     heading: Floats
     """Heading at these times, rad."""
-    derivatives: dict[int, Complexes]
+    derivatives: dict[P, Complexes]
     """Derivatives of `place` with respect to parameters, by the index of the parameter."""
-    heading_derivatives: dict[int, Floats]
+    heading_derivatives: dict[P, Floats]
     """Derivatives of `heading` with respect to the same parameters."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
@@ -104,22 +91,22 @@ class Path(Struct, frozen=True):
         `t` has the recorded times of the positions, which are delayed by the parameter DELAY. The
         derivatives have the shape (times, COUNT).
         """
-        t = t - parameters[DELAY]
+        t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
         here, ahead = self._sensor(t, parameters)
-        lever = 1j * complex(parameters[SENSOR_X], parameters[SENSOR_Y]) * ahead
+        lever = 1j * complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y]) * ahead
         for index, values in self.derivatives.items():
             turned = np.interp(t, self.t, self.heading_derivatives[index])
             derivatives[:, index] = np.interp(t, self.t, values) + lever * turned
-        derivatives[:, SENSOR_X], derivatives[:, SENSOR_Y] = ahead, 1j * ahead
+        derivatives[:, P.SENSOR_X], derivatives[:, P.SENSOR_Y] = ahead, 1j * ahead
         before, after = (self._sensor(t + s, parameters)[0] for s in (-SPEED_S, SPEED_S))
-        derivatives[:, DELAY] = (before - after) / (2 * SPEED_S)
+        derivatives[:, P.DELAY] = (before - after) / (2 * SPEED_S)
         return here, derivatives
 
     def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Return the sensor's place, and the robot's heading as a complex number of length 1."""
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
-        lever = complex(parameters[SENSOR_X], parameters[SENSOR_Y])
+        lever = complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y])
         return np.interp(t, self.t, self.place) + lever * ahead, ahead
 
 
@@ -163,18 +150,18 @@ def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
 
 def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
     """Return the path of the robot from the origin with heading 0. Each step is an exact arc."""
-    left, right, turn, rate = parameters[[LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]]
+    left, right, turn, rate = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
     gain = base.gain * turn
     mean = gain * (left + right) / 2
     turn_derivatives = {
-        LEFT: -gain * steps.left,
-        RIGHT: gain * steps.right,
-        INVERSE_TRACK: base.gain * (right * steps.right - left * steps.left),
-        TRACK_GROWTH: -mean * abs(mean) * steps.fast,
+        P.LEFT: -gain * steps.left,
+        P.RIGHT: gain * steps.right,
+        P.INVERSE_TRACK: base.gain * (right * steps.right - left * steps.left),
+        P.TRACK_GROWTH: -mean * abs(mean) * steps.fast,
     }
-    turns = turn * turn_derivatives[INVERSE_TRACK] + rate * turn_derivatives[TRACK_GROWTH]
-    rolls = {LEFT: base.radius * steps.left / 2, RIGHT: base.radius * steps.right / 2}
-    distance = left * rolls[LEFT] + right * rolls[RIGHT]
+    turns = turn * turn_derivatives[P.INVERSE_TRACK] + rate * turn_derivatives[P.TRACK_GROWTH]
+    rolls = {P.LEFT: base.radius * steps.left / 2, P.RIGHT: base.radius * steps.right / 2}
+    distance = left * rolls[P.LEFT] + right * rolls[P.RIGHT]
     heading, ahead = _directions(turns)
     derivatives, heading_derivatives = {}, {}
     for index, of_step in turn_derivatives.items():
@@ -186,8 +173,8 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
     """Return the places as in `Path.place`, but faster, for a track that does not change."""
-    left, right = parameters[LEFT] * steps.left, parameters[RIGHT] * steps.right
-    _, ahead = _directions(base.gain * parameters[INVERSE_TRACK] * (right - left))
+    left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
+    _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
@@ -367,7 +354,7 @@ def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
     """Return a factor of at least 1, which is larger for a less usual robot."""
-    signed = point.parameters[[LEFT, RIGHT]] * point.parameters[INVERSE_TRACK]
+    signed = point.parameters[[P.LEFT, P.RIGHT]] * point.parameters[P.INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
     like = np.ones(2)
     if sides is not None:
@@ -379,7 +366,7 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 def _turn(parameters: Floats) -> float:
     """Return the robot's turn for a roll of the right wheels alone, relative to `Base.gain`."""
-    return float(parameters[INVERSE_TRACK] * parameters[RIGHT])
+    return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
 
 
 def _timed(
@@ -387,7 +374,7 @@ def _timed(
 ) -> StartingPoint:
     """Return the starting point with the delay of the positions that suits it best."""
     parameters = point.parameters
-    shape = float(np.sign(parameters[LEFT])), float(parameters[INVERSE_TRACK] * parameters[RIGHT])
+    shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
     return min([point, *tried], key=lambda point: point.unexplained)
 
@@ -404,7 +391,7 @@ def _tried(
     the positions in s.
     """
     parameters = base.start()
-    parameters[[LEFT, RIGHT, INVERSE_TRACK, DELAY]] = shape[0], 1.0, shape[1], shape[2]
+    parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
     paths = {run: place(of_run, base, parameters) for run, of_run in steps.items()}
     cross = squares = size = 0.0
     for segment in kept:
@@ -417,8 +404,8 @@ def _tried(
     if not size or not squares:
         return StartingPoint(parameters, np.inf)
     scale = cross / size
-    parameters[[LEFT, RIGHT]] *= scale
-    parameters[INVERSE_TRACK] /= scale
+    parameters[[P.LEFT, P.RIGHT]] *= scale
+    parameters[P.INVERSE_TRACK] /= scale
     return StartingPoint(parameters, 1.0 - cross**2 / (size * squares))
 
 

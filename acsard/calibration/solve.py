@@ -13,21 +13,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration import heading, plausibility, positions
-from acsard.calibration.fit import (
-    BIAS_ERROR,
-    COUNT,
-    DELAY,
-    INVERSE_TRACK,
-    LEFT,
-    RIGHT,
-    SCALE_ERROR,
-    TRACK_GROWTH,
-    Base,
-    Fit,
-    Held,
-    Source,
-    fit,
-)
+from acsard.calibration.fit import COUNT, Base, Fit, Held, P, Source, fit
 from acsard.calibration.heading import Headings, Rates, Rows, rates
 from acsard.calibration.improvement import (
     UNMEASURED,
@@ -181,7 +167,7 @@ def prepared(
     steps = [positions.wheel_steps(run) for run in driven] if segments else []
     sources: list[Source] = []
     sides = by_positions = None
-    if headings is not None and len(rows.turned):
+    if headings is not None:
         plausibility.turns_like_the_wheels(headings.source, rows, base)
         plausibility.turns_enough(rows.turned)
         sides = heading.first(rows, base)
@@ -203,9 +189,9 @@ def prepared(
         )
     plausibility.turns_the_right_way(headings.source if headings else "", sides, by_positions)
     if sides is not None:
-        mean, size = float(sides.mean()), float(start[[LEFT, RIGHT]].mean())
-        start[[LEFT, RIGHT]] = size * sides / mean
-        start[INVERSE_TRACK] = mean / size
+        mean, size = float(sides.mean()), float(start[[P.LEFT, P.RIGHT]].mean())
+        start[[P.LEFT, P.RIGHT]] = size * sides / mean
+        start[P.INVERSE_TRACK] = mean / size
     if headings is not None:
         plausibility.turn_rates(headings.source, rows)
     _check_units(headings, start, base, by_positions is not None)
@@ -213,11 +199,11 @@ def prepared(
 
 
 def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:
-    size, configured = float(start[[LEFT, RIGHT]].mean()), base.start()
+    size, configured = float(start[[P.LEFT, P.RIGHT]].mean()), base.start()
     if sized:
         plausibility.distance_units(size, base)
-    bare = size * float(start[INVERSE_TRACK])
-    turn = bare / float(configured[[LEFT, RIGHT]].mean() * configured[INVERSE_TRACK])
+    bare = size * float(start[P.INVERSE_TRACK])
+    turn = bare / float(configured[[P.LEFT, P.RIGHT]].mean() * configured[P.INVERSE_TRACK])
     plausibility.turn_units(headings.source if headings else "", turn, bare, base)
 
 
@@ -282,8 +268,8 @@ def _candidates(made: Prepared) -> list[Candidate]:
         )  # fmt: skip
         if fitted.converged:
             candidate = _candidate(made, fitted)
-            track = float(np.sqrt(fitted.covariance()[INVERSE_TRACK, INVERSE_TRACK]))
-            track /= abs(float(fitted.parameters[INVERSE_TRACK]))
+            track = float(np.sqrt(fitted.covariance()[P.INVERSE_TRACK, P.INVERSE_TRACK]))
+            track /= abs(float(fitted.parameters[P.INVERSE_TRACK]))
             too_wide = plausibility.unsure(candidate.result, track)
             if not kept:
                 deviations = {TRACK: track, RATIO: candidate.result.ratio_std}
@@ -305,8 +291,8 @@ def _candidates(made: Prepared) -> list[Candidate]:
 def _held(base: Base) -> dict[str, list[Held]]:
     """Return the parameters that a fit holds at the configured ones, by the quantity it keeps."""
     ratio, track, growth = np.zeros((3, COUNT))
-    ratio[[LEFT, RIGHT]] = base.right, -base.left
-    track[INVERSE_TRACK] = growth[TRACK_GROWTH] = 1.0
+    ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
+    track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
     return {"": [], RATIO: [(ratio, 0.0)], TRACK: [(track, 1 / base.track), (growth, 0.0)]}
 
 
@@ -314,8 +300,8 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     """Return a fit to these blocks with its improvement. Raises `RefusedError`."""
     headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
-    gyro_scale = 1 + float(fitted.parameters[SCALE_ERROR])
-    bias_error = float(fitted.parameters[BIAS_ERROR])
+    gyro_scale = 1 + float(fitted.parameters[P.SCALE_ERROR])
+    bias_error = float(fitted.parameters[P.BIAS_ERROR])
     if headings is None:
         plausibility.turns_enough(by_wheels)
     elif headings.bias_unknown:
@@ -324,7 +310,7 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
     rate = rates(rows, by_wheels)
     present = fitted.parameters.copy()
-    present[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
+    present[: P.DELAY] = base.start()[: P.DELAY]
     held = folds(fitted, made.parts, drives(made.runs), rate)
     places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in held]
     better = improvement(held, present, base, rows, places, made.steps)
@@ -339,7 +325,7 @@ def _calibration(log: Log, tape: Tape | None, best: Candidate) -> Calibration:
     by_wheels, result = heading.turned(rows, base, fitted.parameters), best.result
     delays = {headings.source: headings.delay} if headings is not None else {}
     if made.segments:
-        delays["positions"] = float(fitted.parameters[DELAY])
+        delays["positions"] = float(fitted.parameters[P.DELAY])
     scale, notes = ["positions"] if made.segments else [], list(log.notes)
     if tape is not None:
         follow = _follow(made, fitted, rate)
@@ -358,8 +344,8 @@ def _calibration(log: Log, tape: Tape | None, best: Candidate) -> Calibration:
     return Calibration(
         reference=" and ".join(delays), drives=totals, configured=configured(base),
         multipliers=result, scale=" and ".join(scale),
-        growth=float(fitted.parameters[TRACK_GROWTH]),
-        growth_std=float(np.sqrt(fitted.covariance()[TRACK_GROWTH, TRACK_GROWTH])),
+        growth=float(fitted.parameters[P.TRACK_GROWTH]),
+        growth_std=float(np.sqrt(fitted.covariance()[P.TRACK_GROWTH, P.TRACK_GROWTH])),
         improvement=best.improvement, delays=delays, gyro_bias=best.gyro_bias, notes=tuple(notes),
         kept=tuple(best.kept),
     )  # fmt: skip
@@ -412,9 +398,9 @@ def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
 
     def follow(values: Floats, number: int) -> Extent:
         parameters = fitted.parameters.copy()
-        parameters[[LEFT, RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
-        parameters[INVERSE_TRACK] = 1 / (
-            values[SEPARATION] * (1 - parameters[TRACK_GROWTH] * rate.mean)
+        parameters[[P.LEFT, P.RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
+        parameters[P.INVERSE_TRACK] = 1 / (
+            values[SEPARATION] * (1 - parameters[P.TRACK_GROWTH] * rate.mean)
         )
         steps = positions.wheel_steps(made.runs[number])
         place = positions.path(steps, made.base, parameters).place

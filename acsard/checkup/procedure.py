@@ -170,10 +170,7 @@ class _Steps:
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Return the finding of a step, repeated while this computer is late.
-
-        If it is always late, return the finding that the step was not judged.
-        """
+        """Return the finding of a step, repeated while this computer is late, or not judged."""
         board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:

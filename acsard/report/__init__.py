@@ -6,7 +6,7 @@ All modules of this package are pure, except `page.drawn`, which replays the rec
   arrive (`acsard.core.thinning`), so a day takes no more memory than a minute.
 - `command_sources` keeps the part of these data that shows which source drove.
 - `report_text` describes the recording in words.
-- `time_figures` and `path_figure` draw it, with the elements of `plot_elements`.
+- `figures` draws it, with the elements of `plot_elements`.
 - `page` assembles the file.
 
 The caller passes the code of the library plotly as an argument. Each text of unknown origin, such

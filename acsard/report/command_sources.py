@@ -56,10 +56,7 @@ class CommandSources:
         return source if source in self._timeouts else OTHERS
 
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
-        """Take the commands of a step at time `t`, s; `robot` is the robot after the step.
-
-        Returns whether the refused sources have changed.
-        """
+        """Take the commands of a step at `t`, s. Return whether the refused sources changed."""
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
             self._newest.pop((command.source, command.sender), None)

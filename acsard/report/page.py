@@ -24,10 +24,10 @@ from acsard.recording.file import Recording
 from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
 from acsard.recording.replay_text import verdict
 from acsard.recording.time_span import WHOLE, Span, clock, date
+from acsard.report.figures import TimeFigures
 from acsard.report.plot_elements import Figure
 from acsard.report.report_data import Mark, ReportData
 from acsard.report.report_text import Clock, Origin, differences, notes, reasons, rows, summary
-from acsard.report.time_figures import TimeFigures
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2127; --soft: #59636e; --paper: #fff; --card: #f5f7f9;
@@ -234,12 +234,7 @@ def _figure(figure: Figure) -> str:
 
 def _reasons(data: ReportData) -> str:
     cells = [
-        (
-            f'<td class="name">{escaped(name)}</td>',
-            f'<td class="time">{escaped(state)}</td>',
-            f"<td>{escaped(words)}</td>",
-            f'<td class="time">{lasting(seconds)}</td>',
-        )
+        (_cell(name, "name"), _cell(state, "time"), _cell(words), _cell(lasting(seconds), "time"))
         for name, state, words, seconds in reasons(data)
     ]
     return _table(["source", "", "why it did not drive", "duration"], cells) if cells else ""
@@ -256,10 +251,10 @@ def _events(data: ReportData, clock: Clock) -> str:
 
     cells = [
         (
-            f'<td class="time">{escaped(time_of(mark))}</td>',
-            f'<td class="name {escaped(mark.level)}">{escaped(mark.name.replace("_", " "))}</td>',
-            f"<td>{escaped(mark.words)}</td>",
-            f"<td>{escaped(mark.by)}</td>",
+            _cell(time_of(mark), "time"),
+            _cell(mark.name.replace("_", " "), f"name {mark.level}"),
+            _cell(mark.words),
+            _cell(mark.by),
         )
         for mark in marks
     ]
@@ -279,9 +274,14 @@ def _settings(data: ReportData) -> str:
     changed = differences(data.config)
     if not changed:
         return "<h2>Configuration</h2><p>Every key has its default.</p>"
-    cells = [tuple(f"<td>{escaped(part)}</td>" for part in setting) for setting in changed]
+    cells = [tuple(map(_cell, setting)) for setting in changed]
     heading = "<h2>Configuration keys that differ from the default</h2>"
     return heading + _table(["key", "here", "default"], cells, "rows settings")
+
+
+def _cell(text: str, kind: str = "") -> str:
+    look = f' class="{escaped(kind)}"' if kind else ""
+    return f"<td{look}>{escaped(text)}</td>"
 
 
 def _table(names: list[str], cells: Sequence[tuple[str, ...]], kind: str = "rows") -> str:

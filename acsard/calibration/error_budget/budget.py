@@ -54,6 +54,16 @@ SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
 """Steps straight ahead (m) and on the spot (rad), for the errors of a robot that stands."""
 
 
+NOISE = "distance_variance_per_metre", "yaw_variance_per_metre", "yaw_variance_per_radian"
+"""Settings of `[odometry]` for the errors by skidding."""
+
+PARAMETERS = (
+    "wheel_separation_multiplier_std", "left_wheel_radius_multiplier_std",
+    "right_wheel_radius_multiplier_std", "distance_scale_std",
+)  # fmt: skip
+"""Settings of `[odometry]` for the errors of wheel radii and track."""
+
+
 class Share(Struct, frozen=True):
     """The error of one cause alone; None if this drive does not show it."""
 
@@ -175,10 +185,10 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
     """Return the budget of a robot that stands, which follows from the settings alone."""
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
-        model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, noise=True)),
+        model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
         model.share(
             "parameters", "settings" if known else "unknown", STRAIGHT, SPIN,
-            _only(odometry, parameters=True),
+            _only(odometry, *PARAMETERS),
         ),
     )  # fmt: skip
     spread = TwistUncertainty(ErrorModel(_only(odometry), model.kinematics), 0).of(REST, 0.0)
@@ -211,11 +221,11 @@ def _causes(received: Received, model: _Model, driving: Driving, counts: int) ->
     yield share("quantisation", basis, plain if counted else driving.rounded(), counts=counts)
     yield share("gaps", basis, plain if counted else driving.missed())
 
-    declared = share("slip", "settings", plain, _only(odometry, noise=True))
+    declared = share("slip", "settings", plain, _only(odometry, *NOISE))
     seen = share("slip", "measured", driving.contradicted())
     yield max(declared, seen, key=_millimetres)
 
-    kind = _only(odometry, parameters=True)
+    kind = _only(odometry, *PARAMETERS)
     basis = "settings" if model.declares_parameters else "unknown"
     if received.learned is not None:
         off = received.deviation if received.used else abs(received.learned - 1.0)
@@ -269,10 +279,7 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Return the covariance of the pose after these steps were repeated.
-
-        They are repeated until the robot has driven `metres` m or turned by `angle` rad.
-        """
+        """Return the pose's covariance after `metres` m or `angle` rad of these steps, repeated."""
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
@@ -289,26 +296,10 @@ class _Model:
         return pose.covariance
 
 
-def _only(
-    odometry: OdometryConfig, *, noise: bool = False, parameters: bool = False
-) -> OdometryConfig:
-    """Return the settings with the errors of the chosen kind only, and without any by default.
-
-    `noise` keeps the variances per metre and radian. `parameters` keeps the standard deviations of
-    the multipliers and of the scale.
-    """
-    made = replace(odometry, pose_covariance_diagonal=(0.0,) * 6)
-    if not noise:
-        made = replace(
-            made, distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0,
-            yaw_variance_per_radian=0.0,
-        )  # fmt: skip
-    if not parameters:
-        made = replace(
-            made, wheel_separation_multiplier_std=0.0, left_wheel_radius_multiplier_std=0.0,
-            right_wheel_radius_multiplier_std=0.0, distance_scale_std=0.0,
-        )  # fmt: skip
-    return made
+def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
+    """Return the settings with these settings of `NOISE` and `PARAMETERS`, and no other error."""
+    zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
+    return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 
 
 def _millimetres(share: Share) -> float:

@@ -418,10 +418,7 @@ class Driving:
         return self._steps(gyro=self._motion.yaw_variance)
 
     def late(self) -> Steps:
-        """Return the steps with the errors of wrong times of feedback lines.
-
-        The errors within `BLOCK_S` are correlated, so they are summed before they are squared.
-        """
+        """Return the steps with the errors of wrong stamps, correlated within `BLOCK_S`."""
         late = self._motion.late
         starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
         squares = np.zeros_like(late)

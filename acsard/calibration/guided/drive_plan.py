@@ -153,7 +153,10 @@ FASTEST_WHEEL = 0.5
 """Largest rolling speed of the wheels in a turn, m/s."""
 
 REACH = 0.75
-"""Distance from the middle to the outermost point less half a wheel radius, in separations."""
+"""Distance from the robot's middle to its outermost point, in wheel separations.
+
+Half a wheel radius is added to it.
+"""
 
 EDGE = 0.1
 """Margin between the robot and the edge of the floor, m."""

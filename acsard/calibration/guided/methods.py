@@ -80,11 +80,7 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return the number of whole turns on the spot that fit into `MOST_SPIN_S`, from 1 to `most`.
-
-    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
-    separation.
-    """
+    """Return how many turns at the true `rate`, rad/s, fit into `MOST_SPIN_S`: 1 to `most`."""
     one = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(most, int(MOST_SPIN_S / one)))
 

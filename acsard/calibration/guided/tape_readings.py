@@ -18,17 +18,7 @@ import numpy as np
 from msgspec import Struct
 
 from acsard.calibration import heading
-from acsard.calibration.fit import (
-    COUNT,
-    INVERSE_TRACK,
-    LEFT,
-    RIGHT,
-    TRACK_GROWTH,
-    USUAL,
-    Base,
-    condition,
-    student_factor,
-)  # fmt: skip
+from acsard.calibration.fit import COUNT, USUAL, Base, P, condition, student_factor
 from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Mean, Measure, Quantity
 from acsard.calibration.heading import Rates, rates
 from acsard.calibration.improvement import (
@@ -65,7 +55,7 @@ SMALL = 1e-9
 WORST_CONDITION = 1e8
 """Largest condition number at which the readings determine the parameters."""
 
-ACTIVE = [LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]
+ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 """Parameters that are fitted."""
 
 PRECISE = 0.2
@@ -150,7 +140,7 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
 def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     """Fit the parameters to the readings. Raises `RefusedError` if they contradict each other."""
     parameters, normal = _solved(readings, base, _starting_parameters(readings, base))
-    in_range(np.array([1 / parameters[INVERSE_TRACK], parameters[LEFT], parameters[RIGHT]]))
+    in_range(np.array([1 / parameters[P.INVERSE_TRACK], parameters[P.LEFT], parameters[P.RIGHT]]))
     compared = [(found, weight) for _, found, weight in _compared(readings, base, parameters)]
     residuals, weights = np.array(compared).T
     # Combine the scatter of these readings with the assumed noise. If there are few readings, the
@@ -181,7 +171,7 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
                     f"{math.degrees(reading.value):.0f} deg: start again, and let it turn "
                     "one full circle to the left"
                 )
-            start[INVERSE_TRACK] *= reading.value / by_wheels
+            start[P.INVERSE_TRACK] *= reading.value / by_wheels
             break
     return start
 
@@ -207,10 +197,10 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         for prediction, residual, weight in _compared(readings, base, parameters):
             normal += weight * np.outer(prediction.derivatives, prediction.derivatives)
             score += weight * prediction.derivatives * residual
-        normal[TRACK_GROWTH, TRACK_GROWTH] += USUAL[TRACK_GROWTH] ** -2
-        score[TRACK_GROWTH] -= parameters[TRACK_GROWTH] * USUAL[TRACK_GROWTH] ** -2
+        normal[P.TRACK_GROWTH, P.TRACK_GROWTH] += USUAL[P.TRACK_GROWTH] ** -2
+        score[P.TRACK_GROWTH] -= parameters[P.TRACK_GROWTH] * USUAL[P.TRACK_GROWTH] ** -2
         both = np.zeros(COUNT)
-        both[[LEFT, RIGHT]] = 0.5
+        both[[P.LEFT, P.RIGHT]] = 0.5
         normal += np.outer(both, both) / UNKNOWN**2
         score += both * float(both @ (configured - parameters)) / UNKNOWN**2
         inner = normal[np.ix_(ACTIVE, ACTIVE)]
@@ -329,8 +319,8 @@ def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Ca
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)
     result = multipliers(fit.parameters, fit.covariance, rate)
-    inverse_track, std = fit.parameters[INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
-    chance = float(std[INVERSE_TRACK] / abs(inverse_track))
+    inverse_track, std = fit.parameters[P.INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
+    chance = float(std[P.INVERSE_TRACK] / abs(inverse_track))
     for name, deviation in unsure(result, chance, WORST).items():
         raise RefusedError(
             f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
@@ -340,8 +330,8 @@ def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Ca
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
     return Calibration(
         reference=tool, drives=drives, configured=configured(base), multipliers=result,
-        scale="distance", growth=float(fit.parameters[TRACK_GROWTH]),
-        growth_std=float(std[TRACK_GROWTH]), improvement=_improvement(readings, base, fit, rate),
+        scale="distance", growth=float(fit.parameters[P.TRACK_GROWTH]),
+        growth_std=float(std[P.TRACK_GROWTH]), improvement=_improvement(readings, base, fit, rate),
         delays={}, gyro_bias=0.0, notes=tuple(notes),
     )  # fmt: skip
 
@@ -350,7 +340,7 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
     """Return the errors before and after. An error after is that of a fit without its reading."""
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
-    present[: TRACK_GROWTH + 1] = base.start()[: TRACK_GROWTH + 1]
+    present[: P.DELAY] = base.start()[: P.DELAY]
     constant = with_constant_track(fit.parameters, rate)
     for number, reading in enumerate(readings):
         steps = reading.steps

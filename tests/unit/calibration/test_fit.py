@@ -5,18 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.fit import (
-    COUNT,
-    INVERSE_TRACK,
-    LEFT,
-    RIGHT,
-    USUAL,
-    Base,
-    Fit,
-    fit,
-    huber,
-    of_rows,
-)  # fmt: skip
+from acsard.calibration.fit import COUNT, USUAL, Base, Fit, P, fit, huber, of_rows
 from acsard.calibration.heading import Rates, rates
 from acsard.calibration.multipliers import Multipliers, configured, multipliers
 from tests.unit.calibration.cut import BASE, ideal, ready, table
@@ -68,7 +57,7 @@ def test_without_a_block_is_what_a_fit_without_it_gives() -> None:
     out = np.arange(20) == 4
     normal = found.normal[~out].sum(axis=0)[:3, :3]
     score = (found.score + found.normal @ found.parameters)[~out].sum(axis=0)[:3]
-    assert found.without(out)[[LEFT, RIGHT, INVERSE_TRACK]] == pytest.approx(
+    assert found.without(out)[[P.LEFT, P.RIGHT, P.INVERSE_TRACK]] == pytest.approx(
         np.linalg.solve(normal, score)
     )
 
@@ -82,15 +71,8 @@ def fit_of(rate: float) -> Fit:
     """Return a fit with nearly exact parameters."""
     parameters = np.array([0.99, 1.01, 0.625, rate, *[0.0] * (COUNT - 4)])
     normal = np.tile(np.eye(COUNT) * 1e12, (12, 1, 1))
-    return Fit(
-        parameters,
-        normal,
-        np.zeros((12, COUNT)),
-        np.zeros((COUNT, COUNT)),
-        (0, 1, 2, 3),
-        True,
-        USUAL,
-    )
+    known, score = np.zeros((COUNT, COUNT)), np.zeros((12, COUNT))
+    return Fit(parameters, normal, score, known, tuple(P)[:4], True, USUAL)
 
 
 def multipliers_of(fitted: Fit, rate: Rates) -> Multipliers:

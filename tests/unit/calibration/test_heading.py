@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration import heading
-from acsard.calibration.fit import COUNT, DELAY, SENSOR_X, SENSOR_Y, huber
+from acsard.calibration.fit import COUNT, P, huber
 from acsard.calibration.heading import of_gyro, of_yaw, rows
 from acsard.calibration.log_table import LogError
 from acsard.calibration.runs import blocks
@@ -137,4 +137,4 @@ def test_slopes_are_those_of_what_the_wheels_say() -> None:
         weight = huber(residual / usual, 1.0)
         # The other parameters also change the rate term, but only to second order.
         assert score[index] == pytest.approx(float(slope @ (weight * residual)), rel=0.15)
-    assert not score[[DELAY, SENSOR_X, SENSOR_Y]].any()
+    assert not score[[P.DELAY, P.SENSOR_X, P.SENSOR_Y]].any()

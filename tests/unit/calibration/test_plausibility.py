@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as replace_fit
 
-from acsard.calibration.fit import INVERSE_TRACK, LEFT, RIGHT, fit
+from acsard.calibration.fit import P, fit
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import RefusedError
 from acsard.calibration.multipliers import Multipliers
@@ -179,8 +179,8 @@ def test_what_is_unusual_is_reported() -> None:
 def test_it_begins_near_the_truth(gyro: bool, places: bool) -> None:
     made = ready(table(usual(), gyro=gyro, places=places))
     assert len(made.sources) == gyro + places
-    assert made.start[[LEFT, RIGHT]] == pytest.approx([1.0, 1.0], abs=0.05)
-    assert 1 / made.start[INVERSE_TRACK] == pytest.approx(1.66, abs=0.15)
+    assert made.start[[P.LEFT, P.RIGHT]] == pytest.approx([1.0, 1.0], abs=0.05)
+    assert 1 / made.start[P.INVERSE_TRACK] == pytest.approx(1.66, abs=0.15)
 
 
 def test_sensors_of_another_time_are_refused() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration import positions
-from acsard.calibration.fit import COUNT, DELAY, INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.fit import COUNT, Base, P
 from acsard.calibration.positions import StartingPoint, search, segments
 from acsard.calibration.runs import Block, blocks
 from tests.unit.calibration.cut import BASE, ideal, log_of, table, usual
@@ -85,23 +85,23 @@ def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> Starti
 def test_it_begins_near_the_truth(separation: float, radius: float) -> None:
     found = begun(usual(), Base(radius, separation, 1.0, 1.0, 1.0))
     assert found.unexplained < 0.05
-    assert found.parameters[LEFT] == pytest.approx(0.05 / radius, rel=0.1)
-    assert found.parameters[INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
+    assert found.parameters[P.LEFT] == pytest.approx(0.05 / radius, rel=0.1)
+    assert found.parameters[P.INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
 
 
 def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
     seen = usual()
     left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())
     found = begun(left).parameters
-    one = np.sign(found[[LEFT, RIGHT]] * found[INVERSE_TRACK])
+    one = np.sign(found[[P.LEFT, P.RIGHT]] * found[P.INVERSE_TRACK])
     assert one.tolist() == [-1.0, 1.0]
-    assert begun(mirrored).parameters[INVERSE_TRACK] < 0
+    assert begun(mirrored).parameters[P.INVERSE_TRACK] < 0
 
 
 def test_late_positions_are_found() -> None:
     seen = usual()
     late = replace(seen, place_t=seen.place_t + 0.9)
-    assert begun(late).parameters[DELAY] == pytest.approx(0.9, abs=0.15)
+    assert begun(late).parameters[P.DELAY] == pytest.approx(0.9, abs=0.15)
 
 
 def squares(chi: float) -> Plan:
@@ -120,9 +120,9 @@ def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: comple
     """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
     seen = drive(robot, squares(chi))
-    assert begun(seen).parameters[INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
+    assert begun(seen).parameters[P.INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
     mirrored = replace(seen, place=seen.place.conj())
     sides = np.array([1.0, 1.0]) / chi
-    assert begun(mirrored, sides=-sides).parameters[INVERSE_TRACK] == pytest.approx(
+    assert begun(mirrored, sides=-sides).parameters[P.INVERSE_TRACK] == pytest.approx(
         -1 / chi, rel=0.05
     )

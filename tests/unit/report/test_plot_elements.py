@@ -7,7 +7,7 @@ from itertools import combinations
 
 import pytest
 
-from acsard.report.path_figure import path_figure
+from acsard.report.figures import path_figure
 from acsard.report.plot_elements import SOURCE_COLOURS, label, numbers, source_style
 from tests.unit.report.driven import drive_of_two
 from tests.unit.report.seen import column, trace

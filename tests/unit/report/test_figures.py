@@ -12,8 +12,8 @@ import pytest
 
 from acsard.core.config.parsing import parse
 from acsard.core.thinning import Point
+from acsard.report.figures import Clip, TimeFigures, clipped
 from acsard.report.plot_elements import Figure
-from acsard.report.time_figures import Clip, TimeFigures, clipped
 from tests.scenarios.taped import Tape, happenings
 from tests.scenarios.world import START, World
 from tests.unit.report.driven import drive_of_two, report_from, report_of, two_drivers
