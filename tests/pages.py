@@ -409,6 +409,10 @@ COMMANDS: dict[str, How] = {
     "ros2 param set /acsard limits.linear_speed 0.8": NO_ROS,
     "ros2 run teleop_twist_keyboard teleop_twist_keyboard --ros-args "
     "-r cmd_vel:=cmd_vel_teleop": NO_ROS,
+    "ros2 topic pub -r 10 -t 10 /cmd_vel_nav geometry_msgs/msg/Twist": NO_ROS,
+    "ros2 topic pub -r 10 -t 10 /cmd_vel geometry_msgs/msg/Twist": NO_ROS,
+    "ros2 run diagnostic_aggregator aggregator_node --ros-args "
+    "--params-file deploy/ros2/diagnostics.yaml": NO_ROS,
     f"ros2 launch {_LAUNCH_FILE} use_rviz:=true": LAUNCH,
     f"ros2 launch {_LAUNCH_FILE} use_ros2_control:=true": LAUNCH,
     "sudo apt install ros-$ROS_DISTRO-ros2-controllers "

@@ -19,11 +19,15 @@ from unittest.mock import MagicMock
 import msgspec
 import pytest
 import zenoh
+from msgspec.structs import replace
 from ruamel.yaml import YAML
 
-from acsard.core.config.settings import Config, RosConfig
+from acsard.core.config.settings import BusConfig, Config, RosConfig
+from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.ros.transports import ros_names
+from acsard.core.values import GyroStatus, Recording
 from tests.each import each
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()
@@ -259,7 +263,16 @@ def test_nav2s_chain_ends_at_cmd_vel_in_one_type() -> None:
     assert monitor["cmd_vel_in_topic"] == "cmd_vel_smoothed"
     assert f"/{monitor['cmd_vel_out_topic']}" in published_names("in")
     stamped = [v for k, v in leaves(yaml("nav2_params.yaml")) if k == "enable_stamped_cmd_vel"]
-    assert stamped == [False] * 4
+    assert stamped == [False] * 5
+
+
+def test_the_docking_server_sends_often_enough_on_a_topic_of_its_own() -> None:
+    docking = ros_parameters("nav2_params.yaml", "docking_server")
+    assert 1 / docking["controller_frequency"] < min(TIMEOUTS)
+    assert docking["base_frame"] == CONFIG.odometry.base_frame
+    assert docking["fixed_frame"] == CONFIG.odometry.odom_frame
+    assert "/cmd_vel_dock" in published_names("in")
+    assert '("cmd_vel", "cmd_vel_dock")' in (FILES / "README.md").read_text()
 
 
 def test_nav2s_footprint_has_the_wheels_inside() -> None:
@@ -426,12 +439,55 @@ def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
     assert all(len(names) == len(set(names)) for names in allow.values())
     assert wanted["publishers"] == {
         "/cmd_vel",
+        "/cmd_vel_dock",
         "/cmd_vel_teleop",
         "/joint_commands",
         "/imu/data",
     }
     assert len(wanted["subscribers"]) == 6
     assert len(services) == 11
+
+
+# diagnostics.yaml
+
+
+def groups() -> dict[str, dict[str, Any]]:
+    parameters = ros_parameters("diagnostics.yaml", "analyzers")
+    return {name: value for name, value in parameters.items() if isinstance(value, dict)}
+
+
+def row_names() -> list[str]:
+    """Return the name of every row that acsard can publish on `diagnostics`."""
+    config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
+    snapshot = replace(
+        SNAPSHOT, gyro=GyroStatus("used"), recording=Recording("/somewhere"), latch_file=""
+    )
+    rows = diagnostics(config, OUTPUTS, snapshot, (0, "valid for a year")).status
+    return [row.name for row in rows]
+
+
+def test_each_row_of_diagnostics_falls_into_exactly_one_group_of_the_aggregator() -> None:
+    """The aggregator's rule: a name begins with one of `startswith`, to the letter."""
+    names = row_names()
+    assert len(set(names)) == 10
+    for name in names:
+        found = [
+            group
+            for group, analyzer in groups().items()
+            if any(name.find(start) == 0 for start in analyzer["startswith"])
+        ]
+        assert len(found) == 1, name
+    for analyzer in groups().values():
+        for start in analyzer["startswith"]:
+            assert any(name.startswith(start) for name in names), start
+
+
+def test_the_aggregator_calls_no_row_stale_that_comes_at_its_rate() -> None:
+    for analyzer in groups().values():
+        assert analyzer["type"] == "diagnostic_aggregator/GenericAnalyzer"
+        assert analyzer["timeout"] > 2 / CONFIG.rates.diagnostics
+        (prefix,) = analyzer["remove_prefix"]
+        assert all(start.startswith(prefix) for start in analyzer["startswith"])
 
 
 # README.md

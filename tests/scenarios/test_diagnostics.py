@@ -6,7 +6,7 @@ import pytest
 
 from acsard.core.messages.diagnostics import OK, WARN
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
-from tests.scenarios.speakers import Speaker
+from tests.scenarios.speakers import Speaker, Way
 from tests.scenarios.world import World
 
 
@@ -48,6 +48,24 @@ def test_a_sender_whose_clock_is_new_here_is_no_warning(world: World) -> None:
     client = Speaker(world, "signed", ahead=-3600.0)
     client.hold(0.0, 0.2)
     assert world.state.counters["commands_of_new_senders"] == 4
+    assert row(world, "commands").level == OK
+
+
+@pytest.mark.parametrize("way", ["client", "rmw"])
+def test_a_second_program_on_a_source_is_a_warning_until_one_of_them_is_silent(
+    world: World, way: Way
+) -> None:
+    first, second = Speaker(world, way, "first"), Speaker(world, way, "second")
+    first.open()
+    assert row(world, "commands").level == OK
+    for _ in range(20):
+        first.send(0.4)
+        second.send(0.0)
+        world.run(0.05)
+    told = row(world, "commands")
+    assert told.level == WARN
+    assert "2 programs send as app" in told.message
+    second.hold(0.0, 1.0)
     assert row(world, "commands").level == OK
 
 

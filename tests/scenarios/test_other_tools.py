@@ -345,9 +345,15 @@ class Nav2(Speaker):
     TIMEOUT_S, STEP, MONITOR_S = 0.25, 1.0 / 20.0, 2.0
 
     def __init__(
-        self, world: World, road: Road, *, smoother: bool = True, stamps: Stamps = "none"
+        self,
+        world: World,
+        road: Road,
+        name: str = "a",
+        *,
+        smoother: bool = True,
+        stamps: Stamps = "none",
     ) -> None:
-        super().__init__(world, road)
+        super().__init__(world, road, name)
         self._smoother, self._stamps = smoother, stamps
         self._wanted: float | None = None
         self._wanted_ns = self._stamp_ns = 0
@@ -362,6 +368,11 @@ class Nav2(Speaker):
     def cancel(self) -> None:
         """Cancel the goal, or let it abort: the controller sends one zero."""
         self._tick(0.0)
+
+    def receive_zeros(self, seconds: float) -> None:
+        """Have no goal, while another program publishes zeros to the smoother."""
+        for _ in range(round(seconds * 20.0)):
+            self._tick(0.0)
 
     def idle(self, seconds: float) -> None:
         """Have no goal."""
@@ -470,6 +481,116 @@ def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
     nav2.cancel()
     nav2.idle(5.0)
     drives(world, lambda: nav2.goal(FAST, 1.0))
+
+
+@by_each_road
+def test_the_first_goal_of_nav2_after_a_start_does_not_move_the_robot_and_the_second_one_does(
+    world: World, road: Road
+) -> None:
+    """Nothing before the goal, TwistStamped speeds at 20 Hz from its start, one zero at its end."""
+    nav2 = Nav2(world, road, smoother=False, stamps="kept")
+    nav2.idle(5.0)
+    stands(world, lambda: nav2.goal(FAST, 30.0))
+    nav2.cancel()
+    nav2.idle(0.0 if road == "rmw" else 1.0)
+    drives(world, lambda: nav2.goal(FAST, 0.5))
+    nav2.cancel()
+    nav2.idle(300.0)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+
+
+@pytest.mark.parametrize(("road", "moves"), [("rmw", False), ("bridge", True)])
+def test_a_nav2_that_was_started_again_must_send_a_zero_by_rmw_and_not_by_the_bridge(
+    world: World, road: Road, moves: bool
+) -> None:
+    before = Nav2(world, road, "before", smoother=False, stamps="kept")
+    before.goal(FAST, 3.0)
+    before.cancel()
+    before.idle(2.0)
+    drives(world, lambda: before.goal(FAST, 1.0))
+    before.cancel()
+    before.idle(10.0)
+    again = Nav2(world, road, "again", smoother=False, stamps="kept")
+    (drives if moves else stands)(world, lambda: again.goal(FAST, 2.0))
+
+
+@by_each_road
+@pytest.mark.parametrize("smoother", [True, False])
+@pytest.mark.parametrize("later", [0.0, 60.0])
+def test_zeros_that_pass_through_nav2_after_its_start_replace_the_cancelled_goal(
+    world: World, road: Road, smoother: bool, later: float
+) -> None:
+    """The page has the command. One second of zeros also proves the clock of the monitor."""
+    nav2 = Nav2(world, road, smoother=smoother)
+    nav2.receive_zeros(1.0)
+    nav2.idle(1.0 + later)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+
+
+def test_zeros_that_pass_through_nav2_do_nothing_after_a_clear(world: World) -> None:
+    """The collision monitor falls silent 2 s after its first zero, whatever zeros follow."""
+    nav2 = Nav2(world, "rmw")
+    nav2.receive_zeros(1.0)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+    nav2.cancel()
+    nav2.idle(5.0)
+    stop_and_clear(world, lambda: nav2.idle(CLEAR_S))
+    nav2.receive_zeros(1.0)
+    stands(world, lambda: nav2.goal(FAST, 2.0))
+
+
+def test_a_zero_on_cmd_vel_by_the_bridge_arms_nav2_after_a_clear(world: World) -> None:
+    nav2 = Nav2(world, "bridge")
+    nav2.receive_zeros(1.0)
+    nav2.idle(1.0)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+    nav2.cancel()
+    nav2.idle(5.0)
+    stop_and_clear(world, lambda: nav2.idle(CLEAR_S))
+    topic_pub(world, "bridge", "zeros", 0.0, 1.0)
+    nav2.idle(1.1)
+    drives(world, lambda: nav2.goal(FAST, 1.0))
+
+
+class Docking(Speaker):
+    """Nav2's docking server: speeds at 50 Hz from the first one, past the monitor, one zero."""
+
+    def __init__(self, world: World, road: Road) -> None:
+        super().__init__(world, road, "docking server")
+        self.key = "cmd/dock"
+
+    def dock(self, linear: float, seconds: float) -> None:
+        """Approach the dock."""
+        self.hold(linear, seconds, 50.0)
+
+    def end(self) -> None:
+        """Send the zero with which docking ends, whatever its result."""
+        self.send(0.0)
+        self.world.run(0.02)
+
+
+def test_docking_has_its_own_place_above_nav2_and_below_ros2_control() -> None:
+    rank = {source.name: source.priority for source in World().config.commands.sources}
+    assert rank["nav"] < rank["dock"] < rank["ros2_control"]
+
+
+@by_each_road
+def test_the_first_docking_after_a_start_must_be_cancelled_and_later_ones_pass_the_zeros_of_nav2(
+    world: World, road: Road
+) -> None:
+    """The collision monitor still repeats its zeros when the docking server begins."""
+    monitor, docking = Speaker(world, road, "monitor"), Docking(world, road)
+    monitor.key = "cmd/nav"
+    stands(world, lambda: docking.dock(0.15, 3.0))
+    docking.end()
+    world.run(1.1)
+    since_ns = world.now_ns
+    for _ in range(20):
+        monitor.send(0.0)
+        docking.dock(0.15, 0.1)
+    assert (world.state.mode, world.state.source) == ("driving", "dock")
+    docking.end()
+    assert moved(world, since_ns)
 
 
 @by_each_road

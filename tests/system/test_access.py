@@ -40,7 +40,7 @@ DRIVERS: Who = KEEPERS | {"operator"}
 ANYBODY: Who = DRIVERS | {"viewer"}
 
 ME, OTHER = "acsard/acsar", "acsard/other"
-SOURCES = ("teleop", "app", "ros2_control", "nav")
+SOURCES = ("teleop", "app", "ros2_control", "dock", "nav")
 PLAIN = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "state", "diagnostics", "events")
 VALUES = (*PLAIN, *(f"json/{key}" for key in PLAIN))
 

@@ -53,7 +53,7 @@ TOPICS = {
     "/log": ("rcl_interfaces/msg/Log", "events"),
 } | {
     f"/cmd_vel_in/{source}": ("geometry_msgs/msg/TwistStamped", f"cmd/{source}")
-    for source in ("teleop", "app", "ros2_control", "nav")
+    for source in ("teleop", "app", "ros2_control", "dock", "nav")
 }
 """The ROS type, and the bus key with the same contents."""
 

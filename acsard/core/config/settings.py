@@ -232,6 +232,7 @@ class CommandsConfig(Struct, frozen=True):
         Source("teleop", 100),
         Source("app", 50),
         Source("ros2_control", 20),
+        Source("dock", 15),
         Source("nav", 10),
     )
 

@@ -131,11 +131,17 @@ def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
     values = {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.counters, "command")
     message = f"commanded by {outputs.source}" if outputs.source else "waiting for a command"
+    crowded = [s for s in snapshot.sources if s.waits_for.what == "senders"]
+    for source in crowded:
+        message = (
+            f"{message}; {source.waits_for.senders + 1} programs send as {source.name}, and the "
+            "robot follows one of them: end the others, or give each a source of its own"
+        )
     age_s = snapshot.refused_age_s
     refused = age_s is not None and age_s < REFUSED_S
     if refused:
         message = f"{message}; refused: {snapshot.refused}"
-    return Row("commands", WARN if refused else OK, message, values)
+    return Row("commands", WARN if refused or crowded else OK, message, values)
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:

@@ -99,8 +99,16 @@ PUBLISHED = (
 
 TWISTS = {"twist": "geometry_msgs/msg/Twist", "twist_stamped": "geometry_msgs/msg/TwistStamped"}
 
-SOURCES = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2_control"}
+SOURCES = {
+    "cmd_vel": "nav",
+    "cmd_vel_dock": "dock",
+    "cmd_vel_teleop": "teleop",
+    "joint_commands": "ros2_control",
+}
 """The command source of each topic that commands the robot."""
+
+DOCK = f"cmd/{SOURCES['cmd_vel_dock']}"
+"""Native key of the commands of a docking server."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
 """Subscription to a gyro. It is best effort, so it also accepts drivers with SensorDataQoS."""
@@ -117,6 +125,9 @@ def left_out(config: Config) -> frozenset[str]:
         silent.add(IMU)
     if not (config.lidar.publish_tf or config.footprint.publish_tf):
         silent.add("tf_static")
+    # A configuration from before this source exists does not have it.
+    if not any(source.name == SOURCES["cmd_vel_dock"] for source in config.commands.sources):
+        silent.add(DOCK)
     return frozenset(silent)
 
 
@@ -131,7 +142,8 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
         *(row for row in PUBLISHED if row.native not in silent),
         *(
             RosName(name, f"cmd/{SOURCES[name]}", "in", TWISTS[kind])
-            for name in ("cmd_vel", "cmd_vel_teleop")
+            for name in ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
+            if f"cmd/{SOURCES[name]}" not in silent
             for kind in kinds
         ),
         RosName(

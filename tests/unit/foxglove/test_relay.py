@@ -22,7 +22,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.messages.topics import full_key
 from acsard.core.ros.attachments import Attachment
-from acsard.core.ros.transports import command_keys
+from acsard.core.ros.transports import SOURCES, command_keys
 from acsard.foxglove.relay import News, Reader, Way, ways
 from tests.each import each
 
@@ -116,7 +116,7 @@ def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
 
 def test_all_keys_of_ros_that_command_are_somebody_s() -> None:
     ros = RosConfig()
-    heard = {key for source in ("nav", "teleop", "ros2_control") for key in found(source, ros)}
+    heard = {key for source in SOURCES.values() for key in found(source, ros)}
     assert {key for key in command_keys(ros) if "imu" not in key} <= heard
 
 

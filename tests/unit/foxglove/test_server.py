@@ -67,7 +67,8 @@ def test_without_a_follower_the_robot_is_not_queried(monkeypatch: pytest.MonkeyP
 def test_they_are_the_settings_that_may_be_set_and_no_others() -> None:
     single = {key for key in LIVE if "*" not in key}
     timeouts = {
-        f"commands.sources.{name}.timeout" for name in ("teleop", "app", "nav", "ros2_control")
+        f"commands.sources.{name}.timeout"
+        for name in ("teleop", "app", "dock", "nav", "ros2_control")
     }
     assert set(NOW) == single | timeouts
 

@@ -75,7 +75,13 @@ def test_what_is_set_is_in_the_configuration_and_nothing_else_is() -> None:
 def test_a_source_is_set_by_its_name() -> None:
     made, _ = changed(CONFIG, {"commands.sources.app.timeout": 0.5}, True)
     timeouts = {source.name: source.timeout for source in made.commands.sources}
-    assert timeouts == {"teleop": 0.25, "app": 0.5, "ros2_control": 0.25, "nav": 0.25}
+    assert timeouts == {
+        "teleop": 0.25,
+        "app": 0.5,
+        "ros2_control": 0.25,
+        "dock": 0.25,
+        "nav": 0.25,
+    }
 
 
 def test_a_whole_number_is_a_number_and_a_list_is_one() -> None:

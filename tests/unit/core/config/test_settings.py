@@ -58,11 +58,12 @@ def test_the_default_limits_are_those_of_the_design() -> None:
     assert (limits.linear_jerk, limits.angular_jerk) == (0.0, 0.0)
 
 
-def test_the_default_sources_are_ranked_teleop_app_ros2_control_nav() -> None:
+def test_the_default_sources_are_ranked_teleop_app_ros2_control_dock_nav() -> None:
     assert [(s.name, s.priority, s.timeout) for s in Config().commands.sources] == [
         ("teleop", 100, 0.25),
         ("app", 50, 0.25),
         ("ros2_control", 20, 0.25),
+        ("dock", 15, 0.25),
         ("nav", 10, 0.25),
     ]
 

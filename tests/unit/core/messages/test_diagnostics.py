@@ -10,7 +10,16 @@ from msgspec.structs import replace
 from acsard.core.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
 from acsard.core.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
-from acsard.core.values import GyroStatus, Measured, Outputs, RoutersStatus, Snapshot, Spread
+from acsard.core.values import (
+    GyroStatus,
+    Measured,
+    Outputs,
+    RoutersStatus,
+    Snapshot,
+    SourceStatus,
+    Spread,
+    Wait,
+)
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
 
@@ -167,6 +176,19 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
         "command_stale": "3",
     }
     assert row("commands", outputs=replace(OUTPUTS, source="")).message == "waiting for a command"
+
+
+def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> None:
+    two = SourceStatus("nav", 10, 0.1, Wait("senders", senders=1))
+    alone = SourceStatus("app", 50, 0.1, Wait("nothing"))
+    one = row("commands", snapshot=seen(sources=(alone, two)))
+    assert (one.level, one.message) == (
+        WARN,
+        "commanded by app; 2 programs send as nav, and the robot follows one of them: end the "
+        "others, or give each a source of its own",
+    )
+    assert values(one)["nav"] == "1 more of its senders: wait until the first one is silent"
+    assert row("commands", snapshot=seen(sources=(alone,))).level == OK
 
 
 def test_commands_are_a_warning_while_a_source_is_refused_and_say_why() -> None:

@@ -52,6 +52,7 @@ def test_the_bridge_s_keys_are_the_bare_names() -> None:
         "diagnostics": "diagnostics",
         "cmd_vel_out": "cmd_vel_out",
         "cmd/nav": "cmd_vel",
+        "cmd/dock": "cmd_vel_dock",
         "cmd/teleop": "cmd_vel_teleop",
         "wheel_cmd/ros2_control": "joint_commands",
         "imu": "imu/data",
@@ -93,7 +94,7 @@ def test_over_rmw_a_topic_of_two_types_has_a_key_for_each() -> None:
 def test_one_type_of_twist_can_be_chosen(kind: str, types: list[str]) -> None:
     ros = RosConfig(cmd_vel_type=kind)  # type: ignore[arg-type]
     rmw = [e for e in found(ros) if e.transport == "rmw" and e.native.startswith("cmd/")]
-    assert [e.key.split("/")[2].rpartition("::")[2] for e in rmw] == types * 2
+    assert [e.key.split("/")[2].rpartition("::")[2] for e in rmw] == types * 3
 
 
 @pytest.mark.parametrize(("bridge", "rmw"), [(True, False), (False, True), (False, False)])
@@ -152,7 +153,7 @@ def test_every_endpoint_over_rmw_has_a_token_of_its_own() -> None:
 
 def test_a_bridge_is_told_of_everything_that_has_one_type() -> None:
     silent = {e.native for e in found(RosConfig()) if e.transport == "bridge" and not e.token}
-    assert silent == {"cmd/nav", "cmd/teleop"}
+    assert silent == {"cmd/nav", "cmd/dock", "cmd/teleop"}
     chosen = RosConfig(cmd_vel_type="twist_stamped")
     assert all(e.token for e in found(chosen))
     assert "/MS/cmd_vel/geometry_msgs§msg§TwistStamped/" in "".join(e.token for e in found(chosen))
@@ -167,7 +168,7 @@ def test_a_bridge_is_told_nothing_when_announcing_is_off() -> None:
 def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
     rate_limited = command_keys(RosConfig())
     assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
-    assert len(rate_limited) == 4 + 6
+    assert len(rate_limited) == 5 + 8
 
 
 def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:
@@ -187,6 +188,15 @@ def test_either_static_transform_keeps_tf_static() -> None:
     footprint = FootprintConfig(publish_tf=True)
     config = Config(lidar=LidarConfig(publish_tf=False), footprint=footprint)
     assert "tf_static" not in left_out(config)
+
+
+def test_a_robot_without_the_source_for_docking_has_no_topic_for_it() -> None:
+    """A configuration that was written before this source exists does not list it."""
+    older = CommandsConfig(sources=tuple(s for s in CommandsConfig().sources if s.name != "dock"))
+    config = Config(mcu=REAL, odometry=OdometryConfig(gyro=True), commands=older)
+    assert left_out(config) == {"cmd/dock"}
+    kept = {e.native for e in endpoints(RosConfig(), ZID, left_out(config))}
+    assert {e.native for e in found(RosConfig())} - kept == {"cmd/dock"}
 
 
 def test_a_gyro_of_ros_is_listened_to_where_it_is_wanted_and_the_robot_has_none_itself() -> None:

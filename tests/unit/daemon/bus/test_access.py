@@ -351,7 +351,7 @@ def test_only_configured_sources_may_send_commands(names: list[str]) -> None:
         for name in names:
             assert access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
             assert not access.lets("viewer", "put", access.key(f"{kind}/{name}/operator"))
-        for name in {"teleop", "app", "nav", "ros2_control"}.difference(names):
+        for name in {"teleop", "app", "dock", "nav", "ros2_control"}.difference(names):
             assert not access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
     for endpoint in endpoints(RosConfig(), ZID):
         if endpoint.direction == "in" and endpoint.native != "imu":

@@ -237,7 +237,7 @@ def test_each_commanding_certificate_has_keys_of_its_own_on_each_robot(
         assert set(rule["key_exprs"]) == {
             f"acsard/{robot}/{key}"
             for robot in robots
-            for key in source_keys(("teleop", "app", "ros2_control", "nav"), name)
+            for key in source_keys(("teleop", "app", "ros2_control", "dock", "nav"), name)
         }
         assert (rule["flows"], rule["messages"]) == (["ingress"], ["put"])
         (policy,) = [p for p in access["policies"] if rule["id"] in p["rules"]]
