@@ -444,7 +444,7 @@ def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
         "/joint_commands",
         "/imu/data",
     }
-    assert len(wanted["subscribers"]) == 6
+    assert len(wanted["subscribers"]) == 7
     assert len(services) == 11
 
 

@@ -13,6 +13,7 @@ from acsard.cli.common import add_config, load
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
 from acsard.core.config.writing import document
+from acsard.daemon.robot_description import robot_description
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +23,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     where, config = load(args.config)
+    robot_description(config.ros.urdf)
     plain = effective(config)
     if args.json:
         print(msgspec.json.encode(plain).decode())

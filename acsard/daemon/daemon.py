@@ -21,6 +21,7 @@ from acsard import __version__
 from acsard.core.config.settings import TLS, Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
+from acsard.core.messages.topics import DESCRIPTION
 from acsard.core.values import NS_PER_S, Event, Latches
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.certificate_watch import watch_certificates
@@ -30,6 +31,7 @@ from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
 from acsard.daemon.late_watch import LateWatch
+from acsard.daemon.robot_description import robot_description
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulated_board import Simulated
 from acsard.daemon.settings_file import SettingsFile
@@ -150,6 +152,7 @@ async def _run(
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # entered first, so it runs last
+        urdf = robot_description(config.ros.urdf)
         events, start = list[Event](), clock.now()
         recorder = _recorder(config, events.append, start.wall_ns, stack)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
@@ -184,6 +187,10 @@ async def _run(
             settings_file,
             stack.enter_context(LateWatch()),
         )
+        control.report.description = urdf
+        if (description := control.report.robot_description()) is not None:
+            # Only once: RViz and the controller manager load the robot again with each message.
+            bus.publish(DESCRIPTION, description)
         if settings_file is not None:
             settings_file.start()
             stack.callback(settings_file.close)

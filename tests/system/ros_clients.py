@@ -32,6 +32,7 @@ TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ODOMETRY, TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 JOINTS, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
 TRIGGER = "std_srvs/srv/Trigger"
+STRING = "std_msgs/msg/String"
 LIST, GET = "rcl_interfaces/srv/ListParameters", "rcl_interfaces/srv/GetParameters"
 
 HASHES = {
@@ -39,6 +40,7 @@ HASHES = {
     STAMPED: "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
     ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     TF: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    STRING: "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     JOINTS: "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     TRIGGER: "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
@@ -67,6 +69,9 @@ PUBLISHED = {
     "cmd_vel_out": (STAMPED, 10, False),
 }
 """The robot's publications: type, depth, transient local."""
+
+TWISTS = ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
+"""The topics that take both types of twists."""
 
 TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
 
@@ -388,7 +393,7 @@ class Client(ABC):
 
     def zeros(self, bus: Bus) -> None:
         """Put an accepted zero on every source. From here on each could move the robot."""
-        for name in ("cmd_vel", "cmd_vel_teleop"):
+        for name in TWISTS:
             self.heard(bus, name, TWIST, twist(0.0))
         self.heard(bus, "joint_commands", JOINTS, lambda: joints(0.0))
 

@@ -111,7 +111,7 @@ def _commands() -> Iterator[Try]:
 
 
 def _ros_commands() -> Iterator[Try]:
-    twists = ("cmd_vel", "cmd_vel_teleop")
+    twists = ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
     for name in twists:
         yield Try(name, DRIVERS, CDR_TWIST)
         yield Try(ros.rmw_key(name, ros.TWIST), DRIVERS, CDR_TWIST)

@@ -258,7 +258,12 @@ def every_way(session: zenoh.Session) -> Iterator[Sent]:
     for form in FORMATS:
         payload = encode(moving(JOINTS, speed := next(speeds)), form)
         yield "ros2_control", speed, put("wheel_cmd/ros2_control", payload)
-    topics = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2_control"}
+    topics = {
+        "cmd_vel": "nav",
+        "cmd_vel_dock": "dock",
+        "cmd_vel_teleop": "teleop",
+        "joint_commands": "ros2_control",
+    }
     for client, (topic, source) in itertools.product(
         (RmwClient(session), BridgeHalf(session)), topics.items()
     ):
@@ -276,7 +281,7 @@ def asked(messages: list[Any]) -> list[tuple[str, float, float]]:
 def test_whatever_a_source_commands_by_is_shown_as_an_export_has_it(tmp_path: Path) -> None:
     words = ["--record", str(tmp_path / "record")]
     with Daemon(tmp_path, words=words) as daemon, Shows(daemon) as own, Viewer(own.port) as viewer:
-        sources = ("teleop", "ros2_control", "nav")
+        sources = ("teleop", "ros2_control", "dock", "nav")
         looked = {source: viewer.show(f"/cmd_vel_in/{source}") for source in sources}
         read: dict[str, list[Any]] = {source: [] for source in sources}
 

@@ -29,6 +29,7 @@ from tests.system.ros_clients import (
     TF,
     TRIGGER,
     TWIST,
+    TWISTS,
     WHEELS,
     Attached,
     BridgeHalf,
@@ -204,7 +205,7 @@ def test_an_independent_client_stops_and_clears_the_robot(ground: Ground) -> Non
 def test_an_independent_client_lists_topics_services_and_the_node(ground: Ground) -> None:
     prefix = ground.prefix
     topics = {f"{prefix}/{name}": [kind] for name, (kind, _, _) in PUBLISHED.items()}
-    topics |= {f"{prefix}/{name}": [TWIST, STAMPED] for name in ("cmd_vel", "cmd_vel_teleop")}
+    topics |= {f"{prefix}/{name}": [TWIST, STAMPED] for name in TWISTS}
     topics |= {f"{prefix}/joint_commands": [JOINTS]}
     services = {f"{prefix}/{name}": [kind] for name, kind in SERVICES.items()}
     for what, expected in (("topics", topics), ("services", services)):
@@ -259,8 +260,7 @@ def test_every_token_has_the_form_the_graph_is_read_by(bus: Bus, ros: RmwClient)
     (zid,) = map(str, bus.session.info.peers_zid())
     rows = [("MP", name, *row) for name, row in PUBLISHED.items()]
     rows += [("SS", name, kind, 10, False) for name, kind in SERVICES.items()]
-    rows += [("MS", name, kind, 10, False) for name in ("cmd_vel", "cmd_vel_teleop")
-             for kind in (TWIST, STAMPED)]  # fmt: skip
+    rows += [("MS", name, kind, 10, False) for name in TWISTS for kind in (TWIST, STAMPED)]
     rows += [("MS", "joint_commands", JOINTS, 10, False)]
     head, node = f"@ros2_lv/0/{zid}/0", "%/%/acsard"
     expected = {f"{head}/NUMBER/NN/{node}"}

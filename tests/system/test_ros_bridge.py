@@ -21,6 +21,7 @@ from tests.system.ros_clients import (
     QUICK,
     SERVICES,
     TWIST,
+    TWISTS,
     BridgeHalf,
     RmwClient,
     changes,
@@ -136,7 +137,7 @@ def announced(zid: str, namespace: str, twists: bool) -> set[str]:
         found.add(f"{head}/MP/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
     taken = {"joint_commands": JOINTS}
     if twists:
-        taken |= {"cmd_vel": TWIST, "cmd_vel_teleop": TWIST}
+        taken |= dict.fromkeys(TWISTS, TWIST)
     for name, kind in taken.items():
         qos = f":1:0:0,10:typehash=RIHS01_{HASHES[kind]};"
         found.add(f"{head}/MS/{prefix}{name}/{kind.replace('/', '§')}/{qos}")

@@ -9,6 +9,7 @@ a package is a base type; `[]` is a sequence, `[<=n]` a bounded one, `[n]` an ar
 from __future__ import annotations
 
 MESSAGES = """
+std_msgs/msg/String: string data
 sensor_msgs/msg/Imu: \
     std_msgs/msg/Header header, \
     geometry_msgs/msg/Quaternion orientation, float64[9] orientation_covariance, \

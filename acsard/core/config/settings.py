@@ -323,6 +323,10 @@ class RosConfig(Struct, frozen=True):
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
     namespace: RosNamespace = ""
     node: RosNode = "acsard"
+    urdf: Annotated[
+        str,
+        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a file, or empty"}),
+    ] = ""
     cmd_vel_type: Literal["auto", "twist", "twist_stamped"] = "auto"
 
 

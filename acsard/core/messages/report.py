@@ -28,6 +28,7 @@ from acsard.core.messages.schema import (
     RobotState,
     SourceState,
     Spread,
+    String,
     TFMessage,
     Time,
     Transform,
@@ -83,6 +84,8 @@ class Report:
         """
         self.settings_differ = ""
         """How the settings in force differ from the configuration file, in words; else empty."""
+        self.description = ""
+        """The robot's URDF; "" without a file in `[ros] urdf`."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
@@ -152,6 +155,8 @@ class Report:
         match key:
             case "tf_static":
                 return self.tf_static()
+            case "robot_description":
+                return self.robot_description()
             case "odom":
                 return self._odom(estimate, look().measured is not None) if estimate else None
             case "tf":
@@ -184,6 +189,10 @@ class Report:
                 TransformStamped(base, footprint.footprint_frame, Transform(place, Quaternion()))
             )
         return TFMessage(transforms)
+
+    def robot_description(self) -> String | None:
+        """Return the message with the URDF, or None if the robot has none."""
+        return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
         """Return the message with the stamp of its sample.

@@ -290,6 +290,12 @@ class GatewayState(Message, frozen=True):
     """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
 
 
+class String(Message, frozen=True):
+    """A text, such as the robot's URDF on `robot_description`."""
+
+    data: str
+
+
 class KeyValue(Message, frozen=True):
     """A diagnostic value as text."""
 
@@ -441,6 +447,7 @@ MESSAGES: dict[str, type[Message]] = {
         JointState,
         PoseStamped,
         Imu,
+        String,
         Twist,
         TwistStamped,
         RobotState,

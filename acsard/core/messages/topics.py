@@ -56,6 +56,8 @@ class Topic(Struct, frozen=True):
     """True for a key that exists only with the built-in simulator."""
     gyro: bool = False
     """True for a key that exists only with `[odometry] gyro = true`."""
+    urdf: bool = False
+    """True for a key that exists only with a file in `[ros] urdf`."""
 
     @property
     def pattern(self) -> str:
@@ -119,6 +121,9 @@ PLAIN_SERVICES = tuple(
 IMU = "imu"
 """Key of the gyro's samples. The simulator publishes the samples of its gyro on the same key."""
 
+DESCRIPTION = "robot_description"
+"""Key of the robot's URDF."""
+
 WHOAMI = "whoami/<role>"
 """One key for each role.
 
@@ -150,12 +155,19 @@ VERBS: dict[str, Verb] = {service_key(verb): verb for verb in SERVICES}
 
 
 def _out(
-    key: str, kind: str, rate: str, note: str, *, latched: bool = False, simulated: bool = False
+    key: str,
+    kind: str,
+    rate: str,
+    note: str,
+    *,
+    latched: bool = False,
+    simulated: bool = False,
+    urdf: bool = False,
 ) -> Topic:
     """Return the row of a published key, which every client may follow and query."""
     return Topic(
         key, "out", kind, rate, note,
-        subscribe="viewer", query="viewer", latched=latched, simulated=simulated,
+        subscribe="viewer", query="viewer", latched=latched, simulated=simulated, urdf=urdf,
     )  # fmt: skip
 
 
@@ -178,6 +190,10 @@ TOPICS: tuple[Topic, ...] = (
     _out("odom", "Odometry", "every feedback", "pose, twist, covariance of base in odom"),
     _out("tf", "TFMessage", "with odom", "transform odom -> base"),
     _out("tf_static", "TFMessage", "latched", "transform base -> lidar", latched=True),
+    _out(
+        DESCRIPTION, "String", "latched", "the URDF, with a file in [ros] urdf",
+        latched=True, urdf=True,
+    ),
     _out("wheel_states", "JointState", "every feedback", "wheel angles and speeds"),
     _out("cmd_vel_out", "TwistStamped", "every period", "the twist applied after limits"),
     _out("state", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
@@ -225,9 +241,14 @@ PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direct
 
 def offered(config: Config) -> tuple[Topic, ...]:
     """Return the rows that a daemon with this configuration has."""
-    simulated, gyro = config.mcu.simulated, config.odometry.gyro
-    rows = (topic for topic in TOPICS if simulated or not topic.simulated)
-    return tuple(topic for topic in rows if gyro or not topic.gyro)
+    simulated, gyro, urdf = config.mcu.simulated, config.odometry.gyro, bool(config.ros.urdf)
+    return tuple(
+        topic
+        for topic in TOPICS
+        if (simulated or not topic.simulated)
+        and (gyro or not topic.gyro)
+        and (urdf or not topic.urdf)
+    )
 
 
 def published(config: Config) -> tuple[Topic, ...]:

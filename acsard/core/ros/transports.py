@@ -15,7 +15,13 @@ from msgspec import Struct
 
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.encodings import encoding_name
-from acsard.core.messages.topics import IMU, PLAIN_SERVICES, Direction, service_key
+from acsard.core.messages.topics import (
+    DESCRIPTION,
+    IMU,
+    PLAIN_SERVICES,
+    Direction,
+    service_key,
+)
 from acsard.core.ros.names import (
     Kind,
     Node,
@@ -107,8 +113,8 @@ SOURCES = {
 }
 """The command source of each topic that commands the robot."""
 
-DOCK = f"cmd/{SOURCES['cmd_vel_dock']}"
-"""Native key of the commands of a docking server."""
+URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
+"""The robot's description. A recording does not have it, so it is not in `PUBLISHED`."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
 """Subscription to a gyro. It is best effort, so it also accepts drivers with SensorDataQoS."""
@@ -125,9 +131,8 @@ def left_out(config: Config) -> frozenset[str]:
         silent.add(IMU)
     if not (config.lidar.publish_tf or config.footprint.publish_tf):
         silent.add("tf_static")
-    # A configuration from before this source exists does not have it.
-    if not any(source.name == SOURCES["cmd_vel_dock"] for source in config.commands.sources):
-        silent.add(DOCK)
+    if not config.ros.urdf:
+        silent.add(DESCRIPTION)
     return frozenset(silent)
 
 
@@ -139,11 +144,10 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
-        *(row for row in PUBLISHED if row.native not in silent),
+        *(row for row in (*PUBLISHED, URDF) if row.native not in silent),
         *(
             RosName(name, f"cmd/{SOURCES[name]}", "in", TWISTS[kind])
             for name in ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
-            if f"cmd/{SOURCES[name]}" not in silent
             for kind in kinds
         ),
         RosName(

@@ -23,6 +23,7 @@ from typing import Literal, TypedDict
 from acsard.core.config.settings import Config
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
 from acsard.core.messages.topics import (
+    DESCRIPTION,
     IMU,
     Direction,
     full_key,
@@ -120,7 +121,7 @@ class _Keys:
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
         self._robot, self._sources = robot, [source.name for source in config.commands.sources]
-        self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU})
+        self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU, DESCRIPTION})
         topics, outgoing = offered(config), published(config)
         self._incoming = [topic for topic in topics if topic not in outgoing]
         """Rows of the topic table on which clients put, and the queries and services.

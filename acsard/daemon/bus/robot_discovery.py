@@ -180,6 +180,8 @@ def _silent(key: str) -> str:
         return f"no program sends on {key} now"
     if row.simulated:
         return f"only the simulator publishes {key}"
+    if row.urdf:
+        return f"{key} is published only with a file in [ros] urdf of the robot's acsard.toml"
     return _unpublished(key, row)
 
 

@@ -37,6 +37,7 @@ from acsard.core.messages.schema import (
     RobotState,
     SourceState,
     Spread,
+    String,
     TFMessage,
     Time,
     TwistStamped,
@@ -59,7 +60,7 @@ from acsard.core.values import (
 from tests.each import each
 from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
-ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
+ALL = {topic.key for topic in PUBLISHED if not (topic.simulated or topic.urdf)}
 """Keys that a report publishes.
 
 The simulator publishes the true values of a simulated robot itself.
@@ -569,6 +570,14 @@ def test_there_is_no_present_value_before_the_first_step(key: str) -> None:
 def test_the_static_transforms_are_there_from_the_start() -> None:
     report = Report(CONFIG, START)
     assert report.current("tf_static", never) == report.tf_static()
+
+
+def test_the_urdf_is_there_from_the_start_if_the_robot_has_one() -> None:
+    report = Report(CONFIG, START)
+    assert report.current("robot_description", never) is None
+    report.description = '<robot name="r7"/>'
+    assert report.current("robot_description", never) == String('<robot name="r7"/>')
+    assert "robot_description" not in dict(report.due(OUTPUTS, ALL | {"robot_description"}, look))
 
 
 @each("key", sorted(ALL - {"tf_static"}))

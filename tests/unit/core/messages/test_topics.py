@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, McuConfig, OdometryConfig
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig, RosConfig
 from acsard.core.messages.schema import MESSAGES
 from acsard.core.messages.topics import (
     PUBLISHED,
@@ -27,6 +27,7 @@ PROMISED = [
     ("odom", "out", "Odometry"),
     ("tf", "out", "TFMessage"),
     ("tf_static", "out", "TFMessage"),
+    ("robot_description", "out", "String"),
     ("wheel_states", "out", "JointState"),
     ("cmd_vel_out", "out", "TwistStamped"),
     ("state", "out", "RobotState"),
@@ -78,8 +79,8 @@ def test_published_is_every_way_out_but_the_token_and_the_same_in_json() -> None
     assert all(topic.type in MESSAGES for topic in PUBLISHED)
 
 
-def test_only_the_static_transforms_wait_for_late_joiners() -> None:
-    assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static"]
+def test_only_the_static_transforms_and_the_urdf_wait_for_late_joiners() -> None:
+    assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static", "robot_description"]
 
 
 GYRO = OdometryConfig(gyro=True)
@@ -89,6 +90,12 @@ REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 def test_the_truth_is_offered_where_the_robot_is_simulated_and_nowhere_else() -> None:
     simulated = {topic.key for topic in offered(Config())}
     assert simulated - {topic.key for topic in offered(REAL)} == {"sim/pose"}
+
+
+def test_a_description_is_offered_only_with_a_file() -> None:
+    described = replace(REAL, ros=RosConfig(urdf="/etc/acsard/robot.urdf"))
+    more = {topic.key for topic in offered(described)} - {topic.key for topic in offered(REAL)}
+    assert more == {"robot_description"}
 
 
 @pytest.mark.parametrize("config", [Config(), REAL, replace(REAL, odometry=GYRO)])

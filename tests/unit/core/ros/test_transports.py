@@ -28,6 +28,7 @@ from acsard.core.ros.transports import (
 
 ZID = "abc"
 REAL = McuConfig(port="/dev/ttyACM0")
+DESCRIBED = RosConfig(urdf="/etc/acsard/robot.urdf")
 
 
 def found(ros: RosConfig) -> list[Endpoint]:
@@ -48,6 +49,7 @@ def test_the_bridge_s_keys_are_the_bare_names() -> None:
         "odom": "odom",
         "tf": "tf",
         "tf_static": "tf_static",
+        "robot_description": "robot_description",
         "wheel_states": "joint_states",
         "diagnostics": "diagnostics",
         "cmd_vel_out": "cmd_vel_out",
@@ -137,7 +139,10 @@ def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
 
 
 def test_only_what_is_latched_in_the_native_tree_is_latched() -> None:
-    assert {e.native for e in found(RosConfig()) if e.latched} == {"tf_static"}
+    assert {e.native for e in found(RosConfig()) if e.latched} == {
+        "tf_static",
+        "robot_description",
+    }
 
 
 def test_every_endpoint_over_rmw_has_a_token_of_its_own() -> None:
@@ -173,7 +178,7 @@ def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
 
 def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:
     odometry = OdometryConfig(publish_tf=False, gyro=True)
-    off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False))
+    off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False), ros=DESCRIBED)
     assert left_out(off) == {"tf", "tf_static"}
     kept = endpoints(RosConfig(), ZID, left_out(off))
     assert not {e.native for e in kept} & {"tf", "tf_static"}
@@ -190,19 +195,21 @@ def test_either_static_transform_keeps_tf_static() -> None:
     assert "tf_static" not in left_out(config)
 
 
-def test_a_robot_without_the_source_for_docking_has_no_topic_for_it() -> None:
-    """A configuration that was written before this source exists does not list it."""
-    older = CommandsConfig(sources=tuple(s for s in CommandsConfig().sources if s.name != "dock"))
-    config = Config(mcu=REAL, odometry=OdometryConfig(gyro=True), commands=older)
-    assert left_out(config) == {"cmd/dock"}
+def test_a_robot_without_a_urdf_has_no_topic_for_it() -> None:
+    config = Config(mcu=REAL, odometry=OdometryConfig(gyro=True))
+    assert left_out(config) == {"robot_description"}
     kept = {e.native for e in endpoints(RosConfig(), ZID, left_out(config))}
-    assert {e.native for e in found(RosConfig())} - kept == {"cmd/dock"}
+    assert {e.native for e in found(RosConfig())} - kept == {"robot_description"}
 
 
 def test_a_gyro_of_ros_is_listened_to_where_it_is_wanted_and_the_robot_has_none_itself() -> None:
     wanted = OdometryConfig(gyro=True)
-    assert left_out(Config(mcu=REAL, odometry=wanted)) == set()
-    for other in (Config(mcu=REAL), Config(), Config(odometry=wanted)):
+    assert left_out(Config(mcu=REAL, odometry=wanted, ros=DESCRIBED)) == set()
+    for other in (
+        Config(mcu=REAL, ros=DESCRIBED),
+        Config(ros=DESCRIBED),
+        Config(odometry=wanted, ros=DESCRIBED),
+    ):
         assert left_out(other) == {"imu"}
         assert not [e for e in endpoints(RosConfig(), ZID, left_out(other)) if e.native == "imu"]
 

@@ -1,0 +1,85 @@
+"""Reads the robot's URDF from the file in `[ros] urdf`, or says why the file cannot be published.
+
+The daemon publishes the text as it is. The checks find the mistakes that would otherwise appear
+only in the tools of ROS: another file, a xacro file, a file that no link accepts.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import String
+from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
+from acsard.host.errors import Exit, ExitError
+
+MAX_BYTES = 50_000
+"""Largest file, bytes. The TLS gateway and the routers accept no message above `MESSAGE_BYTES`, and
+JSON has two bytes for each quotation mark and each line end."""
+
+MAX_JSON = MESSAGE_BYTES - 1024
+"""Largest message as JSON, bytes. The rest is for the key and for Zenoh's headers."""
+
+XACRO = "{http://www.ros.org/wiki/xacro}"
+"""Prefix of the names of xacro's elements, as ElementTree writes them."""
+
+
+def robot_description(path: str) -> str:
+    """Return the text of the URDF at `path`, or "" if `path` is "".
+
+    Raises:
+        ExitError: the file cannot be published. The message says what to do.
+    """
+    if not path:
+        return ""
+    file = Path(path)
+    try:
+        # A pipe of this name would never end.
+        if file.exists() and not file.is_file():
+            raise _error(path, "it is not a file; name the URDF itself")
+        with file.open("rb") as opened:
+            data = opened.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise _error(
+            path, 'there is no such file; write its whole path, or ros.urdf = "" for no description'
+        ) from None
+    except PermissionError:
+        raise _error(
+            path,
+            "no permission to read it; a service reads only files that its user may read, such as "
+            "/etc/acsard/robot.urdf",
+            Exit.NO_PERMISSION,
+        ) from None
+    except OSError as error:
+        raise _error(path, f"it cannot be read: {error.strerror or error}") from None
+    if len(data) > MAX_BYTES:
+        raise _too_large(path)
+    try:
+        text = data.decode("utf-8-sig")
+        root = ET.fromstring(text)
+    except UnicodeDecodeError:
+        raise _error(path, "it is not a text in UTF-8; save it as UTF-8") from None
+    except (ET.ParseError, ValueError) as error:
+        raise _error(path, f"it is not XML ({error}); name the robot's URDF") from None
+    if root.tag != "robot":
+        raise _error(path, f"its outermost element is <{root.tag}>, and that of a URDF is <robot>")
+    if any(element.tag.startswith(XACRO) for element in root.iter()):
+        raise _error(
+            path, f"it is a xacro file; make the URDF with `xacro {path} > robot.urdf`, and name it"
+        )
+    if len(encode(String(text), "json")) > MAX_JSON:
+        raise _too_large(path)
+    return text
+
+
+def _too_large(path: str) -> ExitError:
+    return _error(
+        path,
+        f"it has more than {MAX_BYTES} bytes, or more than {MAX_JSON} as JSON, and the links of "
+        "the bus take no longer message; shorten it, or let robot_state_publisher publish it",
+    )
+
+
+def _error(path: str, why: str, code: Exit = Exit.BAD_CONFIG) -> ExitError:
+    return ExitError(code, f'ros.urdf = "{path}": {why}')
