@@ -411,6 +411,7 @@ COMMANDS: dict[str, How] = {
     "-r cmd_vel:=cmd_vel_teleop": NO_ROS,
     "ros2 topic pub -r 10 -t 10 /cmd_vel_nav geometry_msgs/msg/Twist": NO_ROS,
     "ros2 topic pub -r 10 -t 10 /cmd_vel geometry_msgs/msg/Twist": NO_ROS,
+    'ros2 topic pub --once /speed_limit nav2_msgs/msg/SpeedLimit "{speed_limit: 0.0}"': NO_ROS,
     "ros2 run diagnostic_aggregator aggregator_node --ros-args "
     "--params-file deploy/ros2/diagnostics.yaml": NO_ROS,
     f"ros2 launch {_LAUNCH_FILE} use_rviz:=true": LAUNCH,

@@ -78,6 +78,7 @@ RULES: dict[tuple[Role, Use], str] = {
     ("viewer", "query"): "see",
     ("viewer", "publish"): "stop",
     ("operator", "query"): "operate",
+    ("operator", "publish"): "slow",
     ("maintainer", "query"): "keep",
     ("maintainer", "publish"): "sense",
 }

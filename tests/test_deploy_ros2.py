@@ -442,6 +442,7 @@ def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
         "/cmd_vel_dock",
         "/cmd_vel_teleop",
         "/joint_commands",
+        "/speed_limit",
         "/imu/data",
     }
     assert len(wanted["subscribers"]) == 7

@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config
+from acsard.core.config.lowered import lowered
+from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
@@ -25,11 +26,12 @@ from acsard.core.incoming.bus_interface import (
 from acsard.core.incoming.commands import Receiver, caller_name, parts, sender
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Queries, Query, refused
+from acsard.core.incoming.speed_limit import SpeedLimiter
 from acsard.core.link.serial_output import Port
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import Info, Message
-from acsard.core.messages.topics import IMU
+from acsard.core.messages.topics import IMU, SPEED_LIMIT
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.robot import Robot
 from acsard.core.values import (
@@ -103,6 +105,12 @@ class ControlLoop:
         self._beside = beside
         self._config, self._adopted, self._settings_file = config, adopted, settings_file
         self._recorder, self._handover = recorder, Handover(latches, keeper)
+        self._started, self._speed = config.limits, SpeedLimiter(self.robot.config)
+        """The limits of the configuration file at the start, and the speed limit in force."""
+        self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
+        """The last latches without a speed limit, with the objects that they were made of."""
+        self._told: tuple[Answer, ...] = ()
+        """The answers of this step."""
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that wait until the file has the latches, each with its monotonic time."""
         self._got = NOTHING
@@ -171,6 +179,7 @@ class ControlLoop:
                     self._others += self._late_watch.news()
         commands, refusals, requests = self._from_bus(now)
         requests += self._keepable(now)
+        requests, refused_sets = self._speed.requests(requests, now.mono_ns)
         self._others += self._handover.news()
         port, pace = self._port, self._pace
         # Take the bytes first: `take` closes the port when the computer was suspended.
@@ -200,6 +209,7 @@ class ControlLoop:
             self._turn_rates.clear()
         before = self._config
         outputs, went = self._decided(inputs)
+        self._told = (*refused_sets, *self._told)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
@@ -215,6 +225,7 @@ class ControlLoop:
         """Return the outputs and whether their line left, and record the step in any case."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
+            self._told = self._speed.settle(self.robot.config, outputs.answers, self._others)
             self._handover.take(self._to_keep(outputs.latches))
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
@@ -228,10 +239,23 @@ class ControlLoop:
         return outputs, went is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
-        """Return the latches of the robot as the next start of the daemon needs them."""
-        if self._settings_file is None:
-            return latches
-        return self._settings_file.latches(latches, self.robot.config.limits)
+        """Return the latches of the robot as the next start of the daemon needs them.
+
+        The limits that a person has lowered are kept over a restart. A speed limit is not, because
+        the program that would lift it may be gone.
+        """
+        now, file = self._speed.settings.limits, self._settings_file
+        if file is not None:
+            latches = file.latches(latches, now)
+        if self._speed.lowers:
+            limits, kept = self._started if file is None else file.limits, self._kept
+            if kept is None or not (kept[0] is latches and kept[1] is now and kept[2] is limits):
+                without = replace(latches, lowered=lowered(limits, now))
+                kept = self._kept = latches, now, limits, without
+            latches = kept[3]
+        last = self._handover.latches
+        # The file is written again for another object only.
+        return last if latches == last else latches
 
     def finish(self, now: Instant) -> None:
         """Keep the stops that arrived after the last step, and give the last answers."""
@@ -251,7 +275,7 @@ class ControlLoop:
         self.report.use(config)
         self._queries.use(config)
         if self._settings_file is not None:
-            self._settings_file.use(config)
+            self._settings_file.use(self._speed.settings)
 
     def _from_bus(
         self, now: Instant
@@ -274,6 +298,11 @@ class ControlLoop:
                 heard = self._imu.receive(arrival, self.robot.counters, self._others)
                 if heard is not None:
                     self._turn_rates.append(heard)
+                continue
+            if arrival.key == SPEED_LIMIT:
+                file = self._settings_file
+                limits = self._started if file is None else file.limits
+                self._speed.receive(arrival, limits.linear_speed, refusals)
                 continue
             if arrival.key == "stop":
                 if arrival.put:
@@ -379,12 +408,10 @@ class ControlLoop:
                 told_ns = self._mono_ns()
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, told_ns)
-        if outputs.answers:
+        if self._told:
             file, now_ns = self._settings_file, outputs.now.mono_ns
             self._answers.extend(
-                (now_ns, answer)
-                for answer in outputs.answers
-                if file is None or not file.obeyed(answer)
+                (now_ns, answer) for answer in self._told if file is None or not file.obeyed(answer)
             )
         if self._answers:
             self._answer(outputs.now)
@@ -412,6 +439,7 @@ class ControlLoop:
         outputs = self.outputs
         if self._settings_file is not None:
             self.report.settings_differ = self._settings_file.differ
+        self.report.speed_limit = self._speed.text
         now_ns = 0 if outputs is None else outputs.now.mono_ns
         return replace(
             self.robot.snapshot(now_ns),

@@ -122,7 +122,7 @@ class SettingsFile:
             self.differ = f"this process cannot compare them with the file ({error})"
 
     def use(self, config: Config) -> None:
-        """Take the configuration that is in force from now on."""
+        """Take the configuration in force from now on, without a speed limit."""
         self._in_force = config
         self._look()
 
@@ -184,6 +184,11 @@ class SettingsFile:
             del self._pending[waits.request.id]
         return [*found, *map(_overdue, overdue)]
 
+    @property
+    def limits(self) -> LimitsConfig:
+        """The limits of the daemon's start, with those that it has written since."""
+        return self._limits
+
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
         """Return the latches of the robot for the next start, which begins with the file.
 
@@ -192,7 +197,7 @@ class SettingsFile:
 
         Args:
             latches: the latches of the robot.
-            now: the limits in force.
+            now: the limits in force, without a speed limit.
         """
         file = self._limits
         if file is self._started:

@@ -33,6 +33,7 @@ ODOMETRY, TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 JOINTS, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
 TRIGGER = "std_srvs/srv/Trigger"
 STRING = "std_msgs/msg/String"
+SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
 LIST, GET = "rcl_interfaces/srv/ListParameters", "rcl_interfaces/srv/GetParameters"
 
 HASHES = {
@@ -40,6 +41,7 @@ HASHES = {
     STAMPED: "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
     ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     TF: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    SPEED_LIMIT: "83d8e4e842559f4d9a988b19d31b162216ec738536389f98438d1a166f91845a",
     STRING: "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     JOINTS: "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
@@ -116,6 +118,7 @@ QUICK = {
 
 _store: Any = get_typestore(Stores.ROS2_JAZZY)
 for _name, _text in {
+    SPEED_LIMIT: "std_msgs/Header header\nbool percentage\nfloat64 speed_limit",
     "std_srvs/msg/TriggerReply": "bool success\nstring message",
     "rcl_interfaces/msg/ListRequest": "string[] prefixes\nuint64 depth",
     "rcl_interfaces/msg/ListReply": "rcl_interfaces/ListParametersResult result",

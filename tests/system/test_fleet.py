@@ -581,7 +581,7 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(
     for robot in ROBOTS:
         found = {
             kind: {key.removeprefix(f"acsard/{robot}/") for key in keys[f"{kind}-{robot}"]}
-            for kind in ("see", "stop", "operate", "keep", "sense")
+            for kind in ("see", "stop", "operate", "slow", "keep", "sense")
         }
         found["drive"] = {
             key.removeprefix(f"acsard/{robot}/")
@@ -589,8 +589,9 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(
             if key.startswith(f"acsard/{robot}/")
         }
         assert found["see"] | found["keep"] >= published | asked | {"alive"}
+        inputs = {"stop", "imu", "speed_limit"}
         assert set().union(*found.values()) == (
-            published | asked | services | commands | {"alive", "stop", "imu", *least.values()}
+            published | asked | services | commands | inputs | {"alive", *least.values()}
         )
         assert found["drive"] == commands
         for kind, role in (("see", "viewer"), ("operate", "operator"), ("keep", "maintainer")):

@@ -25,6 +25,7 @@ from tests.system.ros_clients import (
     PUBLISHED,
     QUICK,
     SERVICES,
+    SPEED_LIMIT,
     STAMPED,
     TF,
     TRIGGER,
@@ -206,7 +207,7 @@ def test_an_independent_client_lists_topics_services_and_the_node(ground: Ground
     prefix = ground.prefix
     topics = {f"{prefix}/{name}": [kind] for name, (kind, _, _) in PUBLISHED.items()}
     topics |= {f"{prefix}/{name}": [TWIST, STAMPED] for name in TWISTS}
-    topics |= {f"{prefix}/joint_commands": [JOINTS]}
+    topics |= {f"{prefix}/joint_commands": [JOINTS], f"{prefix}/speed_limit": [SPEED_LIMIT]}
     services = {f"{prefix}/{name}": [kind] for name, kind in SERVICES.items()}
     for what, expected in (("topics", topics), ("services", services)):
         until(partial(_lists, ground.sdk, what, expected), 5.0, f"all {what}")
@@ -262,6 +263,7 @@ def test_every_token_has_the_form_the_graph_is_read_by(bus: Bus, ros: RmwClient)
     rows += [("SS", name, kind, 10, False) for name, kind in SERVICES.items()]
     rows += [("MS", name, kind, 10, False) for name in TWISTS for kind in (TWIST, STAMPED)]
     rows += [("MS", "joint_commands", JOINTS, 10, False)]
+    rows += [("MS", "speed_limit", SPEED_LIMIT, 10, False)]
     head, node = f"@ros2_lv/0/{zid}/0", "%/%/acsard"
     expected = {f"{head}/NUMBER/NN/{node}"}
     for role, name, kind, depth, transient in rows:

@@ -27,6 +27,7 @@ from tests.system.ros_clients import (
     PUBLISHED,
     QUICK,
     REQUESTS,
+    SPEED_LIMIT,
     STAMPED,
     STRING,
     TF,
@@ -42,6 +43,7 @@ from tests.system.ros_clients import (
     changes,
     decode,
     encode,
+    header,
     joints,
     make,
     refused_without_motion,
@@ -147,6 +149,35 @@ def test_the_urdf_is_latched_and_sent_once(described: Daemon, transport: str) ->
             with ros.follow_late("tf_static", TF) as repeated:
                 until(lambda: len(repeated.seen) >= 2, 7.0, "the transforms are repeated")
             assert len(samples.seen) == 1
+
+
+# speed limits
+
+
+@pytest.mark.usefixtures("restored")
+def test_a_speed_limit_slows_the_robot_until_it_is_lifted(bus: Bus, ros: Client) -> None:
+    def send(value: float) -> None:
+        limit = make(SPEED_LIMIT, header=header(), percentage=False, speed_limit=value)
+        ros.put("speed_limit", SPEED_LIMIT, encode(limit))
+
+    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.4):
+        states.find(lambda s: (s["linear"] or 0.0) > 0.35, 3.0, "it drives")
+        send(0.2)
+        limited_at = time.monotonic()
+        states.find(
+            lambda s: "0.2 m/s" in s["speed_limit"] and 0.15 < (s["linear"] or 0.0) < 0.25,
+            3.0,
+            "it is slower",
+            after=limited_at,
+        )
+        assert bus.get("config")["limits"]["linear_speed"] == 0.2
+        send(0.0)
+        states.find(
+            lambda s: not s["speed_limit"] and (s["linear"] or 0.0) > 0.35,
+            3.0,
+            "it is fast again",
+            after=time.monotonic(),
+        )
 
 
 # commands

@@ -20,6 +20,7 @@ from tests.system.ros_clients import (
     PUBLISHED,
     QUICK,
     SERVICES,
+    SPEED_LIMIT,
     TWIST,
     TWISTS,
     BridgeHalf,
@@ -135,7 +136,7 @@ def announced(zid: str, namespace: str, twists: bool) -> set[str]:
     for name, (kind, depth, late) in PUBLISHED.items():
         qos = f":1:{int(late)}:0,{depth}:typehash=RIHS01_{HASHES[kind]};"
         found.add(f"{head}/MP/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
-    taken = {"joint_commands": JOINTS}
+    taken = {"joint_commands": JOINTS, "speed_limit": SPEED_LIMIT}
     if twists:
         taken |= dict.fromkeys(TWISTS, TWIST)
     for name, kind in taken.items():

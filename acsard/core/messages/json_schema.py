@@ -17,19 +17,26 @@ from acsard.core.messages.schema import (
     MESSAGES,
     Imu,
     JointState,
+    SpeedLimit,
     TwistStamped,
 )
 from acsard.core.messages.topics import SERVICES
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-ONLY_IN = {"Twist", "GatewayState", *(service.payload for service in SERVICES.values())}
+ONLY_IN = {
+    "Twist",
+    "SpeedLimit",
+    "GatewayState",
+    *(service.payload for service in SERVICES.values()),
+}
 BOTH_WAYS = (TwistStamped, JointState, Imu)
 
 ENOUGH: dict[type, list[str]] = {
     TwistStamped: ["twist"],
     JointState: ["name", "velocity"],
     Imu: ["angular_velocity"],
+    SpeedLimit: ["speed_limit"],
 }
 """Required fields of the received types that do not require all fields without a default."""
 

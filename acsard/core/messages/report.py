@@ -84,6 +84,8 @@ class Report:
         """
         self.settings_differ = ""
         """How the settings in force differ from the configuration file, in words; else empty."""
+        self.speed_limit = ""
+        """The speed limit that lowers a setting, in words; else empty."""
         self.description = ""
         """The robot's URDF; "" without a file in `[ros] urdf`."""
         self._names = list(config.joints.as_tuple())
@@ -262,6 +264,7 @@ class Report:
             latch_file_error=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
             settings_differ=self.settings_differ,
+            speed_limit=self.speed_limit,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:

@@ -182,6 +182,15 @@ class Imu(Message, frozen=True):
     linear_acceleration_covariance: Covariance3
 
 
+class SpeedLimit(Message, frozen=True):
+    """A highest speed below that of the settings, as nav2_msgs/SpeedLimit; 0.0 is no limit."""
+
+    header: Header
+    percentage: bool
+    """Whether `speed_limit` is in % of the configured `limits.linear_speed`, and not in m/s."""
+    speed_limit: float
+
+
 class SourceState(Message, frozen=True):
     """A source of commands."""
 
@@ -270,7 +279,13 @@ class RobotState(Message, frozen=True):
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
-    If the daemon could not start again with that file, the text has the reason.
+    If the daemon could not start again with that file, the text has the reason. The effect of a
+    speed limit is not among them.
+    """
+    speed_limit: str = ""
+    """The limit of a SpeedLimit that lowers `limits.linear_speed`, with its sender, in words.
+
+    Empty if none lowers it.
     """
 
 
@@ -447,6 +462,7 @@ MESSAGES: dict[str, type[Message]] = {
         JointState,
         PoseStamped,
         Imu,
+        SpeedLimit,
         String,
         Twist,
         TwistStamped,

@@ -121,6 +121,9 @@ PLAIN_SERVICES = tuple(
 IMU = "imu"
 """Key of the gyro's samples. The simulator publishes the samples of its gyro on the same key."""
 
+SPEED_LIMIT = "speed_limit"
+"""Key on which a speed filter lowers the robot's highest speed."""
+
 DESCRIPTION = "robot_description"
 """Key of the robot's URDF."""
 
@@ -210,6 +213,10 @@ TOPICS: tuple[Topic, ...] = (
     Topic(
         IMU, "in", "Imu", "any", "turn rate from a gyro, with [odometry] gyro",
         publish="maintainer", subscribe="viewer", query="viewer", gyro=True,
+    ),
+    Topic(
+        SPEED_LIMIT, "in", "SpeedLimit", "10 Hz",
+        "lowers the highest speed, m/s or %; 0 lifts it", publish="operator",
     ),
     Topic(
         "stop", "in", "anything", "any", "any PUT stops the robot like srv/stop", publish="viewer",

@@ -19,6 +19,7 @@ from acsard.core.messages.topics import (
     DESCRIPTION,
     IMU,
     PLAIN_SERVICES,
+    SPEED_LIMIT,
     Direction,
     service_key,
 )
@@ -116,6 +117,9 @@ SOURCES = {
 URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
 """The robot's description. A recording does not have it, so it is not in `PUBLISHED`."""
 
+SLOWER = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
+"""Subscription to Nav2's speed filter."""
+
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
 """Subscription to a gyro. It is best effort, so it also accepts drivers with SensorDataQoS."""
 
@@ -156,6 +160,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
             "in",
             "sensor_msgs/msg/JointState",
         ),
+        SLOWER,
         *(row for row in (GYRO,) if row.native not in silent),
         *(
             RosName(f"{ros.node}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")

@@ -23,6 +23,7 @@ from typing import Literal, TypedDict
 from acsard.core.config.settings import Config
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
 from acsard.core.messages.topics import (
+    COMMANDS,
     DESCRIPTION,
     IMU,
     Direction,
@@ -184,7 +185,7 @@ class _Keys:
         native = endpoint.native
         if native.startswith(PARAMETERS):
             return least_role("config")
-        if endpoint.direction == "in" and native != IMU:
+        if native.startswith(tuple(f"{kind}/" for kind in COMMANDS)):
             return COMMAND_ROLE if native.rpartition("/")[2] in self._sources else None
         return least_role(native)
 

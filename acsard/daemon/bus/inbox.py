@@ -20,7 +20,15 @@ import zenoh
 from acsard.core.incoming.bus_interface import NOTHING, BusInput, Waker
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
 from acsard.core.incoming.queries import BUSY, Query, Reply, most_bytes, refused
-from acsard.core.messages.topics import IMU, JSON_TREE, VERBS, full_key, service_key, source_keys
+from acsard.core.messages.topics import (
+    IMU,
+    JSON_TREE,
+    SPEED_LIMIT,
+    VERBS,
+    full_key,
+    service_key,
+    source_keys,
+)
 from acsard.core.ros.transports import Endpoint
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
@@ -162,6 +170,7 @@ class Inbox:
         }
         # A gyro sample does not wake the control loop. It waits for the next feedback line.
         self._arrivals[IMU] = Mailbox(SAMPLES, self._note)
+        self._arrivals[SPEED_LIMIT] = Mailbox(ARRIVALS, self._note)
         self._stops = Mailbox[Arrival](STOPS, self._stopped)
         # In a mailbox a new query would displace the oldest one. Here the new query is refused.
         self._services: deque[Query] = deque()

@@ -15,7 +15,7 @@ from pathlib import Path
 import zenoh
 
 from acsard.core.config.settings import TLS, Config
-from acsard.core.messages.topics import full_key, source_keys
+from acsard.core.messages.topics import IMU, SPEED_LIMIT, full_key, source_keys
 from acsard.core.ros.transports import command_keys
 from acsard.daemon.bus.access import access_control, gateway_access
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, require_usable, trouble
@@ -246,14 +246,14 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(config: Config) -> dict[str, object]:
-    """Return the rate limits of the command keys, native and of ROS, and of the gyro's key.
+    """Return the rate limits of commands, speed limits and the gyro, native and of ROS.
 
     Each configured source has a limit of its own, so that no source uses up another's limit. All
     other sources share one limit. All certificates of a source share the limit of the source. Zenoh
     applies the limits to each connection separately.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
-    below = [*source_keys(names), *source_keys(names, "*"), "imu"]
+    below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]
     keys = [full_key(config.robot.id, key) for key in below]
     return _rate_limit("commands", ["put", "delete"], [*keys, *command_keys(config.ros)])
 

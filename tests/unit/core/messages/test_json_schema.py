@@ -28,7 +28,7 @@ from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 INCOMING = {
     "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "Settings",
-    "GatewayState"
+    "GatewayState", "SpeedLimit",
 }  # fmt: skip
 OUTGOING = set(SCHEMAS) - INCOMING
 

@@ -40,6 +40,7 @@ PROMISED = [
     ("cmd/<source>/<certificate>", "in", "Twist or TwistStamped"),
     ("wheel_cmd/<source>/<certificate>", "in", "JointState"),
     ("imu", "in", "Imu"),
+    ("speed_limit", "in", "SpeedLimit"),
     ("stop", "in", "anything"),
     ("gateway", "in", "GatewayState"),
     ("srv/stop", "service", "ServiceReply"),

@@ -57,6 +57,7 @@ def test_the_bridge_s_keys_are_the_bare_names() -> None:
         "cmd/dock": "cmd_vel_dock",
         "cmd/teleop": "cmd_vel_teleop",
         "wheel_cmd/ros2_control": "joint_commands",
+        "speed_limit": "speed_limit",
         "imu": "imu/data",
         "srv/stop": "acsard/stop",
         "srv/clear": "acsard/clear",
@@ -128,7 +129,7 @@ def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
     for row in ros_names(RosConfig()):
         if row.native.startswith(PARAMETERS):
             continue
-        if row.direction == "in" and row.native != "imu":
+        if row.direction == "in" and row.native not in ("imu", "speed_limit"):
             head, _, source = row.native.partition("/")
             assert source in sources
             assert patterns[f"{head}/"].direction == "in"
@@ -173,7 +174,7 @@ def test_a_bridge_is_told_nothing_when_announcing_is_off() -> None:
 def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
     rate_limited = command_keys(RosConfig())
     assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
-    assert len(rate_limited) == 5 + 8
+    assert len(rate_limited) == 6 + 9
 
 
 def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:

@@ -184,6 +184,7 @@ LEAST: dict[str, Role] = {
     "cmd/<source>/<certificate>": "operator",
     "wheel_cmd/<source>/<certificate>": "operator",
     "imu": "maintainer",
+    "speed_limit": "operator",
     "stop": "viewer",
     "info": "viewer",
     "topics": "viewer",
@@ -366,7 +367,7 @@ def test_only_configured_sources_may_send_commands(names: list[str]) -> None:
         for name in {"teleop", "app", "dock", "nav", "ros2_control"}.difference(names):
             assert not access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
     for endpoint in endpoints(RosConfig(), ZID):
-        if endpoint.direction == "in" and endpoint.native != "imu":
+        if endpoint.native.startswith(("cmd/", "wheel_cmd/")):
             listed = endpoint.native.partition("/")[2] in names
             assert access.lets("operator", "put", endpoint.key) == listed
 

@@ -1,0 +1,222 @@
+"""Lowers the robot's highest speed by a nav2_msgs/SpeedLimit on the key `speed_limit`.
+
+A speed limit never raises a speed. The robot's `limits.linear_speed` is the lower one of two:
+
+- the *setting*: the value of the configuration, or of the last `set`.
+- the limit of the last message, in m/s. 0.0 lifts it.
+
+The robot knows nothing of speed limits. This module turns a message into the request that `set`
+makes. While a limit is in force, a `set` of a client is checked against the settings, because they
+return when the limit is lifted. The robot gets the client's value only as far as the limit allows.
+So no step drives with a speed above either.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.core.config.live import changed
+from acsard.core.config.parsing import ConfigError
+from acsard.core.config.settings import Config
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, caller_name
+from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.core.messages.schema import Header, SpeedLimit
+from acsard.core.messages.topics import SPEED_LIMIT
+from acsard.core.values import NS_PER_S, Answer, Event, Refusal, Request
+
+SETTING = "limits.linear_speed"
+"""The setting that a speed limit lowers."""
+
+PAUSE_NS = NS_PER_S // 10
+"""Least time between two changes of the limit, ns.
+
+Each change builds the whole configuration again, so a flood of messages would cost periods. The
+newest message waits.
+"""
+
+LIFTED = 0.0
+"""Value of nav2_msgs/SpeedLimit that means "no limit", in either unit."""
+
+
+class _Wish(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A SpeedLimit in which only the number is required."""
+
+    header: Header = Header()
+    percentage: bool = False
+    speed_limit: float
+
+
+_wishes = Decoder(_Wish)
+
+
+class Limit(Struct, frozen=True):
+    """The limit that a message asks for."""
+
+    speed: float
+    """Highest speed, m/s; infinity for none."""
+    by: str
+    """Name of the sender, for the log."""
+    arrived_ns: int
+
+
+def reading(arrival: Arrival, configured: float) -> Limit:
+    """Return the limit in a sample. Raises `DecodeError`.
+
+    `configured` is the configured `limits.linear_speed`, m/s. A percentage is a share of it.
+    """
+    if not arrival.put:
+        raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
+    if len(arrival.payload) > MAX_COMMAND_BYTES:
+        raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+    got: SpeedLimit | _Wish
+    if detect(arrival.encoding, arrival.payload) == "cdr":
+        got = decode_cdr(SpeedLimit, arrival.payload)
+    else:
+        got = _wishes.decode(arrival.encoding, arrival.payload)
+    value = got.speed_limit
+    if not math.isfinite(value):
+        raise DecodeError("not_finite", "NaN or infinity; 0.0 lifts the limit")
+    if value < 0.0 or (got.percentage and value > 100.0):
+        unit = " %" if got.percentage else " m/s"
+        most = " to 100 %" if got.percentage else " m/s or more"
+        raise DecodeError("out_of_range", f"{value:g}{unit}: send 0{most}; 0 lifts the limit")
+    speed = value / 100.0 * configured if got.percentage else value
+    by = f"{SPEED_LIMIT}, {caller_name(arrival.via, arrival.attachment, arrival.sender)}"
+    return Limit(math.inf if value == LIFTED else speed, by, arrival.arrived_ns)
+
+
+NONE = Limit(math.inf, "", 0)
+
+
+class SpeedLimiter:
+    """The speed limit in force, and the settings that hold without it."""
+
+    def __init__(self, config: Config) -> None:
+        """Start without a limit, with the configuration that the robot has."""
+        self._limit = NONE
+        self._waiting: Limit | None = None
+        """The newest message that has not been applied yet."""
+        self._changed_ns = 0
+        self._robot = self._settings = config
+        """The configuration that the robot has, and the one without the speed limit."""
+        self._asked: tuple[Request, float] | None = None
+        """This step's `set` of the speed, and the speed that the client wants, m/s."""
+        self._held: list[Request] = []
+        """Each `set` that waits for the next step, so that the one before it is settled first."""
+
+    @property
+    def settings(self) -> Config:
+        """The configuration in force without the speed limit; the same object until it changes."""
+        return self._settings
+
+    @property
+    def lowers(self) -> bool:
+        """Whether the limit is below the setting."""
+        return self._limit.speed < self._settings.limits.linear_speed
+
+    @property
+    def text(self) -> str:
+        """The limit in words, "" if it lowers nothing."""
+        if not self.lowers:
+            return ""
+        setting = self._settings.limits.linear_speed
+        return f"{self._limit.speed:.3g} m/s by {self._limit.by}; {setting:g} m/s without it"
+
+    def receive(self, arrival: Arrival, configured: float, refusals: list[Refusal]) -> None:
+        """Take a message, or add the refusal, which the robot counts and reports.
+
+        `configured` is as in `reading`.
+        """
+        try:
+            self._waiting = reading(arrival, configured)
+        except DecodeError as error:
+            refusals.append(Refusal(error.reason, f"{SPEED_LIMIT}: {error}"))
+
+    def requests(
+        self, requests: tuple[Request, ...], now_ns: int
+    ) -> tuple[tuple[Request, ...], list[Answer]]:
+        """Return the requests for the robot in this step, and answers to those that are refused.
+
+        Call `settle` after the step.
+        """
+        own = self._own(now_ns)
+        if self._limit is NONE and not self._held:
+            return (*own, *requests), []
+        found, refused, taken = list(own), list[Answer](), False
+        waiting, self._held = [*self._held, *requests], []
+        for request in waiting:
+            if request.verb != "set" or self._limit is NONE:
+                found.append(request)
+            elif taken:
+                self._held.append(request)
+            else:
+                taken = True
+                try:
+                    found.append(self._limited(request))
+                except ConfigError as error:
+                    refused.append(Answer(request.id, False, str(error)))
+        return tuple(found), refused
+
+    def _limited(self, request: Request) -> Request:
+        """Return a `set` with a speed that is within the limit.
+
+        Raises `ConfigError` if the settings would contradict each other without the limit.
+        """
+        # The robot decides itself whether a change must wait until it stands.
+        made, _ = changed(self._settings, request.settings, at_rest=True)
+        if SETTING not in request.settings:
+            return request
+        wanted = made.limits.linear_speed
+        self._asked = request, wanted
+        if wanted <= self._limit.speed:
+            return request
+        return replace(request, settings=request.settings | {SETTING: self._limit.speed})
+
+    def _own(self, now_ns: int) -> tuple[Request, ...]:
+        """Return the request that makes the robot obey the newest message, if it needs one."""
+        if self._waiting is None or now_ns - self._changed_ns < PAUSE_NS:
+            return ()
+        new, self._waiting = self._waiting, None
+        self._limit = NONE if math.isinf(new.speed) else new
+        lowest = min(self._settings.limits.linear_speed, new.speed)
+        if lowest == self._robot.limits.linear_speed:
+            return ()
+        self._changed_ns = now_ns
+        return (Request("set", asked_ns=new.arrived_ns, by=new.by, settings={SETTING: lowest}),)
+
+    def settle(
+        self, robot: Config, answers: Iterable[Answer], events: list[Event]
+    ) -> tuple[Answer, ...]:
+        """Take the robot's configuration after the step, and return its answers for the clients.
+
+        An answer to a `set` whose speed must wait for the end of the limit says so, and so does an
+        event.
+        """
+        answers = tuple(answers)
+        speed = self._settings.limits.linear_speed
+        asked, self._asked = self._asked, None
+        if asked is not None:
+            request, wanted = asked
+            mine = next((one for one in answers if one.id == request.id), None)
+            if mine is not None and mine.success:
+                speed = wanted
+                if wanted > self._limit.speed:
+                    text = f"{SETTING} = {wanted:g} {self._until}"
+                    events.append(Event("set", text, by=request.by, kind="waits"))
+                    told = replace(mine, message=text)
+                    answers = tuple([told if one is mine else one for one in answers])
+        if robot is not self._robot or speed != self._settings.limits.linear_speed:
+            self._robot = robot
+            limited = self._limit is not NONE
+            limits = replace(robot.limits, linear_speed=speed) if limited else robot.limits
+            self._settings = replace(robot, limits=limits) if limited else robot
+        return answers
+
+    @property
+    def _until(self) -> str:
+        limit = self._limit
+        return f"once the limit of {limit.speed:.3g} m/s ends ({limit.by})"

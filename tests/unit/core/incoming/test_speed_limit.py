@@ -1,0 +1,268 @@
+"""A speed limit only lowers the highest speed, whatever clients set meanwhile."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.contradictions import contradictions
+from acsard.core.config.live import changed
+from acsard.core.config.parsing import ConfigError
+from acsard.core.config.settings import Config
+from acsard.core.incoming.commands import Arrival, Via
+from acsard.core.incoming.speed_limit import PAUSE_NS, SETTING, SpeedLimiter, reading
+from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
+from acsard.core.messages.schema import Header, SpeedLimit, Time
+from acsard.core.ros.attachments import Attachment
+from acsard.core.values import Answer, Event, Plain, Refusal, Request
+from tests.each import each
+
+FULL = SpeedLimit(Header(Time(12, 5), "map"), True, 40.0)
+
+
+def arrival(payload: bytes, encoding: str = "", put: bool = True, via: Via = "native") -> Arrival:
+    attachment = Attachment(1, 7, b"g" * 16).pack() if via == "rmw" else b""
+    return Arrival("speed_limit", put, payload, encoding, 7, None, "", via, attachment)
+
+
+def said(value: object, **fields: Any) -> Arrival:
+    """Return a message in hand-written JSON."""
+    return arrival(json.dumps({"speed_limit": value} | fields).encode())
+
+
+@each("named", [True, False])
+@each("form", FORMATS)
+def test_a_speed_limit_is_read_in_every_encoding(form: Format, named: bool) -> None:
+    encoding = encoding_name(form, "SpeedLimit") if named else ""
+    assert reading(arrival(encode(FULL, form), encoding), 0.5).speed == pytest.approx(0.2)
+
+
+def test_of_json_only_the_number_is_required_and_is_in_metres_per_second() -> None:
+    assert reading(said(0.3), 1.0).speed == 0.3
+
+
+@each(
+    ("value", "percentage", "speed"),
+    [(0.0, False, math.inf), (0.0, True, math.inf), (-0.0, False, math.inf), (100.0, True, 0.8),
+     (50.0, True, 0.4), (9.0, False, 9.0), (1e-300, False, 1e-300)],
+)  # fmt: skip
+def test_zero_is_no_limit_and_a_percentage_is_of_the_configured_speed(
+    value: float, percentage: bool, speed: float
+) -> None:
+    assert reading(said(value, percentage=percentage), 0.8).speed == speed
+
+
+def test_the_sender_is_named() -> None:
+    by = reading(arrival(encode(FULL, "cdr"), via="rmw"), 1.0).by
+    assert by == f"speed_limit, unnamed (rmw {(b'g' * 16).hex()})"
+
+
+REFUSED: dict[str, list[Arrival]] = {
+    "out_of_range": [said(-0.1), said(-5.0, percentage=True), said(100.1, percentage=True)],
+    "not_finite": [
+        arrival(encode(SpeedLimit(Header(), share, value), "cdr"))
+        for value in (math.nan, math.inf, -math.inf)
+        for share in (False, True)
+    ],
+    "wrong_shape": [arrival(b"{}"), said("fast"), said(0.3, percent=True), said(None)],
+    "malformed": [arrival(encode(FULL, "cdr")[:-1]), arrival(b'{"speed_limit": NaN}')],
+    "unknown_encoding": [arrival(b"0.5")],
+    "too_big": [arrival(b"{" + b" " * 5000)],
+    "not_a_put": [arrival(encode(FULL, "json"), put=False)],
+}
+
+
+@each("reason", REFUSED)
+def test_a_message_is_refused_as_a_whole_with_its_reason(reason: str) -> None:
+    for one in REFUSED[reason]:
+        limiter, refusals = SpeedLimiter(Config()), list[Refusal]()
+        limiter.receive(said(0.5), 1.0, refusals)
+        limiter.requests((), PAUSE_NS)
+        limiter.receive(one, 1.0, refusals)
+        assert [refusal.reason for refusal in refusals] == [reason]
+        assert refusals[0].text.startswith("speed_limit: ")
+        assert limiter.requests((), 2 * PAUSE_NS) == ((), []), "the limit before stays"
+
+
+@given(st.binary(max_size=200))
+def test_whatever_comes_is_a_limit_or_refused(payload: bytes) -> None:
+    try:
+        assert reading(arrival(payload), 1.0).speed > 0.0
+    except DecodeError:
+        pass
+
+
+class Robot:
+    """The configuration of a robot, which obeys `set` as `core/robot.py` does."""
+
+    def __init__(self) -> None:
+        self.config = Config()
+        self.limiter = SpeedLimiter(self.config)
+        self.events: list[Event] = []
+        self.now_ns = 10 * PAUSE_NS
+        self.peak = 0.0
+        """Highest speed that was allowed at any moment of the last step, m/s."""
+
+    def limit(self, value: float, percentage: bool = False) -> None:
+        self.limiter.receive(said(value, percentage=percentage), 1.0, [])
+
+    def step(self, *wishes: Mapping[str, Plain], at_rest: bool = True) -> dict[int, Answer]:
+        """Take a step with a `set` for each of these wishes, and return the answers by number."""
+        self.now_ns += PAUSE_NS
+        requests = [
+            Request("set", number, settings=dict(wish)) for number, wish in enumerate(wishes, 1)
+        ]
+        taken, refused = self.limiter.requests(tuple(requests), self.now_ns)
+        answers, self.peak = list[Answer](), self.config.limits.linear_speed
+        for request in taken:
+            try:
+                self.config, news = changed(self.config, request.settings, at_rest)
+                answers.append(Answer(request.id, True, news))
+            except ConfigError as error:
+                answers.append(Answer(request.id, False, str(error)))
+            # The robot drives at the end of a step only.
+        self.peak = self.config.limits.linear_speed
+        told = (*refused, *self.limiter.settle(self.config, answers, self.events))
+        return {answer.id: answer for answer in told}
+
+    @property
+    def speed(self) -> float:
+        return self.config.limits.linear_speed
+
+
+def test_a_limit_lowers_the_setting_and_its_end_brings_the_setting_back() -> None:
+    robot = Robot()
+    robot.limit(0.3)
+    robot.step()
+    assert robot.speed == 0.3
+    assert robot.limiter.text == "0.3 m/s by speed_limit, unnamed (native); 1 m/s without it"
+    robot.limit(0.0)
+    robot.step()
+    assert (robot.speed, robot.limiter.text) == (1.0, "")
+    assert robot.limiter.settings is robot.config
+
+
+@each("value", [1.0, 1.5, 50.0])
+def test_a_limit_above_the_setting_raises_nothing(value: float) -> None:
+    robot = Robot()
+    robot.limit(value)
+    robot.step()
+    assert (robot.speed, robot.limiter.text) == (1.0, "")
+
+
+def test_a_set_below_the_limit_counts_at_once_and_stays_when_the_limit_ends() -> None:
+    robot = Robot()
+    robot.limit(0.5)
+    robot.step()
+    assert robot.step({SETTING: 0.2})[1].success
+    assert (robot.speed, robot.limiter.text) == (0.2, "")
+    robot.limit(0.0)
+    robot.step()
+    assert robot.speed == 0.2
+
+
+def test_a_set_above_the_limit_waits_for_its_end_and_the_answer_says_so() -> None:
+    robot = Robot()
+    robot.limit(0.3)
+    robot.step()
+    answer = robot.step({SETTING: 0.8})[1]
+    text = (
+        "limits.linear_speed = 0.8 once the limit of 0.3 m/s ends (speed_limit, unnamed (native))"
+    )
+    assert answer == Answer(1, True, text)
+    assert [(event.name, event.text) for event in robot.events] == [("set", text)]
+    assert (robot.speed, robot.limiter.settings.limits.linear_speed) == (0.3, 0.8)
+    robot.limit(0.0)
+    robot.step()
+    assert robot.speed == 0.8
+
+
+def test_a_limit_and_a_higher_set_in_one_step_leave_the_limit_in_force() -> None:
+    robot = Robot()
+    robot.limit(0.3)
+    robot.step({SETTING: 1.4})
+    assert robot.speed == 0.3
+    robot.limit(0.0)
+    robot.step()
+    assert robot.speed == 1.4
+
+
+def test_a_set_that_the_setting_behind_the_limit_contradicts_is_refused() -> None:
+    """At 0.3 m/s the deceleration would do. At 1 m/s, after the limit, it would not."""
+    robot = Robot()
+    robot.limit(0.3)
+    robot.step()
+    answer = robot.step({"limits.linear_deceleration": 0.15})[1]
+    assert not answer.success
+    assert "braking from full speed (1 m/s)" in answer.message
+    assert robot.config.limits.linear_deceleration == Config().limits.linear_deceleration
+
+
+@each("wish", [{SETTING: 11.0}, {SETTING: "fast"}, {SETTING: -1.0}, {"limits.nothing": 1.0}])
+def test_a_set_that_is_not_valid_is_refused_as_without_a_limit(wish: dict[str, Plain]) -> None:
+    plain, limited = Robot(), Robot()
+    limited.limit(0.3)
+    limited.step()
+    assert limited.step(wish) == plain.step(wish)
+    assert limited.limiter.settings.limits.linear_speed == 1.0
+
+
+def test_two_sets_of_one_step_are_obeyed_one_after_the_other() -> None:
+    """Alone each is right, but together they contradict each other once the limit ends."""
+    robot = Robot()
+    robot.limit(0.3)
+    robot.step()
+    first = robot.step({"limits.linear_deceleration": 0.2}, {SETTING: 1.2})
+    assert list(first) == [1]
+    assert first[1].success
+    second = robot.step()
+    assert list(second) == [2]
+    assert not second[2].success
+
+
+def test_a_flood_of_messages_changes_the_limit_at_most_ten_times_a_second() -> None:
+    limiter, changes = SpeedLimiter(Config()), 0
+    for step in range(200):
+        limiter.receive(said(0.2 + 0.001 * step), 1.0, [])
+        taken, _ = limiter.requests((), 10 * PAUSE_NS + step * PAUSE_NS // 10)
+        changes += len(taken)
+        config = Config() if not taken else changed(Config(), taken[0].settings, True)[0]
+        if taken:
+            limiter.settle(config, [], [])
+    assert changes == 20
+
+
+WISHES = st.dictionaries(
+    st.sampled_from([SETTING, "limits.linear_deceleration", "limits.linear_stop_deceleration",
+                     "limits.wheel_speed", "limits.linear_acceleration"]),
+    st.floats(0.01, 60.0) | st.just("x"),
+    min_size=1,
+    max_size=2,
+)  # fmt: skip
+LIMITS = st.tuples(st.floats(0.0, 3.0), st.just(False)) | st.tuples(
+    st.floats(0.0, 100.0), st.just(True)
+)
+
+
+@given(st.lists(st.tuples(st.none() | LIMITS, st.lists(WISHES, max_size=2), st.booleans())))
+def test_the_lower_one_of_limit_and_setting_wins_after_each_step(steps: list[Any]) -> None:
+    robot, limit = Robot(), math.inf
+    for message, wishes, at_rest in steps:
+        if message is not None:
+            value, share = message
+            robot.limit(value, share)
+            limit = math.inf if value == 0.0 else value / 100.0 if share else value
+        robot.step(*wishes, at_rest=at_rest)
+        settings = robot.limiter.settings
+        assert robot.speed == min(limit, settings.limits.linear_speed)
+        assert contradictions(settings) == [], "or the end of the limit would be refused"
+    robot.limit(0.0)
+    robot.step()
+    robot.step()
+    assert robot.config == robot.limiter.settings
