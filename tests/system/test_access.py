@@ -85,6 +85,13 @@ class Try(NamedTuple):
         return self.key + ("" if self.how == "plain" else f" ({self.how})")
 
 
+def _bad_limit() -> bytes:
+    """Return a speed limit that the daemon refuses and counts, in CDR."""
+    return ros.encode(
+        ros.make(ros.SPEED_LIMIT, header=ros.header(), percentage=False, speed_limit=-1.0)
+    )
+
+
 def _commands() -> Iterator[Try]:
     for source in SOURCES:
         for kind, payload in (("cmd", TWIST_JSON), ("wheel_cmd", WHEELS_JSON)):
@@ -94,6 +101,7 @@ def _commands() -> Iterator[Try]:
                 yield Try(f"{ME}/{kind}/{source}/{name}", HERE | {name}, payload)
             yield Try(f"{ME}/{kind}/{source}/viewer", HERE, payload)
     yield Try(f"{ME}/stop", ANYBODY)
+    yield Try(f"{ME}/speed_limit", DRIVERS, _bad_limit())
     unlisted = ("cmd/ghost", "cmd/ghost/operator", "cmd/app/operator/more", "cmd", "cmd/*",
                 "cmd/**", "cmd/ap$*", "cmd/app/**", "cmd/app/*", "cmd/*/operator")  # fmt: skip
     yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in unlisted)
@@ -116,6 +124,8 @@ def _ros_commands() -> Iterator[Try]:
         yield Try(name, DRIVERS, CDR_TWIST)
         yield Try(ros.rmw_key(name, ros.TWIST), DRIVERS, CDR_TWIST)
         yield Try(ros.rmw_key(name, ros.STAMPED), DRIVERS, CDR_STAMPED)
+    yield Try("speed_limit", DRIVERS, _bad_limit())
+    yield Try(ros.rmw_key("speed_limit", ros.SPEED_LIMIT), DRIVERS, _bad_limit())
     yield Try("joint_commands", DRIVERS, _cdr_wheels)
     yield Try(ros.rmw_key("joint_commands", ros.JOINTS), DRIVERS, _cdr_wheels)
     rmw_type = RMW_CMD.removeprefix("0/cmd_vel/")
@@ -422,7 +432,10 @@ def _heard(state: Any) -> int:
     A new sender's commands do not count at once.
     """
     counters = state["counters"]
-    return sum(counters.get(name, 0) for name in ("commands", "commands_of_new_senders"))
+    return sum(
+        counters.get(name, 0)
+        for name in ("commands", "commands_of_new_senders", "command_out_of_range")
+    )
 
 
 def _subscribed(session: zenoh.Session, row: Try, on_sample: Callable[[zenoh.Sample], None]) -> Any:

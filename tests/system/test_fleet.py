@@ -74,7 +74,10 @@ TURNING = json.dumps({"angular_velocity": {"z": 0.1}}).encode()
 FORGED = b"forged"
 SOURCES = tuple(source.name for source in Config().commands.sources)
 VALUES = tuple(key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}"))
-OFTEN = tuple(key for key in VALUES if not key.endswith("tf_static"))
+OFTEN = tuple(key for key in VALUES if not key.endswith(("tf_static", "robot_description")))
+URDF = "deploy/ros2/acsar.urdf"
+TOO_SLOW = json.dumps({"speed_limit": -1.0}).encode()
+"""A speed limit that the robot refuses and counts."""
 EVERY_REPLY = zenoh.ConsolidationMode.NONE
 
 
@@ -112,7 +115,10 @@ def _puts() -> Iterator[Try]:
         yield Try(f"{ONE}/{key}", NOBODY, TWIST)
     for key in ("acsard/*/cmd/app", "acsard/*/stop", "acsard/**", "**/stop", "**"):
         yield Try(key, NOBODY, TWIST)
-    for key in (*OFTEN, "tf_static", "alive", "info", "config", "srv/stop", "tf_static/@adv/x"):
+    yield Try(f"{ONE}/speed_limit", DRIVERS, TOO_SLOW)
+    yield Try(f"{TWO}/speed_limit", DRIVERS | ITSELF, TOO_SLOW)
+    latched = ("tf_static", "robot_description", "tf_static/@adv/x")
+    for key in (*OFTEN, *latched, "alive", "info", "config", "srv/stop"):
         yield Try(f"{ONE}/{key}", NOBODY, FORGED)
     for key in ("robot1/cmd_vel", "cmd_vel", "acsard/robot3/state", "@/*/router/config/mode"):
         yield Try(key, NOBODY, FORGED)
@@ -120,7 +126,7 @@ def _puts() -> Iterator[Try]:
 
 def _queries() -> Iterator[Try]:
     described = ("info", "topics", "interfaces", "schema/Twist")
-    for key in (*OFTEN, "tf_static", *described):
+    for key in (*OFTEN, "tf_static", "robot_description", "json/robot_description", *described):
         yield Try(f"{ONE}/{key}", ANYBODY)
     yield Try(f"{TWO}/info", ANYBODY | ITSELF)
     for key in ("tf_static/@adv/**?_anyke", "schema/*"):
@@ -246,6 +252,7 @@ class Fleet:
         tables["bus"] |= {"connect": [self.endpoint], "tls": str(self.where / robot_id)}
         tables["rates"] = {"state": 100.0, "diagnostics": 100.0}
         tables["limits"] = {"linear_acceleration": 5.0, "linear_stop_deceleration": 5.0}
+        tables.setdefault("ros", {})["urdf"] = str(ROBOT_FILE.parents[2] / URDF)
         return Daemon(self.where, config=tables, name=name or robot_id, ready=ready)
 
     def member(self, name: str, robot_id: str = "robot1") -> Member:
@@ -325,7 +332,7 @@ class Visitor:
         def commands() -> list[int]:
             # A first command of a new clock passes the router, and the daemon does not believe it
             # yet.
-            heard = ("commands", "commands_of_new_senders")
+            heard = ("commands", "commands_of_new_senders", "command_out_of_range")
             return [sum(map(robot.count, heard)) for robot in fleet.robots]
 
         def obeyed() -> bool:

@@ -99,4 +99,4 @@ def test_the_longest_description_fits_into_a_message_of_each_encoding(
     assert "shorten it" in refusal(written(tmp_path, text(accepted + 500)))
     message = String(text(accepted))
     for form in ("json", "msgpack", "cdr"):
-        assert len(encode(message, form)) < MESSAGE_BYTES - 512  # type: ignore[arg-type]
+        assert len(encode(message, form)) < MESSAGE_BYTES - 512
