@@ -137,12 +137,12 @@ def described(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
         yield daemon
 
 
-@pytest.mark.parametrize("transport", TRANSPORTS)
+@pytest.mark.parametrize("transport", NETWORK)
 def test_the_urdf_is_latched_and_sent_once(described: Daemon, transport: str) -> None:
     """RViz would load the robot again with each message."""
     with Bus(described.endpoint) as bus:
         assert bus.get("robot_description") == {"data": URDF_TEXT}
-        ros = TRANSPORTS[transport](bus.session)
+        ros = EMULATED[transport](bus.session)
         with ros.follow_late("robot_description", STRING) as samples:
             got = samples.first("the description", within=2.0)
             assert decode(STRING, got.payload).data == URDF_TEXT

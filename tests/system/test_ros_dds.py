@@ -30,8 +30,10 @@ from tests.system.ros_clients import (
     ROUTE_S,
     SERVICES,
     STAMPED,
+    STRING,
     TF,
     TWIST,
+    TWISTS,
     Relay,
     Samples,
     changes,
@@ -90,6 +92,23 @@ def test_a_bridge_that_starts_before_the_robot_joins_it_and_joins_it_again(
                 assert called._replace(replies=called.replies[:1]).trigger()[0]
 
 
+def test_a_late_node_gets_the_urdf_that_was_sent_once(tmp_path: Path, dds: NewDomain) -> None:
+    text = '<robot name="r7"><link name="base_link"/></robot>'
+    (tmp_path / "robot.urdf").write_text(text)
+    described = {"ros": {"urdf": str(tmp_path / "robot.urdf")}}
+    with (
+        Daemon(tmp_path, config=described) as daemon,
+        dds(tmp_path) as domain,
+        domain.bridge(daemon.endpoint),
+    ):
+        for _ in range(2):
+            with (
+                domain.node() as node,
+                node.follow_late("robot_description", STRING) as samples,
+            ):
+                assert decode(STRING, samples.first("it", within=10.0).payload).data == text
+
+
 def test_what_is_announced_has_routes_and_nothing_is_sent_unasked(
     tmp_path: Path, dds: NewDomain
 ) -> None:
@@ -103,7 +122,7 @@ def test_what_is_announced_has_routes_and_nothing_is_sent_unasked(
     ):
         for name in PUBLISHED:
             bridge.logs(f"Route Subscriber (Zenoh:{name} -> ROS:/{name}) created")
-        for name in ("cmd_vel", "cmd_vel_teleop", "joint_commands"):
+        for name in (*TWISTS, "joint_commands", "speed_limit"):
             bridge.logs(f"Route Publisher (ROS:/{name} -> Zenoh:{name}) created")
         for name in SERVICES:
             bridge.logs("Route Service Client", f"Zenoh:{name}) created")
