@@ -15,6 +15,7 @@ from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import NS_PER_S, Latches, Outputs, Plain
 from acsard.daemon.settings_file import SettingsFile
 from tests.each import each
+from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.test_restart import MemoryFile
 from tests.scenarios.world import START, World
 
@@ -208,3 +209,21 @@ def test_a_flood_of_limits_changes_the_robot_ten_times_a_second(world: World) ->
         world.run(0.01)
     seconds = (world.now_ns - since_ns) / NS_PER_S
     assert sum(event.count for event in world.events if event.name == "set") <= 10 * seconds + 1
+
+
+def test_a_drive_through_a_zone_is_replayed_to_the_last_bit() -> None:
+    """A recording has the requests that the limits became, so its replay needs no speed limit."""
+    tape = Tape()
+    world = World(recorder=tape)
+    world.run(0.2)
+    world.drive(0.8, seconds=1.0)
+    limit(world, 30.0, percentage=True)
+    world.hold(0.8, seconds=1.0)
+    assert sets(world, limits__linear_speed=0.7).success
+    world.hold(0.8, seconds=0.5)
+    limit(world, 0.0)
+    world.hold(0.8, seconds=1.0)
+    comparison = replayed(tape, world.config).comparison
+    assert comparison.first is None
+    assert comparison.exact
+    assert world.state.linear == pytest.approx(0.7, abs=0.02)
