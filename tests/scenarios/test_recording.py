@@ -40,8 +40,14 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert comparison.first is None
     assert comparison.exact
     assert comparison.steps == comparison.modes_same == len(tape.taken) - first
-    assert comparison.lines == comparison.lines_same >= least
-    assert comparison.poses == comparison.poses_same >= least
+    taken = tape.taken[first:]
+    lines = sum(one.outputs.line is not None for one in taken)
+    assert comparison.lines == comparison.lines_same == lines >= least
+    poses = sum(len(one.outputs.estimates) for one in taken)
+    assert comparison.poses == comparison.poses_same == poses >= least
+    assert comparison.end is not None
+    assert comparison.end[0] == comparison.end[1]
+    assert comparison.apart == 0.0
 
 
 @pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
