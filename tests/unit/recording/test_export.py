@@ -49,8 +49,8 @@ from acsard.recording.export import (
 from acsard.recording.file import Recording
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import Span
-from tests.scenarios.taped import Tape, chunks
-from tests.scenarios.world import START, World
+from tests.scenarios.taped import Tape, chunks, recorded_world
+from tests.scenarios.world import START
 
 SECONDS = 2.0
 
@@ -60,8 +60,7 @@ KINDS: tuple[Kind, ...] = ("mcap", "csv", "rosbag2")
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a drive with two sources."""
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, 0.3, 0.4)
     world.drive(0.3, 0.0, 0.3, source="teleop")
     world.call("stop")
@@ -344,8 +343,7 @@ GYRO = replace(Config(), odometry=replace(Config().odometry, gyro=True))
 
 @pytest.fixture(scope="module")
 def tape() -> Tape:
-    tape = Tape()
-    world = World(GYRO, recorder=tape)
+    tape, world = recorded_world(GYRO)
     world.drive(0.5, 0.4, 1.0)
     return tape
 
