@@ -120,10 +120,7 @@ def _checked(
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
-    """Return the prompt for these options.
-
-    Raises `UsageError` unless a person can answer, or nothing real can move.
-    """
+    """Return the prompt; raise `UsageError` unless a person can answer or nothing can move."""
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "

@@ -54,10 +54,7 @@ class Departure:
         self.hurried = False
 
     def __enter__(self) -> Self:
-        """Handle the signals that end the daemon.
-
-        SIGHUP is one of them, because closing the terminal must stop the wheels.
-        """
+        """Handle the signals that end the daemon; a closed terminal must stop the wheels too."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
