@@ -18,8 +18,7 @@ from pathlib import Path
 
 from acsard.core.config.settings import Config
 from acsard.machine.authority import Authority
-from tests.scenarios.taped import Tape, drive_through_faults, happenings
-from tests.scenarios.world import World
+from tests.scenarios.taped import drive_through_faults, happenings, recorded_world
 from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.camera_stream import Stream
 from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
@@ -264,8 +263,7 @@ def report(directory: Path) -> list[Path]:
 
 def _recorded(path: Path) -> Path:
     """Record two minutes: two clients drive, one is stopped, and links and wheels fail."""
-    tape = Tape()
-    world = World(Config(), recorder=tape)
+    tape, world = recorded_world(Config())
     two_drivers(world)
     happenings(world, random.Random(1))
     drive_through_faults(world, 100.0)

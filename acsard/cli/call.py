@@ -81,10 +81,7 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
 
 
 def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
-    """Stop all these robots at once by their exact keys, and print each robot's answer.
-
-    Returns the exit code: `UNREACHABLE` if any robot did not answer.
-    """
+    """Stop these robots at once, print their answers, and return the exit code."""
     # Send the stop to every named robot first. Finding out which robots are present would delay it.
     robot_discovery.stop(robot.session, ids, robot.caller)
     replies = of_each(robot, ids, lambda one: one.call("stop"))

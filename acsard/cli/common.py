@@ -75,10 +75,7 @@ def seconds(text: str) -> float:
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
-    """Return an argparse type for a whole number from 1 to `most`.
-
-    `hint` is appended to its error message.
-    """
+    """Return an argparse type for a whole number up to `most`; `hint` ends its error."""
 
     def number(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:

@@ -81,10 +81,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _words() -> Mapping[tuple[str, str], list[str]]:
-    """Return the words for each (subcommand, argument).
-
-    The names of sources are those of the defaults.
-    """
+    """Return the words for each (subcommand, argument), with the default sources."""
     config = Config()
     sources = [source.name for source in config.commands.sources]
     published = [topic.key for topic in PUBLISHED]
@@ -108,10 +105,7 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield every option and argument with its subcommand.
-
-    Those of `recording show` belong to `recording`.
-    """
+    """Yield every option with its subcommand: `recording` for those of `recording show`."""
     for action in parser._actions:
         yield verb, action
         if isinstance(action, argparse._SubParsersAction):

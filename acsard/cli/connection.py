@@ -53,10 +53,7 @@ def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Return the address of one robot from the options, or else from the configuration.
-
-    Raises `UsageError` if `--id` names several robots.
-    """
+    """Return the robot's address by options or file; raise `UsageError` for several robots."""
     require_one(args)
     _, config = load(args.config)
     return address_of(config, args.connect, args.id, args.tls)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import msgspec
 
-from acsard.checkup import checkup_report, procedure
+from acsard.checkup import procedure
 from acsard.checkup.board import Wire
-from acsard.checkup.checkup_report import report, summary, withheld
+from acsard.checkup.checkup_report import changes, report, summary, withheld
 from acsard.checkup.findings import Finding
 from acsard.cli.common import add_config, add_outcome, load, require_asking
 from acsard.core.config.settings import Config
@@ -70,16 +70,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     given = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
     where, config = load(args.config, given)
+    _, configured = load(args.config)
     if args.write:
         writable(args.config)
-        if why := withheld(config.mcu.simulated, load(args.config)[1]):
+        if why := withheld(config.mcu.simulated, configured):
             raise UsageError(f"--write cannot change {where}: {why}; leave --write out")
     with _prompt(args, config.mcu.port) as prompt:
-        return _checked(args, config, where, prompt)
+        return _checked(args, config, configured, where, prompt)
 
 
-def _checked(args: argparse.Namespace, config: Config, where: str, prompt: Prompt) -> int:
-    _, configured = load(args.config)
+def _checked(
+    args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
+) -> int:
+    """Check the board with `config`, and compare the findings with the file's configuration."""
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
@@ -98,29 +101,26 @@ def _checked(args: argparse.Namespace, config: Config, where: str, prompt: Promp
             raise
         trouble = error  # with --json, print the report before the error
     named = args.port if args.write or (args.json_lines and not simulated) else ""
-    withheld = checkup_report.withheld(simulated, configured)
-    changes = {} if withheld else checkup_report.changes(findings, configured, named)
+    why = withheld(simulated, configured)
+    found_changes = {} if why else changes(findings, configured, named)
     written = ""
-    if args.write and changes and not trouble:
+    if args.write and found_changes and not trouble:
         try:
-            change(Path(where), changes)
+            change(Path(where), found_changes)
             written = where
         except MendableError as error:  # print the findings of a whole minute before the error
             trouble = error
-    found = report(port, findings, changes, written, str(trouble or ""), withheld)
+    found = report(port, findings, found_changes, written, str(trouble or ""), why)
     prompt.result(msgspec.json.encode(found).decode() if args.json else summary(found, where))
     if trouble is not None:
         raise trouble
-    if changes and not args.write:
-        prompt.offer(args.config, changes)
+    if found_changes and not args.write:
+        prompt.offer(args.config, found_changes)
     return int(Exit.OK if found.passed else Exit.FAILURE)
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
-    """Return the prompt for these options.
-
-    Raises `UsageError` unless a person can answer, or nothing real can move.
-    """
+    """Return the prompt; raise `UsageError` unless a person can answer or nothing can move."""
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "

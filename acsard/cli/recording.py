@@ -532,10 +532,7 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that writes the progress in percent to standard error.
-
-    The page's server reads it.
-    """
+    """Return a function that writes the progress in percent, for the page's server."""
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0

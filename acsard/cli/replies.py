@@ -25,10 +25,7 @@ def of_robot(whose: str, line: str) -> str:
 
 
 def json_line(encoding: str, payload: bytes) -> str:
-    """Return a payload of any encoding as one line of JSON.
-
-    Bytes that cannot be decoded become the text `{"undecodable": ...}`.
-    """
+    """Return a payload as a line of JSON, `{"undecodable": ...}` if it cannot be decoded."""
     try:
         form = detect(encoding, payload)
         if form == "cdr":

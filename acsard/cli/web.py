@@ -136,10 +136,7 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
 
 
 def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
-    """Make a token and print its link once.
-
-    `where` is the path of the configuration, for messages.
-    """
+    """Make a token and print its link once; messages name the configuration `where`."""
     import segno
 
     from acsard.web.listen import invitations, require_certificate

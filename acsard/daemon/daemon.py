@@ -15,7 +15,7 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
-from typing import Any
+from typing import Any, Self
 
 from acsard import __version__
 from acsard.core.config.settings import TLS, Config
@@ -55,14 +55,16 @@ class Departure:
         self.begun_ns: int | None = None
         self.hurried = False
 
-    def watch(self) -> None:
-        """Handle the signals that end the daemon.
-
-        SIGHUP is one of them, because closing the terminal must stop the wheels.
-        """
+    def __enter__(self) -> Self:
+        """Handle the signals that end the daemon; a closed terminal must stop the wheels too."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
+        """Return whether a signal has cancelled the start, which is no error."""
+        return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
         """Note that the start is complete.
@@ -121,35 +123,16 @@ async def run(
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
     departure = Departure(log, wake, manager)
-    departure.watch()
-    log_from_environment()
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    # Ask before the first thread starts, because the threads of the bus must not inherit the
-    # priority.
-    refused = real_time.ask() if config.control.real_time else ""
-    if refused:
-        log.info("real_time", text=refused)
-    try:
-        await _run(config, log, announce, departure, wake, manager, gateway, page, settings_file)
-    except asyncio.CancelledError:
-        if departure.begun_ns is None:
-            raise
-    finally:
-        manager.close()
-
-
-async def _run(
-    config: Config,
-    log: Log,
-    announce: Announce,
-    departure: Departure,
-    wake: Wakeup,
-    manager: Systemd,
-    gateway: Sequence[str] | None,
-    page: Sequence[str] | None,
-    settings_file: SettingsFile | None,
-) -> None:
     async with AsyncExitStack() as stack:
+        stack.callback(manager.close)
+        stack.enter_context(departure)
+        log_from_environment()
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        # Ask before the first thread starts, because the threads of the bus must not inherit the
+        # priority.
+        refused = real_time.ask() if config.control.real_time else ""
+        if refused:
+            log.info("real_time", text=refused)
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # entered first, so it runs last
         urdf = robot_description(config.ros.urdf)

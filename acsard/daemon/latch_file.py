@@ -163,10 +163,7 @@ class LatchFile:
         return latches
 
     def _look(self, now: Instant) -> Latches:
-        """Read the file, and write it once to find out whether it can be written.
-
-        Returns the latches with which the robot starts.
-        """
+        """Read the file, try to write it, and return the latches that the robot starts with."""
         with self._disk:
             if self._abandoned:
                 return Latches()
@@ -297,10 +294,7 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches, and report a failure or a recovery.
-
-        Returns the reason of a failure, or "".
-        """
+        """Write these latches, report failure and recovery, and return why it failed or ""."""
         self._busy_ns = clock.mono_ns()
         with self._disk:
             if self._blind:

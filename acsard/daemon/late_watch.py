@@ -122,10 +122,7 @@ class LateWatch:
     # The control loop's thread calls these methods.
 
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
-        """Take a period whose step began at monotonic `now_ns`, `late_ns` late.
-
-        `missed` periods before it had no step.
-        """
+        """Take a period whose step began `late_ns` late, after `missed` without a step."""
         before, times = self._times, b""
         with suppress(OSError):  # a lateness without its times only has fewer causes
             times = os.pread(self._file, 64, 0) if self._file >= 0 else b""

@@ -169,19 +169,13 @@ class Stopwatch:
         return self._missed.count(now_ns)
 
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
-        """Record the start of a period's step, `late_ns` late.
-
-        `missed` periods before it had no step.
-        """
+        """Record a period's step, `late_ns` late after `missed` periods without one."""
         self.figures["period_lateness"].add(now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
-        """Record the age of a line's command at the time of sending.
-
-        `before_ns` is when the line before was sent.
-        """
+        """Record the age of a sent line's command; the line before left at `before_ns`."""
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
@@ -190,10 +184,7 @@ class Stopwatch:
             self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
-        """Record a feedback line.
-
-        `told_ns` is when its messages were queued for the bus, None without subscribers.
-        """
+        """Record a feedback line, queued for the bus at `told_ns`, None without subscribers."""
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
             self.figures["mcu_round_trip"].add(at_ns, at_ns - asked_ns)

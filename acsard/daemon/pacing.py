@@ -11,10 +11,7 @@ from msgspec import Struct
 
 
 class Period(Struct, frozen=True):
-    """The periods that ended since the last step, 0 if none.
-
-    The first of them was due at `due_ns`.
-    """
+    """The periods that ended since the last step, the first of them due at `due_ns`."""
 
     expired: int
     due_ns: int

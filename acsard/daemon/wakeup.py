@@ -70,10 +70,7 @@ class Alarm(_Timer):
 
 
 class Ticker(_Timer):
-    """A timer that calls `wake` every period while entered.
-
-    `take` tells which periods have ended.
-    """
+    """A timer that wakes every period while entered; `take` tells the ended ones."""
 
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)

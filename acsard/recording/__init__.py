@@ -9,7 +9,6 @@ The pure modules:
 - `timeline`: describes a recording in sentences.
 - `retention`: decides which recordings are deleted and which are retained.
 - `published`: rebuilds the messages that were published.
-- `ros_bag`: writes the `metadata.yaml` of a ROS bag.
 
 The modules that do I/O:
 - `recorder`: takes steps from the control loop; `step_writer` writes them in a thread.

@@ -17,7 +17,9 @@ from typing import BinaryIO
 
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
-from acsard.recording.ros_bag import METADATA
+
+METADATA = "metadata.yaml"
+"""Name of the file that describes a ROS bag."""
 
 BAG_SUFFIXES = (".mcap", ".db3")
 """Suffixes of the data files of a ROS bag."""

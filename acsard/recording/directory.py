@@ -238,10 +238,7 @@ class Ring:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and all files in it.
-
-        An earlier version of acsard may have written files that only its own user can read.
-        """
+        """Let every user read the directory and its files, also those of an earlier version."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -265,10 +262,7 @@ class Ring:
         return writing
 
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
-        """Finish a file with the arguments of `Writing.finish`, and name it after its class.
-
-        Returns the new path.
-        """
+        """Finish a file as `Writing.finish` does, and return its path, which has its class."""
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
         writing.path.rename(path)
@@ -295,10 +289,7 @@ class Ring:
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
-        """Call `trim` if the disk is nearly full, and every ten minutes.
-
-        Call this method once a second.
-        """
+        """Trim every ten minutes and if the disk is nearly full. Call this once a second."""
         jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
             self._shift_times(jumped_ns)

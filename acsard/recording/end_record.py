@@ -125,10 +125,7 @@ def end_in(data: bytes) -> EndRecord | None:
 
 
 def _last(tail: bytes) -> dict[str, str] | None:
-    """Return the last end record in `tail`, the last bytes of a file.
-
-    Returns None if the file is not finished.
-    """
+    """Return the end record in the last bytes of a file, or None if it is not finished."""
     footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None

@@ -8,21 +8,21 @@ wheels with themselves.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Literal
 
+import msgspec
 from mcap.writer import Writer
 from msgspec import Struct
 
 from acsard import __version__
 from acsard.core.config.settings import Config
 from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
-from acsard.core.ros.names import TYPE_HASHES
+from acsard.core.ros.names import TYPE_HASHES, Qos
 from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, Outputs
 from acsard.host.errors import RecordingError
-from acsard.recording import ros_bag
-from acsard.recording.atomic_output import replacing, synced
+from acsard.recording.atomic_output import METADATA, replacing, synced
 from acsard.recording.file import About, Recording
 from acsard.recording.file_replay import (
     PROGRESS_STEPS,
@@ -35,6 +35,94 @@ from acsard.recording.published import Published, Publisher
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import WHOLE, Span
+
+BAG_VERSION = 5
+
+_RELIABLE, _BEST_EFFORT = 1, 2
+_TRANSIENT_LOCAL, _VOLATILE = 1, 2
+
+_ENDLESS = "{sec: 9223372036, nsec: 854775807}"
+
+
+class BagTopic(Struct, frozen=True):
+    """A topic of the bag."""
+
+    name: str
+    type: str
+    qos: Qos
+    count: int
+    """Number of messages."""
+
+
+def offered_qos(qos: Qos) -> str:
+    """Return the QoS profile as a YAML list with one entry."""
+    return "\n".join(
+        [
+            "- history: 1",
+            f"  depth: {qos.depth}",
+            f"  reliability: {_BEST_EFFORT if qos.best_effort else _RELIABLE}",
+            f"  durability: {_TRANSIENT_LOCAL if qos.transient else _VOLATILE}",
+            f"  deadline: {_ENDLESS}",
+            f"  lifespan: {_ENDLESS}",
+            "  liveliness: 1",
+            f"  liveliness_lease_duration: {_ENDLESS}",
+            "  avoid_ros_namespace_conventions: false",
+            "",
+        ]
+    )
+
+
+def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: int) -> str:
+    """Return the `metadata.yaml` that makes a ROS bag of a directory with one MCAP file.
+
+    It has format version 5 with numeric QoS policies, which every ROS 2 release since Humble reads.
+    The MCAP file holds the same QoS text in the metadata of each channel, because `ros2 bag play
+    FILE` reads it there.
+
+    Args:
+        file: name of the MCAP file.
+        topics: the topics in the file.
+        first_ns: wall-clock time of the earliest message, ns since 1970.
+        last_ns: wall-clock time of the latest message, ns since 1970.
+    """
+    count = sum(topic.count for topic in topics)
+    begins = f"nanoseconds_since_epoch: {first_ns}"
+    lasts = f"nanoseconds: {last_ns - first_ns}"
+    lines = [
+        "rosbag2_bagfile_information:",
+        f"  version: {BAG_VERSION}",
+        "  storage_identifier: mcap",
+        f"  duration: {{{lasts}}}",
+        f"  starting_time: {{{begins}}}",
+        f"  message_count: {count}",
+        "  topics_with_message_count:",
+    ]
+    for topic in topics:
+        lines += [
+            "    - topic_metadata:",
+            f"        name: {_quoted(topic.name)}",
+            f"        type: {_quoted(topic.type)}",
+            "        serialization_format: cdr",
+            f"        offered_qos_profiles: {_quoted(offered_qos(topic.qos))}",
+            f"      message_count: {topic.count}",
+        ]
+    lines += [
+        '  compression_format: ""',
+        '  compression_mode: ""',
+        f"  relative_file_paths: [{_quoted(file)}]",
+        "  files:",
+        f"    - path: {_quoted(file)}",
+        f"      starting_time: {{{begins}}}",
+        f"      duration: {{{lasts}}}",
+        f"      message_count: {count}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """Quote a YAML string, because a name or a path may contain YAML syntax."""
+    return msgspec.json.encode(text).decode()
+
 
 MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
 """Columns that calibration reads. `t` is the wall-clock time, s since 1970. `yaw_rate` is from a
@@ -187,7 +275,7 @@ class _MessageWriter(_Writer):
             text = channel.schema.encode()
             self._schemas[kind] = self._writer.register_schema(kind, SCHEMA_ENCODING, text)
         topic = channel.topic(self._namespace, source)
-        about = {"offered_qos_profiles": ros_bag.offered(channel.qos)}
+        about = {"offered_qos_profiles": offered_qos(channel.qos)}
         if kind in TYPE_HASHES:
             about["topic_type_hash"] = TYPE_HASHES[kind]
         number: int = self._writer.register_channel(topic, ENCODING, self._schemas[kind], about)
@@ -199,9 +287,9 @@ class _MessageWriter(_Writer):
         self._writer.finish()
 
     @property
-    def topics(self) -> list[ros_bag.Topic]:
+    def topics(self) -> list[BagTopic]:
         return [
-            ros_bag.Topic(name, channel.schema_name, channel.qos, self._counts[number])
+            BagTopic(name, channel.schema_name, channel.qos, self._counts[number])
             for number, (name, channel) in self._topics.items()
         ]
 
@@ -262,8 +350,8 @@ def export(
             file = part / f"{new.name}_0.mcap"
             with file.open("wb") as stream:
                 write(bag := message_writer(stream), stream)
-            with (part / ros_bag.METADATA).open("wb") as stream:
-                stream.write(ros_bag.metadata(file.name, bag.topics, *bag.times).encode())
+            with (part / METADATA).open("wb") as stream:
+                stream.write(bag_metadata(file.name, bag.topics, *bag.times).encode())
                 synced(stream)
             return ExportResult(bag.count, _gaps(run, span, recording.about))
         with part.open("wb") as stream:

@@ -370,10 +370,7 @@ class Recording:
     """A recording read from a file. Damaged parts of the file are skipped."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file.
-
-        Raises `RecordingError` if it cannot be read or is not a recording of acsard.
-        """
+        """Read the file; raise `RecordingError` if it is not a recording that can be read."""
         self.path = path
         self.paths = [path]
         """The files that are read, in order."""

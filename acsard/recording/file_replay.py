@@ -86,10 +86,7 @@ class ReplayResult(NamedTuple):
 
 
 def config_of(recording: Recording) -> Config:
-    """Return the configuration of a recording.
-
-    Raises `RecordingError` if this version cannot read the configuration.
-    """
+    """Return a recording's configuration; raise `RecordingError` if this version cannot read it."""
     try:
         return parse(recording.about.config.encode())
     except ConfigError as error:
@@ -225,10 +222,7 @@ class RecordedRun(_Source):
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
 
     def steps(self) -> Iterator[Step]:
-        """Yield the steps that can be replayed, and count the others in `gaps`.
-
-        Raises `RecordingError` if there is none.
-        """
+        """Yield the steps that can be replayed; raise `RecordingError` if there is none."""
         recording = self._recording
         replayed_ns = recording.about.mono_ns
         read, damaged = self._next, 0
@@ -277,10 +271,7 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Take the robot from `saved` if it is the robot before the step `number`.
-
-        Returns whether it is.
-        """
+        """Take the robot from `saved`, and return True, if it is the one before this step."""
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
         state = self._resumed(saved, number, tried)

@@ -196,10 +196,7 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
-    """Read the chunk whose head begins at the offset `begin` of the file.
-
-    Returns None if no chunk begins there.
-    """
+    """Read the chunk whose head begins at this offset of the file, or return None."""
     at = begin + _HEAD.size
     named = data.startswith(ZSTD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):

@@ -154,10 +154,7 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Return the CRC-32 of all bits of the poses, twists and wheel angles.
-
-    `before` is the CRC-32 of the estimates before these, or 0.
-    """
+    """Return the CRC-32 `before`, continued by all bits of poses, twists and wheel angles."""
     for e in estimates:
         pose, twist = e.pose, e.twist
         data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)

@@ -180,10 +180,7 @@ class Replay:
         return difference
 
     def _keep(self, difference: Difference) -> None:
-        """Keep the first difference of all and of each output, and the first fault of the replay.
-
-        A fault that the recording has too is not kept.
-        """
+        """Keep the first difference, that of each output, and the replay's own first fault."""
         comparison = self.comparison
         comparison.first = comparison.first or difference
         for output in difference.what:
@@ -261,10 +258,7 @@ def _different_parts(
 
 @lru_cache(64)
 def fastest(line: bytes | None) -> int:
-    """Return the highest wheel speed in a line, hundredths of rad/s.
-
-    Returns 0 if the line is None or holds no speeds.
-    """
+    """Return the highest wheel speed in a line, hundredths of rad/s; 0 without any."""
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

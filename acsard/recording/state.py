@@ -88,10 +88,7 @@ _checkpoint = msgspec.msgpack.Decoder(Checkpoint)
 
 
 def checkpoint(data: bytes) -> Checkpoint:
-    """Decode a message of the channel `state`, but not the robot in it.
-
-    Raises `StateError` if the bytes are damaged.
-    """
+    """Decode a message of `state`, but not its robot; raise `StateError` if damaged."""
     try:
         return _checkpoint.decode(data)
     except msgspec.MsgspecError as error:
@@ -110,10 +107,7 @@ def freeze(robot: Robot, memory: Memory) -> bytes:
 
 
 def thaw(data: bytes) -> State:
-    """Decode a robot and its guard's memory.
-
-    Raises `StateError` if this version cannot make them.
-    """
+    """Return a robot and its guard's memory; raise `StateError` if it cannot be made."""
     try:
         made = unpickle(data, part_class)
     except ValueError as error:

@@ -211,10 +211,7 @@ def _seconds(when: When, found: list[Stretch], end: bool) -> float:
 
 
 def part_between(found: list[Stretch], first: float, last: float) -> Span | None:
-    """Return the smallest part with all of a recording between two times, s since 1970.
-
-    Returns None if nothing was recorded between them.
-    """
+    """Return the part of a recording between two times, s since 1970; None if it is empty."""
     inside = [one for one in found if one.begin <= last and first <= one.end]
     if not inside:
         return None
@@ -241,10 +238,7 @@ class Contents(NamedTuple):
 
 
 def stretches(recording: Recording) -> list[Stretch]:
-    """Return the stretches between clock steps, in order.
-
-    There is one if the clock was never set, and none if no step can be read.
-    """
+    """Return the stretches between clock steps in order; none if no step can be read."""
     contents = read_contents(recording)
     return contents.stretches if contents else []
 

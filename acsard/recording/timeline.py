@@ -276,10 +276,7 @@ class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
     def __init__(self, config: Config | None = None) -> None:
-        """Prepare for the first step.
-
-        `config` has the priorities of the sources; without it there is no entry `waits`.
-        """
+        """Take the sources' priorities from `config`; without it no entry is `waits`."""
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None

@@ -123,10 +123,7 @@ class _Entry:
         """True once an opcode has referred to the value. Then it cannot grow any more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Add the depth and the size of new parts to those of this container.
-
-        Raises `ValueError` if a limit is exceeded.
-        """
+        """Add the depth and size of new parts; raise `ValueError` if a limit is exceeded."""
         if self.closed:
             raise ValueError("a part of it contains itself, or grows while it is built")
         for part in parts:

@@ -6,6 +6,7 @@ import random
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from acsard.core.config.named_faults import FAULTS
 from acsard.core.config.parsing import effective
@@ -115,6 +116,14 @@ class Tape:
             if apart:
                 writing.end_chunk()
         writing.finish()
+
+
+def recorded_world(
+    config: Config | None = None, *, every: int = 0, **options: Any
+) -> tuple[Tape, World]:
+    """Return a tape and the world that it records, which has these options."""
+    tape = Tape(every=every)
+    return tape, World(config, recorder=tape, **options)
 
 
 def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:

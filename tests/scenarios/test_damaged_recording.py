@@ -21,7 +21,7 @@ from acsard.recording.mcap_records import walk
 from acsard.recording.recorder import Recorder
 from acsard.recording.series import Series
 from tests.each import each
-from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.taped import chunks, recorded_world
 from tests.scenarios.world import World
 
 MINUTES = 10
@@ -213,8 +213,7 @@ def test_damage_that_hides_the_end_of_a_file_is_not_taken_for_a_cut(
 def test_a_lost_chunk_whose_events_begin_the_next_one_is_not_taken_for_a_forgery(
     tmp_path: Path,
 ) -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, seconds=3.0)
     world.call("stop")
     world.run(3.0)

@@ -41,7 +41,14 @@ from acsard.recording.file_replay import RecordedRun
 from acsard.recording.published import MEASURED, Publisher
 from acsard.recording.replay import replay_step
 from tests.each import each
-from tests.scenarios.taped import ADDED, Tape, drive_through_faults, happenings, plain
+from tests.scenarios.taped import (
+    ADDED,
+    Tape,
+    drive_through_faults,
+    happenings,
+    plain,
+    recorded_world,
+)
 from tests.scenarios.world import EVERY_KEY, World
 
 CHECKED = replace(
@@ -59,8 +66,7 @@ def driven(config: Config) -> tuple[World, Tape]:
 
     The client in it subscribed to everything.
     """
-    tape = Tape()
-    world = World(config, recorder=tape, wanted=EVERY_KEY)
+    tape, world = recorded_world(config, wanted=EVERY_KEY)
     world.bus.publish("tf_static", world.loop.report.tf_static())
     drive_through_faults(world, 4.0)
     happenings(world, random.Random(1))

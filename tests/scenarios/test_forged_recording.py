@@ -21,8 +21,7 @@ from acsard.recording.file import Recording, Topic, Writing
 from acsard.recording.rows import NOTHING, Batch, Rare, Row
 from acsard.recording.timeline import TimelineEntry
 from tests.each import each
-from tests.scenarios.taped import Tape, happenings
-from tests.scenarios.world import World
+from tests.scenarios.taped import happenings, recorded_world
 
 FORGERIES = 10
 """Number of forged recordings for each kind of forgery."""
@@ -180,8 +179,7 @@ def removed_copy(messages: Messages, dice: random.Random) -> None:
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a recording of two sources, calls, refused commands, a lost port and a fault."""
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, 0.3, 1.0, source="nav")
     happenings(world, random.Random(1))
     with world.mcu.stuck_encoder(0):

@@ -13,7 +13,7 @@ from acsard.core.messages.topics import TOPICS
 from acsard.core.values import NS_PER_S
 from acsard.recording.state import freeze
 from tests.scenarios.speakers import Speaker
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import EVERY_KEY, World
 
 SECRET = "5f0c9d31a7e24b68b1d2c3e4"
@@ -68,8 +68,7 @@ def names(texts: list[bytes]) -> list[str]:
 
 def driven() -> tuple[World, Speaker, list[bytes]]:
     """A robot that its operator drives straight on, and everything that its daemon has shown."""
-    tape = Tape()
-    world = World(recorder=tape, wanted=EVERY_KEY)
+    tape, world = recorded_world(wanted=EVERY_KEY)
     victim = Speaker(world, "signed", VICTIM)
     victim.open(0.4)
     asked_everything(world)
@@ -100,8 +99,7 @@ def test_an_attacker_who_knows_all_that_is_published_cannot_drive_as_the_operato
 
 
 def test_the_session_that_stamps_a_command_is_not_published() -> None:
-    tape = Tape()
-    world = World(recorder=tape, wanted=EVERY_KEY)
+    tape, world = recorded_world(wanted=EVERY_KEY)
     speaker = Speaker(world, "zenoh", SECRET)
     speaker.open(0.4)
     shown = world.state.sender

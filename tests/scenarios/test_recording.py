@@ -15,6 +15,7 @@ from tests.scenarios.taped import (
     WITH_ARGUMENTS,
     Tape,
     drive_through_faults,
+    recorded_world,
     replayed,
 )
 from tests.scenarios.world import World
@@ -29,8 +30,7 @@ SLOW_LIMITS = replace(PLAIN, limits=replace(PLAIN.limits, linear_speed=0.3))
 
 
 def taped(config: Config, seconds: float) -> Tape:
-    tape = Tape()
-    world = World(config, recorder=tape)
+    tape, world = recorded_world(config)
     drive_through_faults(world, seconds)
     return tape
 
@@ -40,15 +40,20 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert comparison.first is None
     assert comparison.exact
     assert comparison.steps == comparison.modes_same == len(tape.taken) - first
-    assert comparison.lines == comparison.lines_same >= least
-    assert comparison.poses == comparison.poses_same >= least
+    taken = tape.taken[first:]
+    lines = sum(one.outputs.line is not None for one in taken)
+    assert comparison.lines == comparison.lines_same == lines >= least
+    poses = sum(len(one.outputs.estimates) for one in taken)
+    assert comparison.poses == comparison.poses_same == poses >= least
+    assert comparison.end is not None
+    assert comparison.end[0] == comparison.end[1]
+    assert comparison.apart == 0.0
 
 
 @pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
 def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(after: float) -> None:
     """The guard of the replay lets the rest of the ramp pass, and nothing that comes too late."""
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(1.0, seconds=2.0)
     world.run(after)
     tape.cut = True
@@ -73,8 +78,7 @@ def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(afte
     ],
 )
 def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config) -> None:
-    tape = Tape()
-    world = World(config, recorder=tape)
+    tape, world = recorded_world(config)
     assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS}
     inputs = [taken.inputs for taken in tape.taken]
     for has in ("superseded", "missed", "refusals", "requests", "port_trouble", "commands"):
@@ -83,8 +87,7 @@ def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config)
 
 
 def test_settings_that_were_changed_meanwhile_are_replayed_too() -> None:
-    tape = Tape()
-    world = World(PLAIN, recorder=tape)
+    tape, world = recorded_world(PLAIN)
     world.drive(0.5, seconds=1.0)
     world.call("stop")
     world.run(2.0)
@@ -102,8 +105,7 @@ def test_settings_that_were_changed_meanwhile_are_replayed_too() -> None:
 
 @pytest.mark.slow
 def test_it_goes_on_from_any_moment_of_such_a_drive() -> None:
-    tape = Tape(every=397)
-    world = World(FULL, recorder=tape)
+    tape, world = recorded_world(FULL, every=397)
     drive_through_faults(world, 20.0)
     assert len(tape.states) > 5
     for first in tape.states:
@@ -124,8 +126,7 @@ def test_an_hour_through_every_fault_is_replayed() -> None:
 
 @pytest.mark.parametrize("config", [PLAIN, FULL], ids=["plain", "checked, counted, with a gyro"])
 def test_a_recording_that_begins_in_a_drive_goes_on_from_its_state(config: Config) -> None:
-    tape = Tape()
-    world = World(config, recorder=tape)
+    tape, world = recorded_world(config)
     world.drive(0.6, 0.4, seconds=2.0)
     tape.cut = True
     world.hold(0.6, -0.4, seconds=3.0)
@@ -189,8 +190,7 @@ def test_other_limits_name_the_first_line_that_differs() -> None:
 
 
 def test_other_limits_take_over_in_the_middle_of_a_drive() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, 0.3, seconds=2.0)
     tape.cut = True
     world.hold(0.5, 0.3, seconds=2.0)

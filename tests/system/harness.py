@@ -57,7 +57,7 @@ ZERO_LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 ZERO = {"linear": {"x": 0.0}, "angular": {"z": 0.0}}
 
 
-def until(look: Callable[[], T | None], within: float, what: str) -> T:
+def until(look: Callable[[], T | None], within: float = 10.0, what: str = "") -> T:
     """Return the first true value of `look`. The failure message contains `what`."""
     deadline = time.monotonic() + within + PATIENCE_S
     while True:

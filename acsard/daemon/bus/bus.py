@@ -209,10 +209,7 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return which of the liveliness tokens `alive` and `claims` other sessions hold.
-
-    Takes up to `TWIN_TIMEOUT_S`.
-    """
+    """Return which of these tokens other sessions hold; take up to `TWIN_TIMEOUT_S`."""
     liveliness = session.liveliness()
     subscribers = {
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)

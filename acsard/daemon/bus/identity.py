@@ -44,10 +44,7 @@ class Identity(Struct, frozen=True):
     """The endpoint to which the client is connected."""
 
     def lacks(self, key: str) -> str:
-        """Return why this client may not use a key below the robot's id.
-
-        Returns "" if the client may use it, or if neither role nor certificate are known.
-        """
+        """Return why this client may not use a robot's key; "" if it may, or nothing is known."""
         least = least_role(key)
         if not self.role:
             return self.silence

@@ -113,10 +113,7 @@ class Outlets:
         self._waiting = True
 
     def flush(self) -> None:
-        """Wake the thread, which sends the messages in the slots.
-
-        Raises the error that has ended the thread, if there was one.
-        """
+        """Wake the thread that sends the messages; raise the error that has ended it."""
         if self._error is not None:
             raise self._error
         if self._waiting:

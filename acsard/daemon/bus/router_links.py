@@ -40,10 +40,7 @@ class RouterLinks:
         return self._changes.pop()
 
     def start(self, session: zenoh.Session) -> None:
-        """Start polling.
-
-        Poll even if `bus.connect` is empty, because a router may have connected to the daemon.
-        """
+        """Start polling, also without `bus.connect`: a router may connect to the daemon."""
         self._session = session
         self._thread.start()
 

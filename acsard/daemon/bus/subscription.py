@@ -27,10 +27,7 @@ class Arrivals(Mailbox[zenoh.Sample]):
         """The Zenoh subscribers that fill this queue."""
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if no sample waits.
-
-        Raises `ZError` if no sample waits and the session has ended.
-        """
+        """Return the next sample, or None; raise `ZError` at the end of the session."""
         sample = self.pop()
         if sample is None and self.closed and not self.waiting:
             raise zenoh.ZError("the session has been closed")
@@ -54,10 +51,7 @@ class Subscription:
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if no sample waits.
-
-        Raises `ZError` if no sample waits and the session has ended.
-        """
+        """Return the next sample, or None; raise `ZError` at the end of the session."""
         # The loop is bounded, because a flood of samples on other keys must not hold the caller.
         for _ in range(QUEUED):
             sample: zenoh.Sample | None = self._queue.try_recv()
@@ -74,10 +68,7 @@ class Subscription:
         self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """Yield samples until no sample arrives for `timeout` s, or until the session closes.
-
-        `timeout` None means no limit.
-        """
+        """Yield samples until the session closes, or none arrives for `timeout` s if given."""
         quiet_since_ns = clock.mono_ns()
         try:
             while True:

@@ -51,10 +51,7 @@ class Gateway(Listener):
     events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
-        """Check the certificates of `[bus.tls]`.
-
-        Raises `CertificateError` or `NotPermittedError` if they cannot be used.
-        """
+        """Raise `CertificateError` or `NotPermittedError` if `bus.tls` cannot be used."""
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
         self.files = CertificateFiles(*files_in(config.bus.tls))
@@ -64,10 +61,7 @@ class Gateway(Listener):
         self._probe = DaemonProbe(full_key(config.robot.id, "info"))
 
     def ready(self) -> bool:
-        """Return whether the daemon accepts connections.
-
-        The gateway admits no client before the daemon does.
-        """
+        """Return whether the daemon accepts connections; before it no client is admitted."""
         host, _, port = reachable(self._config.bus.plain[0]).partition("/")[2].rpartition(":")
         try:
             with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
@@ -119,10 +113,7 @@ class DaemonProbe:
         """
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Send a query if the last one is a second old.
-
-        Returns the number of consecutive queries that did not end within a second.
-        """
+        """Return how many queries in a row took over a second; send one a second."""
         if now_ns - self._asked_ns < PROBE_NS:
             return self._unanswered
         if self._asked_ns:

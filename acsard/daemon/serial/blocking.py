@@ -80,10 +80,7 @@ class BlockingPort:
         return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
-        """Write all of `data` to the driver.
-
-        Raise `WireLostError` if the driver stops taking bytes.
-        """
+        """Write `data`; raise `WireLostError` if the driver stops taking bytes."""
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
         while data:

@@ -33,10 +33,7 @@ class _Device(serial.Serial):  # type: ignore[misc]
     """A port whose `read` makes one system call. The caller knows that data is waiting."""
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to `size` waiting bytes.
-
-        Raise `SerialException` if the port is lost or closed.
-        """
+        """Return up to `size` waiting bytes; raise `SerialException` for a lost port."""
         if self.fd is None:
             raise serial.PortNotOpenError
         try:
@@ -184,10 +181,7 @@ _JOIN = (
 
 
 def require(path: str) -> None:
-    """Raise `refusal` if the path is not a character device.
-
-    The daemon waits for its port; a tool must not.
-    """
+    """Raise `refusal` unless the path is a character device. The daemon would wait for it."""
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):
             raise OSError(errno.ENOTTY, "not a character device")

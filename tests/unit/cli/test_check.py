@@ -34,14 +34,6 @@ def test_a_good_file_is_printed_as_json_on_request(
     assert from_builtins(msgspec.json.decode(capsys.readouterr().out)) == parse(file.read_bytes())
 
 
-def test_a_bad_file_ends_with_the_code_for_bad_configuration(tmp_path: Path) -> None:
-    file = tmp_path / "robot.toml"
-    file.write_text("colour = 1\n")
-    with pytest.raises(MendableError) as caught:
-        main(argparse.Namespace(config=str(file), json=False))
-    assert int(caught.value.code) == 78
-
-
 def test_a_missing_urdf_ends_with_the_code_for_bad_configuration(tmp_path: Path) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(f'[ros]\nurdf = "{tmp_path}/nothing.urdf"\n')

@@ -23,7 +23,7 @@ from acsard.recording.file import About, Recording, Writing
 from acsard.recording.recorded_steps import Taken, Unfinished
 from acsard.recording.recovery import recover
 from acsard.recording.timeline import is_serious
-from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.taped import Tape, chunks, recorded_world
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
 
@@ -147,8 +147,7 @@ def test_the_configuration_names_the_directory_of_the_recordings(
 
 def test_the_list_tells_a_start_from_a_file_that_goes_on(tmp_path: Path) -> None:
     """The files are whole, truncated, recovered into a second file, and recovered in place."""
-    tape = Tape(every=200)
-    world = World(recorder=tape)
+    tape, world = recorded_world(every=200)
     world.drive(0.5, seconds=4.0)
     for number, first in enumerate((0, 200)):
         whole = tmp_path / f"00000{number}-20270115T080000Z.mcap"
@@ -216,8 +215,7 @@ def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
 
     A stop happens in the first second of the new day.
     """
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     starts_at(world, 23, 59, 58.0)
     world.run(2.0)
     if set_to:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.core.config.settings import Config
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 
 RECORDED = "000007-20270115T080000Z.kept.mcap"
@@ -142,8 +142,7 @@ def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
 ) -> None:
     wide = replace(Config().drive, wheel_separation_multiplier=1.1)
     config = replace(Config(), drive=wide, odometry=replace(Config().odometry, gyro=True))
-    tape = Tape()
-    world = World(config, recorder=tape)
+    tape, world = recorded_world(config)
     spin_and_curve(world)
     # calibrate recognizes the format by its content, not by its name
     tape.write(here / "drive.log", config)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from acsard.core.config.settings import Config
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
 
@@ -140,8 +140,7 @@ def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
 
 def test_a_drive_across_a_rotation_is_one_drive(tmp_path: Path) -> None:
     """The drive begins in the first of four files and ends in the last one."""
-    tape = Tape(every=STEPS)
-    world = World(recorder=tape)
+    tape, world = recorded_world(every=STEPS)
     world.run(0.5)
     world.drive(0.5, seconds=2.0)
     world.run(1.5)
@@ -161,8 +160,7 @@ def test_a_drive_across_a_rotation_is_one_drive(tmp_path: Path) -> None:
 def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
     tmp_path: Path,
 ) -> None:
-    tape = Tape(every=STEPS)
-    world = World(recorder=tape)
+    tape, world = recorded_world(every=STEPS)
     world.run(0.5)
     world.drive(0.5, seconds=2.0)
     world.run(1.5)
@@ -212,8 +210,7 @@ def test_a_report_goes_on_across_a_rotation(
 
 
 def test_a_time_before_a_clock_that_was_set_back_is_found(tmp_path: Path) -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.run(1.0)
     world.wall_offset_ns -= 3600 * 10**9
     world.run(0.5)

@@ -22,6 +22,7 @@ from acsard.daemon.latch_rules import MAX_BYTES, encode
 from acsard.host.atomic_file import replace as replace_file
 from acsard.host.atomic_file import sync as sync_file
 from acsard.host.errors import InUseError
+from tests.system.harness import until
 
 NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
 STOP = Latches(stop=Latch(1_800_000_000_000, NOW.wall_ns, "joe", "stopped by joe"))
@@ -57,11 +58,10 @@ def end(file: LatchFile) -> None:
         file._lock = -1
 
 
-def until(look: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not look():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
+@pytest.fixture
+def file(tmp_path: Path, started: Started) -> LatchFile:
+    """Return the latch file of a robot at its first start."""
+    return started(tmp_path)[0]
 
 
 def test_without_a_file_it_is_the_first_start_and_the_file_is_there_then(
@@ -75,16 +75,16 @@ def test_without_a_file_it_is_the_first_start_and_the_file_is_there_then(
 
 @pytest.mark.parametrize("latches", [STOP, FAULT])
 def test_latches_are_in_force_at_the_next_start(
-    tmp_path: Path, started: Started, latches: Latches
+    tmp_path: Path, started: Started, file: LatchFile, latches: Latches
 ) -> None:
-    file, _ = started(tmp_path)
     file.keep(latches)
     end(file)
     assert started(tmp_path)[1] == latches.after_restart()
 
 
-def test_a_latch_that_was_cleared_stays_cleared(tmp_path: Path, started: Started) -> None:
-    file, _ = started(tmp_path)
+def test_a_latch_that_was_cleared_stays_cleared(
+    tmp_path: Path, started: Started, file: LatchFile
+) -> None:
     file.keep(STOP)
     file.keep(Latches())
     end(file)
@@ -164,9 +164,8 @@ def same(one: Latches, other: Latches) -> bool:
 
 
 def test_an_old_stop_in_a_directory_that_cannot_be_written_keeps_its_name(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, started: Started, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     file.keep(STOP)
     end(file)
     monkeypatch.setattr(module, "replace", full)
@@ -291,9 +290,8 @@ def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
 
 
 def test_only_the_newest_is_written_when_the_disk_takes_again(
-    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+    file: LatchFile, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     monkeypatch.setattr(module, "replace", stuck.replace)
     file.keep(FAULT)
     assert stuck.asked.wait(10.0)
@@ -305,9 +303,8 @@ def test_only_the_newest_is_written_when_the_disk_takes_again(
 
 
 def test_a_flood_of_stops_is_written_at_a_pace(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     contents = []
 
     def counted(path: Path, content: bytes, *, synced: bool) -> None:
@@ -342,9 +339,8 @@ def test_latches_are_held_from_the_rename_on(
 
 
 def test_latches_that_come_with_the_end_are_written(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     pop = file._box.pop
 
     def late() -> Latches | None:
@@ -361,9 +357,8 @@ def test_latches_that_come_with_the_end_are_written(
 
 
 def test_each_write_waits_for_the_file_and_for_its_name(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     synced: list[Path] = []
     monkeypatch.setattr(module, "sync", synced.append)
     file.keep(STOP)
@@ -371,17 +366,15 @@ def test_each_write_waits_for_the_file_and_for_its_name(
     assert synced[-2:] == [tmp_path / NAME, tmp_path]
 
 
-def test_to_wait_ends_once_the_latches_are_held(tmp_path: Path, started: Started) -> None:
-    file, _ = started(tmp_path)
+def test_to_wait_ends_once_the_latches_are_held(file: LatchFile) -> None:
     file.keep(STOP)
     file.wait(STOP, 10.0)
     assert file.holds(STOP)
 
 
 def test_to_wait_for_a_stuck_disk_ends_when_the_time_is_over(
-    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+    file: LatchFile, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     monkeypatch.setattr(module, "replace", stuck.replace)
     file.keep(STOP)
     began = time.monotonic()
@@ -391,9 +384,8 @@ def test_to_wait_for_a_stuck_disk_ends_when_the_time_is_over(
 
 
 def test_to_wait_for_a_disk_that_fails_is_over_at_once(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     monkeypatch.setattr(module, "replace", full)
     file.keep(STOP)
     until(lambda: file.trouble)
@@ -403,9 +395,8 @@ def test_to_wait_for_a_disk_that_fails_is_over_at_once(
 
 
 def test_the_end_waits_for_a_stuck_disk_only_for_its_time(
-    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+    file: LatchFile, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     monkeypatch.setattr(module, "replace", stuck.replace)
     file.keep(STOP)
     began = time.monotonic()
@@ -516,8 +507,7 @@ def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
     assert "cannot start another thread" in file.trouble
 
 
-def test_a_thread_that_has_ended_is_reported(tmp_path: Path, started: Started) -> None:
-    file, _ = started(tmp_path)
+def test_a_thread_that_has_ended_is_reported(file: LatchFile) -> None:
     file.close()
     assert file.trouble.startswith("the thread that keeps a stop over a restart has ended")
 
@@ -632,9 +622,8 @@ def test_a_disk_that_hangs_and_then_fails_is_not_said_to_keep_again(
 
 
 def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, _ = started(tmp_path)
     monkeypatch.setattr(module, "RETRY_S", 0.01)
     tries = []
 

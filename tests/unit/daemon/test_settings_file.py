@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from acsard.daemon.settings_file import SettingsFile, keeps
 from acsard.host import config_file, edit_process
 from acsard.host.config_file import Edit
 from acsard.host.edit_process import edited_apart
+from tests.system.harness import until
 
 TEXT = "[limits]\nlinear_speed = 0.5\n"
 LOWERED = "limits.linear_speed = 0.3, not 0.5"
@@ -60,13 +60,6 @@ def file(tmp_path: Path) -> Path:
 def made(file: Path, started: Started) -> SettingsFile:
     """Return the settings file of a daemon that has started with `file`."""
     return started(file, parse(TEXT.encode()), {})
-
-
-def until(look: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not look():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
 
 
 def with_speed(config: Config, speed: float) -> Config:

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Metadata, MetadataIndex
+from mcap.records import Chunk, DataEnd, Footer, Header, Metadata, MetadataIndex
 
 from acsard.core.config.settings import Config
 from acsard.recording.end_record import END, TAIL_BYTES, EndRecord, as_metadata, read_end
-from acsard.recording.mcap_records import MAGIC
+from acsard.recording.mcap_records import MAGIC, encoded
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
@@ -30,13 +29,6 @@ BOMB = Chunk(
     uncompressed_size=len(ZEROS),
 )
 """A chunk of a few kB that has 16 MB inside."""
-
-
-def encoded(*records: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    return bytes(builder.end())
 
 
 FRONT = MAGIC + encoded(Header("", ""))

@@ -5,6 +5,7 @@ The tests also cover files that are already in their place.
 
 from __future__ import annotations
 
+import io
 import os
 import random
 import stat
@@ -21,30 +22,35 @@ from msgspec.structs import replace
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
 
 from acsard.calibration.log_table import read
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import CHANNELS
+from acsard.core.ros.names import Qos
 from acsard.core.values import GyroSample, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording.atomic_output import replacing
 from acsard.recording.export import (
     CSV_HEADER,
     MEASURED_CSV_HEADER,
+    BagTopic,
     Kind,
+    bag_metadata,
     csv_rows,
     export,
     gyro_columns,
     measured,
     measured_csv_rows,
+    offered_qos,
     wheel_columns,
 )
 from acsard.recording.file import Recording
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import Span
-from tests.scenarios.taped import Tape, chunks
-from tests.scenarios.world import START, World
+from tests.scenarios.taped import Tape, chunks, recorded_world
+from tests.scenarios.world import START
 
 SECONDS = 2.0
 
@@ -54,8 +60,7 @@ KINDS: tuple[Kind, ...] = ("mcap", "csv", "rosbag2")
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a drive with two sources."""
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, 0.3, 0.4)
     world.drive(0.3, 0.0, 0.3, source="teleop")
     world.call("stop")
@@ -338,8 +343,7 @@ GYRO = replace(Config(), odometry=replace(Config().odometry, gyro=True))
 
 @pytest.fixture(scope="module")
 def tape() -> Tape:
-    tape = Tape()
-    world = World(GYRO, recorder=tape)
+    tape, world = recorded_world(GYRO)
     world.drive(0.5, 0.4, 1.0)
     return tape
 
@@ -383,3 +387,46 @@ def test_the_times_in_the_table_are_those_of_the_samples(tape: Tape) -> None:
     arrived = GyroSample(START.mono_ns + 2_000_050, None, 0.25)
     assert gyro_columns(arrived, now) == "1800000000.002000,,,,,0.25"
     assert gyro_columns(replace(arrived, stamp_ns=1_500_000), now) == "0.001500,,,,,0.25"
+
+
+def loaded(text: str) -> Any:
+    return YAML(typ="safe").load(io.StringIO(text))
+
+
+@pytest.mark.parametrize(
+    ("qos", "depth", "reliability", "durability"),
+    [
+        (Qos(), 10, 1, 2),
+        (Qos(1, transient=True), 1, 1, 1),
+        (Qos(5, best_effort=True), 5, 2, 2),
+    ],
+)
+def test_qos_policies_are_written_as_the_numbers_of_rmw(
+    qos: Qos, depth: int, reliability: int, durability: int
+) -> None:
+    (said,) = loaded(offered_qos(qos))
+    assert (said["history"], said["depth"]) == (1, depth)
+    assert (said["reliability"], said["durability"]) == (reliability, durability)
+    assert said["avoid_ros_namespace_conventions"] is False
+
+
+def test_topics_are_written_whatever_their_names() -> None:
+    topics = [
+        BagTopic("/odom", "nav_msgs/msg/Odometry", Qos(), 7),
+        BagTopic("/cmd_vel_in/off", "geometry_msgs/msg/TwistStamped", Qos(), 2),
+    ]
+    said = loaded(bag_metadata("yes: no #.mcap", topics, 5, 25))["rosbag2_bagfile_information"]
+    assert said["relative_file_paths"] == ["yes: no #.mcap"]
+    assert said["message_count"] == 9
+    assert said["starting_time"] == {"nanoseconds_since_epoch": 5}
+    assert said["duration"] == {"nanoseconds": 20}
+    assert said["files"][0] == {
+        "path": "yes: no #.mcap",
+        "starting_time": {"nanoseconds_since_epoch": 5},
+        "duration": {"nanoseconds": 20},
+        "message_count": 9,
+    }
+    names = [one["topic_metadata"]["name"] for one in said["topics_with_message_count"]]
+    assert names == ["/odom", "/cmd_vel_in/off"]
+    first = said["topics_with_message_count"][0]
+    assert loaded(first["topic_metadata"]["offered_qos_profiles"]) == loaded(offered_qos(Qos()))

@@ -23,14 +23,13 @@ from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, MODE, About, Recordi
 from acsard.recording.file_replay import config_of, replay_file, steps
 from acsard.recording.recorded_steps import status_of
 from acsard.recording.rows import encode
-from tests.scenarios.taped import BATCH, Tape, chunks
+from tests.scenarios.taped import BATCH, Tape, chunks, recorded_world
 from tests.scenarios.world import World
 
 
 @pytest.fixture(scope="module")
 def tape() -> Tape:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, 0.2, seconds=6.0)
     world.call("stop")
     return tape

@@ -13,7 +13,7 @@ from acsard.recording.recorded_steps import (
     micropose,
     unfinished,
 )
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 
 
@@ -40,8 +40,7 @@ def test_a_checksum_continues_and_covers_every_bit() -> None:
 
 
 def test_the_inputs_of_an_unfinished_step_are_read_back() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, 0.2, seconds=0.5)
     world.call("stop")
     for number, taken in enumerate(tape.taken):

@@ -32,7 +32,7 @@ from acsard.recording.file import About, Recording, Writing, rewrite
 from acsard.recording.file_replay import replay_file, steps
 from acsard.recording.recorded_steps import unfinished
 from acsard.recording.recorder import Recorder
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START, World
 
 SECRET = "PRIVATE KEY of a robot"
@@ -818,8 +818,7 @@ def test_the_control_loop_only_appends_to_the_queue(
     monkeypatch.setattr(os, "fsync", hangs)
     monkeypatch.setattr(module, "FLUSH_S", 0.01)
     monkeypatch.setattr(module, "CLOSE_S", 20.0)
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, seconds=0.5)
     taken = tape.taken[-1]
     recorder = Recorder(config(tmp_path), lambda event: None)

@@ -17,7 +17,7 @@ from acsard.recording.timeline import (
     entry_of,
     summary,
 )
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 
 BOARD = Config(mcu=McuConfig(port="/dev/ttyACM0"))
@@ -30,8 +30,7 @@ def story(tape: Tape, without: range = range(0)) -> list[TimelineEntry]:
 
 
 def driven() -> Tape:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, seconds=2.0)
     world.call("stop")
     world.run(0.5)
@@ -52,8 +51,7 @@ def test_the_timeline_has_the_start_each_drive_and_the_end() -> None:
 
 
 def test_a_recording_that_continues_another_begins_with_what_the_robot_does() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, 0.2, seconds=2.0)
     number = len(tape.taken) - 100
     writer, steps = TimelineWriter(), decode(encode(number, tape.taken[number:]))
@@ -71,8 +69,7 @@ def test_a_recording_that_continues_another_begins_with_what_the_robot_does() ->
 
 
 def test_without_a_link_a_recording_that_continues_another_begins_without_a_pose() -> None:
-    tape = Tape()
-    world = World(BOARD, recorder=tape, plugged=False)
+    tape, world = recorded_world(BOARD, plugged=False)
     world.run(4.0)
     first, writer = 50, TimelineWriter()
     entries = [
@@ -107,8 +104,7 @@ def held_by_neutral_first() -> tuple[Tape, float]:
 
     Also returns the wall-clock time at which these speeds begin, s.
     """
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, seconds=1.0)
     world.call("stop")
     world.run(1.0)
@@ -163,8 +159,7 @@ def test_a_sender_of_an_unknown_source_has_no_entry() -> None:
 
 
 def test_senders_under_many_names_make_an_entry_a_second() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, seconds=1.0, source="teleop")
     for number in range(60):
         world.send(0.5, source="teleop")
@@ -187,8 +182,7 @@ def test_a_sender_that_alone_sends_speeds_has_no_entry() -> None:
 
 
 def test_a_drive_of_several_sources_names_all_of_them() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.drive(0.5, seconds=1.0, source="nav")
     world.send(0.0, source="teleop")
     world.hold(0.5, seconds=1.0, source="teleop")
@@ -198,8 +192,7 @@ def test_a_drive_of_several_sources_names_all_of_them() -> None:
 
 
 def test_a_clock_that_was_set_has_an_entry_with_the_time_of_the_new_clock() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
+    tape, world = recorded_world()
     world.run(1.0)
     world.wall_offset_ns += 36_000 * NS_PER_S
     world.run(1.0)
@@ -238,8 +231,7 @@ def test_a_link_that_is_lost_briefly_has_the_reason_of_its_event_only() -> None:
 
 def restarted(identity: bytes) -> list[TimelineEntry]:
     """Return the timeline of a board that loses the link, and names itself in two reads."""
-    tape = Tape()
-    world = World(BOARD, recorder=tape)
+    tape, world = recorded_world(BOARD)
     world.run(1.0)
     with world.mcu.mute():
         world.run(0.5)
@@ -263,8 +255,7 @@ def test_a_board_that_names_itself_again_and_again_has_an_entry_a_second() -> No
 
 
 def test_a_restart_that_the_robot_reports_has_no_second_entry() -> None:
-    tape = Tape()
-    world = World(BOARD, recorder=tape)
+    tape, world = recorded_world(BOARD)
     world.run(1.0)
     world.port.feed(Received(world.instant, b"!acsard-mcu 1 reset=pin\r\n"))
     world.run(1.0)
@@ -299,8 +290,7 @@ def test_reasons_that_differ_in_a_number_are_one_reason_but_names_with_digits_di
 
 
 def test_a_host_stall_is_not_called_a_silence_of_the_board() -> None:
-    tape = Tape()
-    world = World(BOARD, recorder=tape)
+    tape, world = recorded_world(BOARD)
     world.drive(0.5, seconds=1.0)
     with world.mcu.mute():
         world.run(0.05)
@@ -317,8 +307,7 @@ def test_a_host_stall_is_not_called_a_silence_of_the_board() -> None:
 
 
 def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
-    tape = Tape()
-    world = World(BOARD, recorder=tape)
+    tape, world = recorded_world(BOARD)
     world.run(1.0)
     with world.mcu.mute():
         world.run(5.0)

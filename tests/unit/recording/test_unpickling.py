@@ -20,8 +20,7 @@ from acsard.recording.state import TABLE, freeze, part_class, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_DEPTH, MAX_OPCODES, MAX_PARTS, unpickle
 from tests.each import each
 from tests.recordings.__main__ import CHECKED
-from tests.scenarios.taped import Tape, drive_through_faults
-from tests.scenarios.world import World
+from tests.scenarios.taped import drive_through_faults, recorded_world
 from tests.unit.recording.attacks import ATTACKS, doubled, whole
 
 BYTES = 2 << 30
@@ -102,8 +101,7 @@ def test_nesting_is_limited_in_depth_and_doubling_in_size() -> None:
 
 
 def test_the_largest_robot_is_within_the_limits() -> None:
-    tape = Tape(every=100)
-    world = World(CHECKED, recorder=tape)
+    tape, world = recorded_world(CHECKED, every=100)
     drive_through_faults(world, 1.0)
     for number in range(40):
         world.send(0.1, source=f"somebody-{number}")

@@ -128,7 +128,6 @@ def test_a_disk_that_hangs_takes_one_thread(
         return {"": 8}
 
     monkeypatch.setattr(module, "ENDS_LOOK_S", 0.0)
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0, raising=False)
     monkeypatch.setattr(module, "ends", hang)
 
     async def story() -> None:
