@@ -45,9 +45,11 @@ class Spread:
         config = witness.config
         self._by_metre, self._yaw_by_metre, self._yaw_by_radian = 1e-4, 1e-4, 1e-2
         """The rates of `[odometry]` that a configuration without this table has."""
-        # Slow motors, odd radii and counts in short periods look like slip, which widens it too.
+        # Slow motors, odd radii, and few counts or short periods look like slip, which widens it.
         usual = SHORTEST_NS <= witness.period_ns < LONGEST_NS
-        self._judged = not config.get("odometry") and usual
+        counts = config.get("sim", {}).get("encoder_counts")
+        coarse = counts == 96 and not config["mcu"].get("encoder_counts")
+        self._judged = not config.get("odometry") and usual and not coarse
         self._track = 2 * witness.half
         every_s = max(witness.period_ns / NS, config["mcu"].get("reply_period", 0.0))
         self._longest_ns = 2 * max(int(every_s * NS), LEAST_NS)

@@ -24,7 +24,7 @@ from tests.simulate.planted_cases import CASES
 from tests.simulate.planted_faults import FAULTS, FRESHNESS, Fault
 
 OPEN = {"loop end", "robot end"}
-"""Faults whose row has not been measured yet."""
+"""Faults that only plans made by hand have found so far, so that they have no row."""
 
 ALL = (*FAULTS, *CASES)
 ADDED = [fault for fault in ALL if not all(edit.old for edit in fault.edits)]
