@@ -124,8 +124,10 @@ def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_sa
                 daemon.signal(signal.SIGCONT)
             heard.extend(ours.heard)
 
+    (tmp_path / "robot.urdf").write_text('<robot name="acsar"/>')
+    config = {"odometry": {"gyro": True}, "ros": {"urdf": str(tmp_path / "robot.urdf")}}
     with (
-        Daemon(tmp_path, config={"odometry": {"gyro": True}}) as daemon,
+        Daemon(tmp_path, config=config) as daemon,
         Bus(daemon.endpoint) as bus,
         Page(daemon, tmp_path) as page,
     ):
