@@ -21,8 +21,12 @@ JSON has two bytes for each quotation mark and each line end."""
 MAX_JSON = MESSAGE_BYTES - 1024
 """Largest message as JSON, bytes. The rest is for the key and for Zenoh's headers."""
 
-XACRO = "{http://www.ros.org/wiki/xacro}"
-"""Prefix of the names of xacro's elements, as ElementTree writes them."""
+XACRO = "/xacro}"
+"""End of the namespace of xacro's elements, as ElementTree writes it. Files have different ones,
+such as http://www.ros.org/wiki/xacro and http://ros.org/wiki/xacro."""
+
+DOCUMENT_TYPE = "<!DOCTYPE"
+"""Begins a declaration of entities, which could also expand to any length."""
 
 
 def robot_description(path: str) -> str:
@@ -57,6 +61,8 @@ def robot_description(path: str) -> str:
         raise _too_large(path)
     try:
         text = data.decode("utf-8-sig")
+        if DOCUMENT_TYPE in text:
+            raise _error(path, f"it has a document type, {DOCUMENT_TYPE} ...>; take it out")
         root = ET.fromstring(text)
     except UnicodeDecodeError:
         raise _error(path, "it is not a text in UTF-8; save it as UTF-8") from None
@@ -64,7 +70,7 @@ def robot_description(path: str) -> str:
         raise _error(path, f"it is not XML ({error}); name the robot's URDF") from None
     if root.tag != "robot":
         raise _error(path, f"its outermost element is <{root.tag}>, and that of a URDF is <robot>")
-    if any(element.tag.startswith(XACRO) for element in root.iter()):
+    if any(XACRO in element.tag for element in root.iter()):
         raise _error(
             path, f"it is a xacro file; make the URDF with `xacro {path} > robot.urdf`, and name it"
         )

@@ -70,6 +70,12 @@ def test_what_is_not_a_file_is_not_read(tmp_path: Path) -> None:
             "</robot>",
             "xacro",
         ),
+        (
+            '<robot xmlns:x="http://ros.org/wiki/xacro"><x:property name="a" value="1"/></robot>',
+            "xacro",
+        ),
+        ('<!DOCTYPE robot [<!ENTITY a "r7">]><robot name="&a;"/>', "document type"),
+        ('<?xml version="1.0"?>\n<!DOCTYPE robot SYSTEM "urdf.dtd"><robot/>', "document type"),
     ],
 )
 def test_a_file_that_is_no_urdf_is_refused(text: str | bytes, said: str, tmp_path: Path) -> None:
