@@ -207,6 +207,8 @@ class SpeedLimiter:
                 if wanted > self._limit.speed:
                     text = f"{SETTING} = {wanted:g} {self._until}"
                     events.append(Event("set", text, by=request.by, kind="waits"))
+                    if len(request.settings) > 1:
+                        text = f"{mine.message}; {text}"
                     told = replace(mine, message=text)
                     answers = tuple([told if one is mine else one for one in answers])
         if robot is not self._robot or speed != self._settings.limits.linear_speed:
