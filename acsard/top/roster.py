@@ -90,6 +90,8 @@ def told(row: Row) -> tuple[str, ...]:
     state, why = row.state, reason(row.state)
     if state.settings_differ:
         why = f"{why}; settings: {printable(state.settings_differ)}"
+    if state.speed_limit:
+        why = f"{why}; speed limit: {printable(state.speed_limit)}"
     if absence := _absence(row):
         why = f"{absence}, was: {why}"
     return (

@@ -61,6 +61,8 @@ def test_a_zone_slows_the_robot_and_its_end_lets_it_go_on_as_before(world: World
     assert world.state.linear == pytest.approx(0.25, abs=0.02)
     assert world.state.speed_limit.startswith("0.25 m/s by speed_limit, ")
     assert config(world).limits.linear_speed == 0.25
+    (reply,) = world.ask("diagnostics")
+    assert f"speed limit: {world.state.speed_limit}".encode() in reply.payload
     limit(world, 0.0)
     world.hold(0.8, seconds=1.5)
     assert world.state.linear == pytest.approx(0.8, abs=0.02)

@@ -57,7 +57,11 @@ class Row(Struct, frozen=True):
 
 
 def diagnostics(
-    config: Config, outputs: Outputs, snapshot: Snapshot, certificate: tuple[int, str]
+    config: Config,
+    outputs: Outputs,
+    snapshot: Snapshot,
+    certificate: tuple[int, str],
+    speed_limit: str = "",
 ) -> DiagnosticArray:
     """Return the message with all rows.
 
@@ -67,13 +71,14 @@ def diagnostics(
         snapshot: the state of the robot.
         certificate: the level and the description of the certificate's validity, as `expiry`
             returns them. The description is "" without a certificate, and then there is no row.
+        speed_limit: the speed limit that lowers a setting, in words; "" if none does.
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
         Row("mode", OF_MODE.get(outputs.mode, OK), outputs.reason, mode),
         _serial_link(config, outputs, snapshot),
         _control_loop(snapshot),
-        _commands(outputs, snapshot),
+        _commands(outputs, snapshot, speed_limit),
         _wheels(snapshot.doubt, snapshot.counters),
         *_gyro(config, snapshot.gyro),
         *_routers(config.bus.connect, snapshot.routers),
@@ -127,10 +132,12 @@ def _control_loop(snapshot: Snapshot) -> Row:
     )
 
 
-def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
+def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
     values = {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.counters, "command")
     message = f"commanded by {outputs.source}" if outputs.source else "waiting for a command"
+    if speed_limit:
+        message = f"{message}; speed limit: {speed_limit}"
     crowded = [s for s in snapshot.sources if s.waits_for.what == "senders"]
     for source in crowded:
         message = (

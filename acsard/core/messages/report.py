@@ -277,7 +277,8 @@ class Report:
         return expiry(self.certificate_ends, now.wall_ns)
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
-        return diagnostics(self._config, outputs, snapshot, self._certificate(outputs.now))
+        certificate = self._certificate(outputs.now)
+        return diagnostics(self._config, outputs, snapshot, certificate, self.speed_limit)
 
 
 def _spread(spread: Measurements) -> Spread:

@@ -47,6 +47,11 @@ def test_a_robot_whose_settings_differ_from_its_file_is_marked_and_no_other() ->
     assert "; settings: limits" in table(rows, 71)[1]
 
 
+def test_the_speed_limit_that_slows_a_robot_is_shown() -> None:
+    (_, line) = table([replace(ROW, state=replace(STATE, speed_limit="0.3 m/s by x"))], 160)
+    assert line.endswith("; speed limit: 0.3 m/s by x")
+
+
 def test_without_feedback_no_speed_is_shown() -> None:
     (_, line) = table([replace(ROW, state=replace(STATE, linear=None))], 120)
     assert line.split()[2] == "-"

@@ -178,6 +178,15 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
     assert row("commands", outputs=replace(OUTPUTS, source="")).message == "waiting for a command"
 
 
+def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
+    (one,) = [
+        one
+        for one in diagnostics(CONFIG, OUTPUTS, SNAPSHOT, NO_CERTIFICATE, "0.3 m/s by x").status
+        if one.name == "acsard: commands"
+    ]
+    assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s by x")
+
+
 def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> None:
     two = SourceStatus("nav", 10, 0.1, Wait("senders", senders=1))
     alone = SourceStatus("app", 50, 0.1, Wait("nothing"))
