@@ -109,7 +109,7 @@ class ControlLoop:
         """The limits of the configuration file at the start, and the speed limit in force."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """The last latches without a speed limit, with the objects that they were made of."""
-        self._told: tuple[Answer, ...] = ()
+        self._step_answers: tuple[Answer, ...] = ()
         """The answers of this step."""
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that wait until the file has the latches, each with its monotonic time."""
@@ -209,7 +209,7 @@ class ControlLoop:
             self._turn_rates.clear()
         before = self._config
         outputs, went = self._decided(inputs)
-        self._told = (*refused_sets, *self._told)
+        self._step_answers = (*refused_sets, *self._step_answers)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
@@ -225,7 +225,9 @@ class ControlLoop:
         """Return the outputs and whether their line left, and record the step in any case."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
-            self._told = self._speed.settle(self.robot.config, outputs.answers, self._others)
+            self._step_answers = self._speed.settle(
+                self.robot.config, outputs.answers, self._others
+            )
             self._handover.take(self._to_keep(outputs.latches))
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
@@ -408,10 +410,12 @@ class ControlLoop:
                 told_ns = self._mono_ns()
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, told_ns)
-        if self._told:
+        if self._step_answers:
             file, now_ns = self._settings_file, outputs.now.mono_ns
             self._answers.extend(
-                (now_ns, answer) for answer in self._told if file is None or not file.obeyed(answer)
+                (now_ns, answer)
+                for answer in self._step_answers
+                if file is None or not file.obeyed(answer)
             )
         if self._answers:
             self._answer(outputs.now)

@@ -42,7 +42,7 @@ LIFTED = 0.0
 """Value of nav2_msgs/SpeedLimit that means "no limit", in either unit."""
 
 
-class _Wish(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Payload(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A SpeedLimit in which only the number is required."""
 
     header: Header = Header()
@@ -50,7 +50,7 @@ class _Wish(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     speed_limit: float
 
 
-_wishes = Decoder(_Wish)
+_decoder = Decoder(_Payload)
 
 
 class Limit(Struct, frozen=True):
@@ -63,7 +63,7 @@ class Limit(Struct, frozen=True):
     arrived_ns: int
 
 
-def reading(arrival: Arrival, configured: float) -> Limit:
+def decode_limit(arrival: Arrival, configured: float) -> Limit:
     """Return the limit in a sample. Raises `DecodeError`.
 
     `configured` is the configured `limits.linear_speed`, m/s. A percentage is a share of it.
@@ -72,11 +72,11 @@ def reading(arrival: Arrival, configured: float) -> Limit:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
         raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
-    got: SpeedLimit | _Wish
+    got: SpeedLimit | _Payload
     if detect(arrival.encoding, arrival.payload) == "cdr":
         got = decode_cdr(SpeedLimit, arrival.payload)
     else:
-        got = _wishes.decode(arrival.encoding, arrival.payload)
+        got = _decoder.decode(arrival.encoding, arrival.payload)
     value = got.speed_limit
     if not math.isfinite(value):
         raise DecodeError("not_finite", "NaN or infinity; 0.0 lifts the limit")
@@ -129,10 +129,10 @@ class SpeedLimiter:
     def receive(self, arrival: Arrival, configured: float, refusals: list[Refusal]) -> None:
         """Take a message, or add the refusal, which the robot counts and reports.
 
-        `configured` is as in `reading`.
+        `configured` is as in `decode_limit`.
         """
         try:
-            self._waiting = reading(arrival, configured)
+            self._waiting = decode_limit(arrival, configured)
         except DecodeError as error:
             refusals.append(Refusal(error.reason, f"{SPEED_LIMIT}: {error}"))
 
@@ -201,16 +201,16 @@ class SpeedLimiter:
         asked, self._asked = self._asked, None
         if asked is not None:
             request, wanted = asked
-            mine = next((one for one in answers if one.id == request.id), None)
-            if mine is not None and mine.success:
+            answer = next((one for one in answers if one.id == request.id), None)
+            if answer is not None and answer.success:
                 speed = wanted
                 if wanted > self._limit.speed:
                     text = f"{SETTING} = {wanted:g} {self._until}"
                     events.append(Event("set", text, by=request.by, kind="waits"))
                     if len(request.settings) > 1:
-                        text = f"{mine.message}; {text}"
-                    told = replace(mine, message=text)
-                    answers = tuple([told if one is mine else one for one in answers])
+                        text = f"{answer.message}; {text}"
+                    told = replace(answer, message=text)
+                    answers = tuple([told if one is answer else one for one in answers])
         if robot is not self._robot or speed != self._settings.limits.linear_speed:
             self._robot = robot
             limited = self._limit is not NONE

@@ -16,7 +16,7 @@ from acsard.core.config.live import changed
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
 from acsard.core.incoming.commands import Arrival, Via
-from acsard.core.incoming.speed_limit import PAUSE_NS, SETTING, SpeedLimiter, reading
+from acsard.core.incoming.speed_limit import PAUSE_NS, SETTING, SpeedLimiter, decode_limit
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, SpeedLimit, Time
 from acsard.core.ros.attachments import Attachment
@@ -40,11 +40,11 @@ def said(value: object, **fields: Any) -> Arrival:
 @each("form", FORMATS)
 def test_a_speed_limit_is_read_in_every_encoding(form: Format, named: bool) -> None:
     encoding = encoding_name(form, "SpeedLimit") if named else ""
-    assert reading(arrival(encode(FULL, form), encoding), 0.5).speed == pytest.approx(0.2)
+    assert decode_limit(arrival(encode(FULL, form), encoding), 0.5).speed == pytest.approx(0.2)
 
 
 def test_of_json_only_the_number_is_required_and_is_in_metres_per_second() -> None:
-    assert reading(said(0.3), 1.0).speed == 0.3
+    assert decode_limit(said(0.3), 1.0).speed == 0.3
 
 
 @each(
@@ -55,11 +55,11 @@ def test_of_json_only_the_number_is_required_and_is_in_metres_per_second() -> No
 def test_zero_is_no_limit_and_a_percentage_is_of_the_configured_speed(
     value: float, percentage: bool, speed: float
 ) -> None:
-    assert reading(said(value, percentage=percentage), 0.8).speed == speed
+    assert decode_limit(said(value, percentage=percentage), 0.8).speed == speed
 
 
 def test_the_sender_is_named() -> None:
-    by = reading(arrival(encode(FULL, "cdr"), via="rmw"), 1.0).by
+    by = decode_limit(arrival(encode(FULL, "cdr"), via="rmw"), 1.0).by
     assert by == f"speed_limit, unnamed (rmw {(b'g' * 16).hex()})"
 
 
@@ -94,7 +94,7 @@ def test_a_message_is_refused_as_a_whole_with_its_reason(reason: str) -> None:
 def test_whatever_comes_is_a_limit_or_refused(payload: bytes) -> None:
     try:
         # A percentage of the smallest positive numbers is rounded to 0.
-        assert reading(arrival(payload), 1.0).speed >= 0.0
+        assert decode_limit(arrival(payload), 1.0).speed >= 0.0
     except DecodeError:
         pass
 
