@@ -12,7 +12,7 @@ import pytest
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import ServiceReply
-from acsard.core.values import NS_PER_S, Latches, Outputs, Plain
+from acsard.core.values import NS_PER_S, Inputs, Latches, Outputs, Plain
 from acsard.daemon.settings_file import SettingsFile
 from tests.each import each
 from tests.scenarios.taped import Tape, replayed
@@ -176,6 +176,33 @@ def test_a_restart_forgets_the_limit_and_keeps_the_lower_setting_of_the_operator
     assert config(again).limits.linear_speed == pytest.approx(0.45), "of the file's 0.9"
     limit(again, 0.0)
     assert config(again).limits.linear_speed == 0.6
+
+
+@each("obeyed", [True, False])
+@each("lifts", [True, False])
+def test_a_bug_in_the_step_that_changes_the_limit_does_not_keep_the_limit(
+    lifts: bool, obeyed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No message would lift a limit that the latch file has."""
+    robot = Memory(tmp_path / "acsard.toml", "[limits]\nlinear_speed = 0.9\n")
+    world = robot.start()
+    if lifts:
+        limit(world, 0.2)
+    usual = world.loop.robot.step
+
+    def broken(inputs: Inputs) -> Outputs:
+        if inputs.requests and not obeyed:
+            raise ZeroDivisionError("a bug")
+        outputs = usual(inputs)
+        if inputs.requests:
+            raise ZeroDivisionError("a bug")
+        return outputs
+
+    monkeypatch.setattr(world.loop.robot, "step", broken)
+    with pytest.raises(ZeroDivisionError):
+        limit(world, 0.0 if lifts else 0.2)
+    again = robot.start()
+    assert config(again).limits.linear_speed == 0.9
 
 
 def test_a_zone_writes_no_latch_file(tmp_path: Path) -> None:

@@ -115,8 +115,9 @@ class SpeedLimiter:
 
     @property
     def lowers(self) -> bool:
-        """Whether the limit is below the setting."""
-        return self._limit.speed < self._settings.limits.linear_speed
+        """Whether the limit is below the setting, also until the robot has obeyed its end."""
+        lowest = min(self._limit.speed, self._robot.limits.linear_speed)
+        return lowest < self._settings.limits.linear_speed
 
     @property
     def text(self) -> str:
