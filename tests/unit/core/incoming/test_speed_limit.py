@@ -90,11 +90,22 @@ def test_a_message_is_refused_as_a_whole_with_its_reason(reason: str) -> None:
         assert limiter.requests((), 2 * PAUSE_NS) == ((), []), "the limit before stays"
 
 
-@given(st.binary(max_size=200))
-def test_whatever_comes_is_a_limit_or_refused(payload: bytes) -> None:
+DAMAGE = st.lists(st.tuples(st.integers(0, 200), st.binary(max_size=8)), min_size=1, max_size=4)
+
+
+@given(st.sampled_from(FORMATS), DAMAGE, st.booleans())
+def test_a_damaged_message_is_a_limit_or_refused(
+    form: Format, damage: list[tuple[int, bytes]], named: bool
+) -> None:
+    payload = encode(FULL, form)
+    for at, data in damage:
+        start = at % (len(payload) + 1)
+        payload = payload[:start] + data + payload[start + 1 :]
     try:
         # A percentage of the smallest positive numbers is rounded to 0.
-        assert decode_limit(arrival(payload), 1.0).speed >= 0.0
+        assert (
+            decode_limit(arrival(payload, encoding_name(form) if named else ""), 1.0).speed >= 0.0
+        )
     except DecodeError:
         pass
 
