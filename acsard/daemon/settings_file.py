@@ -179,7 +179,12 @@ class SettingsFile:
                 # The log puts the kind in front of the text: `written: KEY to FILE`.
                 text = f"{keys} to {self._file}"
                 events.append(Event("set", text, by=pending.request.by, kind="written"))
-        overdue = [waits for waits in self._pending.values() if now_ns > waits.due_ns]
+        # A request that the robot has gets the robot's answer, so it may not be called "not set".
+        overdue = [
+            waits
+            for waits in self._pending.values()
+            if now_ns > waits.due_ns and (waits.edit is None or waits.answer is not None)
+        ]
         for waits in overdue:
             del self._pending[waits.request.id]
         return [*found, *map(_overdue, overdue)]

@@ -323,6 +323,13 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
     assert made.results(0, []) == []
 
 
+def test_a_request_that_the_robot_has_is_not_reported_as_not_set(made: SettingsFile) -> None:
+    """While a speed limit is in force, a `set` may wait for the step after the one before it."""
+    check(made)
+    assert made.results(module.PATIENCE_NS + 1, []) == []
+    assert made.obeyed(OBEYED)
+
+
 def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
     file: Path, started: Started
 ) -> None:
