@@ -125,7 +125,10 @@ def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_sa
             heard.extend(ours.heard)
 
     (tmp_path / "robot.urdf").write_text('<robot name="acsar"/>')
-    config = {"odometry": {"gyro": True}, "ros": {"urdf": str(tmp_path / "robot.urdf")}}
+    config: dict[str, dict[str, object]] = {
+        "odometry": {"gyro": True},
+        "ros": {"urdf": str(tmp_path / "robot.urdf")},
+    }
     with (
         Daemon(tmp_path, config=config) as daemon,
         Bus(daemon.endpoint) as bus,
