@@ -374,7 +374,7 @@ class Robot:
         if inputs.refusals:
             # A message that nobody could read cancels the zeros that came before it, and no later
             # one. The refusals of messages that were lost have no time, so they come first.
-            heard = sorted([*inputs.refusals, *heard], key=lambda one: one.arrived_ns)
+            heard = sorted([*heard, *inputs.refusals], key=lambda one: one.arrived_ns)
         for one in heard:
             if isinstance(one, Refusal):
                 self._refuse(one, now_ns, events)
