@@ -127,6 +127,8 @@ class Robot:
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
+        if session.count_recovery.coarse_lines:
+            counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
         if self._arbiter.forgiven_ns:
             counters["clock_adjustments_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
         checks = self._odometry.checks

@@ -79,11 +79,6 @@ def _count_warnings(config: Config) -> list[str]:
     mcu = config.mcu
     if not mcu.encoder_counts:
         return []
-    if not mcu.wants_samples:
-        return [
-            f"mcu.encoder_counts = {mcu.encoder_counts} changes nothing: only checked lines "
-            'carry counts, and mcu.link_check = "off"; write "auto" or "require"'
-        ]
     if mcu.simulated and mcu.encoder_counts != config.sim.encoder_counts:
         return [
             f"mcu.encoder_counts = {mcu.encoder_counts}, but the simulated robot's encoders have "

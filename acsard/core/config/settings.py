@@ -121,7 +121,7 @@ SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
 Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
 Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
 EncoderCounts = Annotated[
-    int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = ask the board for none)"})
+    int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = unknown)"})
 ]
 Baud = Literal[9600, 19200, 38400, 57600, 115200]
 

@@ -79,9 +79,11 @@ class Feedback(Struct, frozen=True, gc=False):
     """Monotonic time at which the line was complete here."""
     counted: Motors | None = None
     """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
-    the speeds show whole counts (`quantization.py`)."""
+    the speeds show whole counts (`quantization.py`, `whole_counts.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
+    count: float = 0.0
+    """Angle of one encoder count, rad, 0 if it is not configured."""
 
 
 class ReplyStyle:
@@ -271,7 +273,7 @@ class Timeline:
             answered = self._prompts.place(asked_ns)
             ours = asked_ns is not None or speaks is False or self._prompts.thinks
             if ours and answered is not None:
-                if answered.due_ns - came_ns > self._usual_ns / 2:
+                if asked_ns is None and answered.due_ns - came_ns > self._usual_ns / 2:
                     # The usual delay comes from a first reply that was read late, during a stall
                     # that the line before has already counted. This line's time is therefore its
                     # arrival.

@@ -1,6 +1,7 @@
 """Detects the quantization of the reported speeds and recovers whole encoder counts from them.
 
-If a wheel's speeds are multiples of a quantization step (`quantization_step.py`), each speed is a
+If the counts per turn are configured, `whole_counts.py` recovers them. Otherwise they are searched:
+if a wheel's speeds are multiples of a quantization step (`quantization_step.py`), each speed is a
 whole number of counts. With the firmware's period it is then an exact angle, so a line tells
 exactly how far the wheel turned. The period by which a firmware divides is a round number near the
 mean period of its lines. It is proven if it makes the counts per turn whole. Each wheel has an
@@ -19,6 +20,7 @@ from msgspec.structs import replace
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.quantization_step import FINEST, ROUNDING, Quantization, Search, on
+from acsard.core.link.whole_counts import WholeCounts
 
 FLICKER = 0.0105
 """rad/s. A smaller step is only rounding."""
@@ -75,6 +77,13 @@ ALIKE = 3.0
 """Bound on a wheel's reported step, as a multiple of the second largest of the four. Random jumps
 look like steps too, and only proven counts may be coarser than this."""
 
+COARSE, JUMP_GAIN = 0.015, 0.06
+"""Mean jump of a wheel, rad per line, from which on its encoder counts as coarse, and the gain of
+its filter. About 200 counts a turn reach it."""
+
+LONGEST_LINE = 0.03
+"""Time of a line, s, above which the motors' own accelerations look like jumps."""
+
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -116,6 +125,30 @@ class Steps:
             # counts.
             self._before, self._count = largest[0], 0
             self.size, self._largest = self._before, [0.0] * RECUR
+
+
+class Coarseness:
+    """Detects wheel speeds that jump to and fro from line to line, as those of coarse encoders do.
+
+    A change of the acceleration is a jump as well, but lasts for one line.
+    """
+
+    def __init__(self) -> None:
+        self._rows = NOTHING, NOTHING
+        """The speeds of the last two lines, rad/s."""
+        self._jumps, self._wheel = [0.0] * 4, 0
+        """Filtered jump of each wheel, rad per line, and the wheel of the last line."""
+
+    def add(self, speeds: Motors, own: float) -> bool:
+        """Take the speeds of a line over `own` s; return whether the encoders look coarse."""
+        (older, before), self._rows = self._rows, (self._rows[1], speeds)
+        if speeds == NOTHING == before or own > LONGEST_LINE:
+            return False
+        # One wheel per line keeps every step short.
+        wheel = self._wheel = (self._wheel + 1) % 4
+        mean, jump = self._jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
+        self._jumps[wheel] = mean = mean + JUMP_GAIN * (own / 2 * jump - mean)
+        return mean > COARSE
 
 
 class WheelCounter:
@@ -223,11 +256,17 @@ class WheelCounter:
 class CountRecovery:
     """The quantization of all wheels, learned from every good line of one port."""
 
-    def __init__(self) -> None:
+    def __init__(self, counts: int = 0) -> None:
+        """Start. `counts` are the configured counts per turn; 0 means that the speeds show them."""
+        self._configured, self._whole = counts, WholeCounts(counts)
+        self.coarse_lines = 0
+        """Number of lines with the jumps of coarse encoders of which nobody knows the counts."""
         self.forget()
 
     def forget(self) -> None:
         """Start over: the board may be another one, or it reports in another way."""
+        self._whole.forget()
+        self._coarseness = Coarseness()
         self._wheels = [WheelCounter() for _ in NOTHING]
         self._owing: list[int] = []
         self._reported, self._steps = NOTHING, NOTHING
@@ -244,16 +283,28 @@ class CountRecovery:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Counts per turn found for each wheel's encoder, in `WHEELS` order; 0 if unknown."""
+        """Counts per turn of each wheel's encoder, in `WHEELS` order; 0 if unknown.
+
+        They are the configured ones unless the speeds are not whole counts of these.
+        """
+        if self._configured:
+            return (self._configured if self._whole.believed else 0,) * 4
         return tuple([wheel.counts for wheel in self._wheels])
 
     def look(self, line: Feedback) -> Feedback:
         """Return the line with each wheel's counted angle and quantization step, where known."""
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
-        if line.turned is None and own > 0.0:
+        if self._whole.angle:
+            if line.turned is None and own > 0.0:
+                counted = self._whole.turned(speeds, own)
+            else:
+                self._whole.pause()
+        elif line.turned is None and own > 0.0:
             counted = self._counted(speeds, own)
+            if counted is None and self._coarseness.add(speeds, own):
+                self.coarse_lines += 1
         a, b, c, d = self._wheels
-        if counted is None:
+        if counted is None or self._configured:
             a.steps.add(speeds[0])
             b.steps.add(speeds[1])
             c.steps.add(speeds[2])
@@ -261,7 +312,7 @@ class CountRecovery:
         reported = a.steps.size, b.steps.size, c.steps.size, d.steps.size
         if reported != self._reported:
             self._reported, self._steps = reported, self._bounded(reported)
-        return replace(line, counted=counted, steps=self._steps)
+        return replace(line, counted=counted, steps=self._steps, count=self._whole.angle)
 
     def _bounded(self, reported: Motors) -> Motors:
         """Return the step of each wheel's speed, from its reports or its proven counts, rad/s."""

@@ -493,6 +493,8 @@ class PromptedTimes:
                 self._passed = left.popleft()
             if left and left[0] == asked_ns:
                 left.popleft()
+            if self._delay is None:
+                self._delay = self._least = float(max(self._at - asked_ns, self._soonest))
             return self._answered(asked_ns)
         if self._delay is None:
             self._begin()

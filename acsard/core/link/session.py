@@ -69,7 +69,7 @@ class McuSession:
         self._link = Link(self.quiet_ns)
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
-        self.count_recovery = CountRecovery()
+        self.count_recovery = CountRecovery(mcu.encoder_counts)
         self._hearing = SilenceDiagnosis()
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()

@@ -40,6 +40,10 @@ SLACK = 2.0
 STEPS = 2
 """Counts by which two reports may differ besides the wheel's motion: each may be off by one."""
 
+SHORTEST_S = 0.004
+"""Time between two lines of a host that catches up after a stall, s. One count in it is a high
+speed."""
+
 LEAST = 0.005
 """rad/s. A line reports a smaller speed as zero."""
 
@@ -189,11 +193,19 @@ class Sanity:
         changes = map(abs, map(sub, wheels, then_wheels))
         if max(map(abs, wheels)) <= fastest and max(changes) <= most:
             return ""  # possible for any encoder steps, as nearly every line is
-        for name, now, then, step in zip(WHEELS, wheels, then_wheels, line.steps, strict=True):
+        turned = line.counted if line.turned is None else line.turned
+        rows = zip(WHEELS, wheels, then_wheels, line.steps, turned or wheels, strict=True)
+        for name, now, then, step, angle in rows:
             size, change = abs(now), abs(now - then)
             # Unless the steps are proven counts they allow no excess speed: a faulty encoder may
             # show any steps.
-            room = 0.0 if line.counted is None or step == math.inf else step
+            room = 0.0
+            if line.count and turned is not None:
+                # Of n counts in a short time, n - 1 certainly lie in it.
+                room = size * min(1.0, line.count / abs(angle)) if angle else size
+                step = max(step, line.count / SHORTEST_S)
+            elif turned is not None and step < math.inf:
+                room = step
             if size > fastest + room:
                 return f"{name} {now:.2f} rad/s is over feedback.wheel_speed"
             if change > most + STEPS * step:

@@ -165,9 +165,8 @@ def test_a_line_is_as_long_as_what_may_be_asked_for(mcu: McuConfig, count: int) 
     assert rate == int(0.8 * 9600 / (count * 10))
 
 
-def test_counts_without_the_check_are_a_surprise() -> None:
-    (warning,) = warnings(Config(mcu=McuConfig(encoder_counts=3200)))
-    assert 'mcu.link_check = "off"; write "auto"' in warning
+def test_counts_without_the_check_are_as_they_should_be() -> None:
+    assert warnings(Config(mcu=McuConfig(encoder_counts=3200))) == []
 
 
 def test_counts_that_are_not_the_simulators_are_a_surprise() -> None:

@@ -147,6 +147,18 @@ def test_where_a_reply_says_its_line_nothing_is_guessed() -> None:
     assert bench.reply(500.0, asked_ms=220.0) == [10.0, 0.0]
 
 
+def test_a_board_that_thinks_for_1_to_5_ms_samples_as_late_where_replies_name_their_lines() -> None:
+    bench, before = Bench(), 0.0
+    late = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
+    for number in range(400):
+        thought = late[number % len(late)]
+        bench.leave(number * 10)
+        dt, _ = bench.reply(number * 10 + 6 + thought, asked_ms=number * 10)
+        if number > 100:
+            assert dt == pytest.approx(10 + thought - before, abs=0.5)
+        before = thought
+
+
 def test_the_first_reply_answers_the_newest_line_that_it_can() -> None:
     bench = Bench()
     for number in range(10):

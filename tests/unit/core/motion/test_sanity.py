@@ -172,6 +172,20 @@ def test_a_speed_of_the_limit_and_one_proven_count_is_possible() -> None:
     assert sanity.impossible(stepping(only(2, 81.25), 31.25, proven=True)) == ""
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_one_count_is_never_too_fast_and_two_in_its_time_are(number: int) -> None:
+    """A host that catches up asks again after 4 ms: one count of 16 is then 98 rad/s."""
+    sanity, count = Sanity(FeedbackConfig(wheel_speed=50.0)), math.tau / 16
+    speed, angle = number * count / 0.004, number * count
+    for sampled in (True, False):
+        turned = (angle, 0.0, 0.0, 0.0)
+        line = Feedback(
+            AT, only(0, speed), DT, count=count,
+            turned=turned if sampled else None, counted=None if sampled else turned,
+        )  # fmt: skip
+        assert ("wheel_speed" in sanity.impossible(line)) is (number == 2)
+
+
 def test_a_step_that_may_be_a_lie_leaves_no_speed_too_fast_unsaid() -> None:
     sanity = Sanity(FeedbackConfig(wheel_speed=50.0))
     assert "feedback.wheel_speed" in sanity.impossible(stepping(only(2, 50.1), 31.4))

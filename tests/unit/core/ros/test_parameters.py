@@ -211,7 +211,7 @@ def test_what_takes_a_start_is_read_only_and_says_so() -> None:
     assert described("mcu.encoder_counts", INTEGER) == ParameterDescriptor(
         "mcu.encoder_counts",
         INTEGER,
-        "a whole number from 0 to 100000 per wheel turn (0 = ask the board for none)",
+        "a whole number from 0 to 100000 per wheel turn (0 = unknown)",
         "only in acsard.toml, with a restart",
         integer_range=[IntegerRange(0, 100_000, 1)],
     )

@@ -1,0 +1,118 @@
+"""With `mcu.encoder_counts`, coarse encoders end a square where their raw counter says.
+
+The raw counter is the true whole counts of the simulated encoders, through the same kinematics. Run
+the table with `pytest -m "slow or not slow" -s tests/scenarios/test_coarse_square.py`.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.motion.path import Path
+from acsard.core.values import Outputs, Pose
+from tests.scenarios.world import World
+
+
+class Square:
+    """A square of 20 m, driven by the clock, with the pose of the raw counter beside it."""
+
+    def __init__(self, link: str, counts: int, stalls: bool, seed: int) -> None:
+        mcu = McuConfig(
+            link_check="off" if link == "plain" else "auto",
+            encoder_counts=counts,
+        )
+        self.world = world = World(Config(sim=SimConfig(encoder_counts=counts), mcu=mcu))
+        self._counts, self._path, self._before = counts, Path(), [0] * 4
+        self._dice, self._stalls, self._since = random.Random(seed), stalls, 0.0
+        if link == "checked":
+            with world.mcu.no_sample():
+                self._drive()
+        else:
+            self._drive()
+
+    def _drive(self) -> None:
+        world, dice = self.world, self._dice
+        world.watch = self._count
+        world.run(1.0 + dice.uniform(0.0, 0.1))
+        speed, rate = dice.uniform(0.4, 0.9), dice.choice((-1, 1)) * dice.uniform(0.8, 1.5)
+        world.drive(0.0, 0.0, 0.2)
+        for _ in range(4):
+            self._hold(speed, 0.0, 5.0 / speed)
+            self._hold(0.0, rate, math.pi / 2 / abs(rate) + 0.2)
+        self._hold(0.0, 0.0, 1.0)
+
+    def _hold(self, linear: float, angular: float, seconds: float) -> None:
+        for _ in range(round(seconds * 20)):
+            self.world.hold(linear, angular, 0.05)
+            self._since += 0.05
+            if self._stalls and self._since > 3.0:
+                self._since = 0.0
+                self.world.stall(self._dice.uniform(0.05, 0.15))
+
+    def _count(self, outputs: Outputs) -> None:
+        """Advance the raw counter up to now."""
+        angles = self.world.mcu.vehicle.angles
+        counts = [math.floor(angle / math.tau * self._counts + 0.5) for angle in angles]
+        a, b, c, d = (now - then for now, then in zip(counts, self._before, strict=True))
+        self._before = counts
+        metres = math.tau / self._counts * 0.05
+        right, left = (a + d) / 2 * metres, (b + c) / 2 * metres
+        self._path.advance((right + left) / 2, (right - left) / 0.30)
+
+    def errors(self) -> tuple[float, float, float, float]:
+        """Return m and degrees off the truth: first the daemon's, then the raw counter's."""
+        state = self.world.state
+        ours, raw = self._off(Pose(state.x, state.y, state.yaw)), self._off(self._path.pose)
+        return *ours, *raw
+
+    def _off(self, pose: Pose) -> tuple[float, float]:
+        true = self.world.mcu.vehicle.pose
+        yaw = math.degrees(abs(math.remainder(pose.yaw - true.yaw, math.tau)))
+        return math.dist((pose.x, pose.y), (true.x, true.y)), yaw
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
+@pytest.mark.parametrize("stalls", [False, True], ids=["", "stalls"])
+@pytest.mark.parametrize(
+    "counts", [16, *(pytest.param(n, marks=pytest.mark.slow) for n in (20, 96, 400))]
+)
+@pytest.mark.parametrize("link", ["plain", "checked", "checked with counts"])
+def test_a_square_ends_where_the_raw_counter_says(
+    link: str, counts: int, stalls: bool, seed: int
+) -> None:
+    square = Square(link, counts, stalls, seed)
+    far, turned, raw_far, raw_turned = square.errors()
+    print(
+        f"{link}, {counts} counts, {'stalls' if stalls else 'no stalls'}, seed {seed}: "
+        f"{1000 * far:.1f} mm {turned:.2f} deg; raw {1000 * raw_far:.1f} mm {raw_turned:.2f} deg"
+    )
+    assert "line_implausible" not in square.world.state.counters
+    # The counts are the same, but the host's clock shows the counter at other moments.
+    assert turned <= 1.05 * raw_turned + 0.3
+    assert far <= 1.05 * raw_far + 0.03
+
+
+@pytest.mark.parametrize(("counts", "coarse"), [(16, True), (96, True), (3200, False)])
+def test_state_counts_the_lines_of_coarse_encoders_whose_counts_nobody_knows(
+    counts: int, coarse: bool
+) -> None:
+    world = World(Config(sim=SimConfig(encoder_counts=counts)))
+    world.run(0.5)
+    for turn in (0.0, 1.0, -1.0):
+        world.drive(0.5, turn, 2.0)
+    assert world.state.encoder_counts == [0] * 4
+    assert (world.state.counters.get("coarse_encoder_lines", 0) > 300) is coarse
+    assert coarse or "coarse_encoder_lines" not in world.state.counters
+
+
+def test_configured_counts_that_the_speeds_show_are_those_of_the_state() -> None:
+    mcu = McuConfig(encoder_counts=16)
+    world = World(Config(sim=SimConfig(encoder_counts=16), mcu=mcu))
+    world.run(0.5)
+    world.drive(0.5, 0.3, 2.0)
+    assert world.state.encoder_counts == [16] * 4
+    assert "coarse_encoder_lines" not in world.state.counters

@@ -1,0 +1,119 @@
+"""Whole counts come out of the speeds of a line although its time is known to some ms only."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from acsard.core.link.codec import Motors
+from acsard.core.link.whole_counts import WholeCounts
+from tests.each import each
+from tests.unit.core.link.counted import PERIOD, Array, angles, counted
+
+
+def lines(
+    counts: int, jitter: float, seed: int = 1, nominal: bool = False
+) -> Iterator[tuple[Motors, float, Array]]:
+    """Yield the speeds of each line, the host's estimate of its time, s, and the true counts.
+
+    Samples are up to `jitter` s late, which the host does not know. Firmware divides by the true
+    time between its samples, or by the `nominal` period.
+    """
+    dice, wheels = np.random.default_rng(seed), angles(np.random.default_rng(seed), 25.0)
+    at = np.arange(len(wheels)) * PERIOD + dice.uniform(0.0, jitter, len(wheels))
+    sampled = np.array([np.interp(at, np.arange(len(w)) * PERIOD, w) for w in wheels.T]).T
+    whole, times = counted(sampled, counts), np.diff(at)
+    by = np.full_like(times, PERIOD) if nominal else times
+    speeds = np.round(whole * math.tau / counts / by[:, None], 2)
+    for row, number in zip(speeds.tolist(), whole, strict=True):
+        yield (row[0], row[1], row[2], row[3]), PERIOD, number
+
+
+def missed(counts: int, jitter: float, nominal: bool = False) -> Array:
+    """Return how many counts of each wheel are wrong in the end."""
+    found, total = WholeCounts(counts), np.zeros(4)
+    for speeds, own, number in lines(counts, jitter, nominal=nominal):
+        turned = found.turned(speeds, own)
+        total += np.array(turned or [speed * own for speed in speeds]) / found.angle - number
+    assert found.believed
+    off: Array = np.abs(total)
+    return off
+
+
+@each("counts", [16, 20, 96])
+@pytest.mark.parametrize("nominal", [False, True])
+def test_a_jitter_of_two_ms_costs_no_count(counts: int, nominal: bool) -> None:
+    assert missed(counts, 0.002, nominal).max() < 0.01
+
+
+def test_of_a_fine_encoder_little_is_lost() -> None:
+    assert missed(400, 0.0005).max() < 3.0
+
+
+def test_without_whole_counts_speed_times_time_would_be_some_counts_off() -> None:
+    found = sum(
+        np.array(speeds) * own / (math.tau / 16) - number
+        for speeds, own, number in lines(16, 0.002)
+    )
+    assert np.abs(found).max() > 1.0
+
+
+def test_a_line_that_repeats_the_one_before_turns_no_wheel() -> None:
+    found, speed = WholeCounts(16), round(math.tau / 16 / 0.008, 2)
+    one = (speed, 0.0, speed, 0.0)
+    assert found.turned(one, 0.008) == (found.angle, 0.0, found.angle, 0.0)
+    assert found.turned(one, 0.003) == (0.0, 0.0, 0.0, 0.0)
+    assert found.turned(one, 0.005) == (found.angle, 0.0, found.angle, 0.0)
+
+
+def test_the_other_wheels_choose_between_two_numbers_of_counts() -> None:
+    found = WholeCounts(96)
+    true = [round(n * found.angle / 0.0139, 2) for n in (3, 3, 2, -3)]
+    turned = found.turned((true[0], true[1], true[2], true[3]), 0.0105)
+    assert turned is not None
+    assert [round(angle / found.angle, 6) for angle in turned] == [3, 3, 2, -3]
+
+
+def test_a_wrong_number_of_counts_is_made_good_by_the_next_line() -> None:
+    found, total = WholeCounts(96), 0.0
+    for number, time, own in ((3, 0.010, 0.010), (3, 0.0139, 0.0112), (2, 0.0077, 0.0104)):
+        speed = round(number * found.angle / time, 2)
+        turned = found.turned((speed, speed, speed, speed), own)
+        assert turned is not None
+        total += turned[0]
+    assert total / found.angle == pytest.approx(8)
+
+
+def test_firmware_that_filters_is_not_believed_to_report_whole_counts() -> None:
+    found, speeds, dice = WholeCounts(96), np.zeros(4), random.Random(1)
+    for row, own, _ in lines(96, 0.0):
+        speeds = speeds + dice.uniform(0.2, 0.4) * (np.array(row) - speeds)
+        a, b, c, d = np.round(speeds, 2).tolist()
+        found.turned((a, b, c, d), own)
+    assert not found.believed
+
+
+def test_slow_wheels_whose_firmware_times_the_edges_are_not_a_count_in_each_line() -> None:
+    found, total = WholeCounts(16), 0.0
+    for _ in range(200):
+        turned = found.turned((0.5, 0.5, 0.5, 0.5), 0.01)
+        total += turned[0] if turned else 0.5 * 0.01
+    assert total == pytest.approx(1.0, abs=found.angle)
+
+
+def test_one_damaged_line_ends_nothing() -> None:
+    found = WholeCounts(16)
+    for number, (speeds, own, whole) in enumerate(lines(16, 0.001)):
+        damaged = number == 300
+        turned = found.turned((speeds[0] + 7.13, 11.11, *speeds[2:]) if damaged else speeds, own)
+        if number > 302 and turned is not None:
+            assert [round(angle / found.angle) for angle in turned] == whole.tolist()
+    assert found.believed
+
+
+def test_wheels_at_rest_are_at_rest() -> None:
+    assert WholeCounts(16).turned((0.0, 0.0, 0.0, 0.0), 0.01) == (0.0, 0.0, 0.0, 0.0)
