@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import fmean
 
 from acsard.checkup import line_loss, outcomes
 from acsard.checkup.board import Board
@@ -12,6 +13,13 @@ from acsard.checkup.motion import GLANCE_S, Reply, steps
 
 AGREES = 0.02
 """Fraction by which the measured counts may differ from the stated ones."""
+
+COARSE = 0.015
+"""Mean jump of a motor's angle from line to line, rad, from which on its encoder is coarse: the
+daemon then needs the counts."""
+
+LEAST_ANGLES = 20
+"""Lines with a motor that turns, from which on the speeds show what they are."""
 
 MOST_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""
@@ -30,10 +38,32 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     return counts / angle * math.tau if angle >= 2.0 else None
 
 
+def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
+    """Return roughly the counts per turn of coarse encoders, by the speeds in lines without counts.
+
+    Return None if the speeds do not jump from line to line by a count of a coarse encoder.
+    """
+    course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
+    jumps, angles = [], []
+    for motor in motors:
+        turned = [abs(step.speeds[motor]) * step.seconds for step in course]
+        angles += [angle for angle in turned if angle > 0.0]
+        for one, two, three in zip(turned, turned[1:], turned[2:], strict=False):
+            if one or two or three:
+                jumps.append(abs(one - 2 * two + three) / 2)
+    if len(angles) < LEAST_ANGLES or fmean(jumps) < COARSE:
+        return None
+    least = sorted(angles)[len(angles) // 20]
+    return math.tau / fmean([angle for angle in angles if angle <= 1.5 * least])
+
+
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Judge `mcu.encoder_counts` by the identification, or by motors that turned as commanded."""
     if not board.sampled:
-        return outcomes.find("encoder counts: none")
+        about = coarse(board.replies, motors)
+        if about is None or board.mcu.encoder_counts:
+            return outcomes.find("encoder counts: none")
+        return outcomes.find("encoder counts: coarse", about=about)
     if board.lost > line_loss.MOST:
         return outcomes.find("encoder counts: damaged", share=board.lost)
     said = board.identity.get("counts", "")

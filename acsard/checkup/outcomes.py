@@ -203,6 +203,11 @@ FAIL wheel map: twice
 
 SKIPPED encoder counts: none
     the firmware sends no counts
+WARN? encoder counts: coarse | about {about:.0f} per turn
+    the firmware sends no counts, and its speeds jump by one count of a coarse encoder from line to
+    line: the pose turns by degrees in one square unless the daemon knows the counts
+    -> write mcu.encoder_counts = the exact counts per wheel turn: those of the encoder times the
+    gear ratio, four for each pulse of two channels
 SKIPPED encoder counts: damaged
     {share:.1%} of the lines are lost, so the counts of the rest cannot be measured
 SKIPPED encoder counts: not turned

@@ -63,6 +63,27 @@ def test_what_is_said_of_the_configured_counts(
     assert (finding.verdict, finding.keys) == (verdict, keys)
 
 
+@pytest.mark.parametrize("counts", [16, 20, 40, 96])
+def test_coarse_encoders_without_counts_are_named(counts: int) -> None:
+    with Robot(config=Config(sim=SimConfig(encoder_counts=counts))).board() as board:
+        for motor in range(4):
+            turn(board, motor, 3.0)
+            board.rest()
+        finding = encoder_counts.finding(board, [0, 1, 2, 3])
+    assert (finding.verdict, finding.keys) == ("WARN", {})
+    assert "write mcu.encoder_counts" in finding.mend
+    about = int(finding.figure.split()[1])
+    assert about == pytest.approx(counts, rel=0.2)
+
+
+@pytest.mark.parametrize(("counts", "configured"), [(16, 16), (3200, 0)])
+def test_counts_that_are_configured_or_fine_are_not_asked_for(counts: int, configured: int) -> None:
+    config = Config(sim=SimConfig(encoder_counts=counts))
+    with Robot(config=config, encoder_counts=configured).board() as board:
+        turn(board, 0, 3.0)
+        assert encoder_counts.finding(board, [0]).verdict == "SKIPPED"
+
+
 def test_counts_that_are_not_as_identified_are_a_fault() -> None:
     with Robot(config=Config(sim=SimConfig(encoder_counts=2000))).board() as board:
         check(board)
