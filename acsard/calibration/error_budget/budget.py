@@ -110,6 +110,8 @@ class Budget(Struct, frozen=True):
     """Standard deviation of `learned`."""
     learned_used: bool = False
     """True if odometry uses `learned` when it has only the wheels to measure a turn."""
+    coarse: bool = False
+    """Whether the wheel speeds jump as those of coarse encoders whose counts nobody knows."""
 
     def largest(self, *bases: Basis) -> Share | None:
         """Return the share with the largest position error, among the shares with these bases.
@@ -154,6 +156,8 @@ class Received(Struct, frozen=True):
     """Relative standard deviation of `learned`."""
     used: bool = False
     """True if odometry uses `learned` when it has only the wheels to measure a turn."""
+    coarse: bool = False
+    """Whether the wheel speeds jump as those of coarse encoders whose counts nobody knows."""
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
@@ -199,7 +203,7 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
         config.mcu.encoder_counts if received.counted else 0, received.gyro, still=True,
         at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=shares,
         multiplier=configured, learned=learned, learned_std=(learned or 0.0) * received.deviation,
-        learned_used=received.used,
+        learned_used=received.used, coarse=received.coarse,
     )  # fmt: skip
 
 

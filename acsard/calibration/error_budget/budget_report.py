@@ -40,6 +40,13 @@ BASIS: dict[Basis, str] = {
     "unknown": "nothing",
 }
 
+COARSE = (
+    "the encoders are coarse and the daemon does not know their counts, so its error in the time "
+    "of a line turns the pose: write mcu.encoder_counts, the counts per wheel turn "
+    "(`acsard mcu check` says about how many)"
+)
+"""Advice for a robot with coarse encoders."""
+
 CALIBRATE = (
     "the error of wheel radii and track width is unknown, and on wheels that skid it is mostly "
     "the largest: run `acsard calibrate`"
@@ -67,7 +74,7 @@ def advice(budget: Budget) -> str:
             "does not show most causes"
         )
     measured, largest = budget.largest("measured"), budget.largest("measured", "settings")
-    advice = []
+    advice = [COARSE] if budget.coarse else []
     if any(share.cause == "parameters" and share.basis == "unknown" for share in budget.shares):
         advice.append(CALIBRATE)
     if largest is not None and largest is not measured:

@@ -32,6 +32,10 @@ KEYS = ("odom", "wheel_states", "cmd_vel_out")
 MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
+SHARE_COARSE = 0.1
+"""Share of the lines that are those of coarse encoders, from which on the tool says so. The daemon
+takes seconds to find counts that the speeds show."""
+
 LEAST_LOST, SHARE_LOST = 3, 0.01
 """Number and fraction of the daemon's feedback lines that may be missing here.
 
@@ -120,7 +124,16 @@ class Feed:
             learned=learned,
             deviation=deviation,
             used=used,
+            coarse=self._coarse(last),
         )
+
+    def _coarse(self, last: RobotState) -> bool:
+        """Return whether many lines were those of coarse encoders whose counts nobody knows."""
+        now, before = last.counters, self._first.counters
+        lines, coarse = (
+            now.get(name, 0) - before.get(name, 0) for name in ("lines", "coarse_encoder_lines")
+        )
+        return coarse > SHARE_COARSE * lines
 
     def _join(self, stamp_ns: int) -> None:
         """Combine the `odom` and the `wheel_states` message of this stamp, if both have arrived."""

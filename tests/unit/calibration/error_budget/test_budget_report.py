@@ -54,6 +54,12 @@ def test_coarse_encoders_are_named() -> None:
     assert "40 counts" in advice(of(("quantisation", 100.0, "measured"), KNOWN, counts=40))
 
 
+def test_coarse_encoders_whose_counts_nobody_knows_come_first() -> None:
+    told = advice(of(("time", 100.0, "measured"), KNOWN, coarse=True))
+    assert told.startswith("the encoders are coarse")
+    assert "write mcu.encoder_counts" in told
+
+
 def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
     told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
     assert told.startswith("the largest cause is slip, by the settings in [odometry]")

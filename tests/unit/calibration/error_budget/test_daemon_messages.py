@@ -97,6 +97,15 @@ def test_lines_of_the_daemon_that_did_not_come_are_noticed(
     assert feed.received(state(lines, impossible=impossible), diagnostics()).whole is whole
 
 
+@pytest.mark.parametrize(("lines", "coarse"), [(90, False), (110, True)])
+def test_coarse_encoders_are_noticed_by_the_lines_that_state_counts(
+    lines: int, coarse: bool
+) -> None:
+    last = state(1000)
+    last.counters["coarse_encoder_lines"] = lines
+    assert Feed(Config(), state(0)).received(last, diagnostics()).coarse is coarse
+
+
 def test_who_has_rates_limited_does_not_send_all_lines() -> None:
     slow = replace(Config(), rates=RatesConfig(odom=10.0))
     assert not Feed(slow, state(0)).received(state(0), diagnostics()).whole
