@@ -28,6 +28,9 @@ MOST_TRIES = 16
 BY_CHANCE = 0.05
 """Largest probability that speeds at random fit one of the candidates."""
 
+EXACT = 0.3
+"""Counts by which the host's time may differ from that of fine encoders' whole counts."""
+
 WIDE, WIDE_S = 0.6, 0.005
 """Largest difference between the firmware's time and the host's: a share of it, plus s."""
 
@@ -120,6 +123,8 @@ class WholeCounts:
         self._run += 1
         kept = min(KEPT, self._run / (self._run + 1))
         self._period, self._apart = period, kept * (want - period)
+        if abs(want - period) <= period * ROUNDING / fastest:
+            self._apart = 0.0  # nothing but the rounding of the speeds
         size, count = self.angle, period / self.angle
         return (
             round(a * count) * size,
@@ -155,13 +160,16 @@ class WholeCounts:
                 for share in shares:
                     by_chance *= min(1.0, 2 * error * number * (1 + share))
                 chance += by_chance
-                if chance > BY_CHANCE:
-                    return 0, None
+                fits = True
                 for share in shares:
                     whole = share * number
                     if abs(whole - round(whole)) > error * number * (1 + share):
+                        fits = False
                         break
-                else:
+                if chance > BY_CHANCE:
+                    # The host's time agrees with the counts if the firmware divides by a round one.
+                    return (number if fits and abs(number - exact) <= EXACT else 0), None
+                if fits:
                     return number, True
             number += step
             step = -step - (1 if step > 0 else -1)

@@ -87,10 +87,11 @@ def text(row: Array) -> bytes:
 class Host:
     """The host's processing of lines: session, slew check and odometry, as in `core/robot.py`."""
 
-    def __init__(self, feedback: FeedbackConfig | None = None) -> None:
-        self.session = McuSession(McuConfig(), 100.0)
+    def __init__(self, feedback: FeedbackConfig | None = None, counts: int = 0) -> None:
+        """Start with these configured counts per turn, 0 if unknown."""
+        self.session = McuSession(McuConfig(encoder_counts=counts), 100.0)
         self.sanity = Sanity(feedback or FeedbackConfig())
-        self.odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+        self.odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)
         self.now_ns = 1_000_000_000
         self.lines = self.dropped = 0
         self.why = ""

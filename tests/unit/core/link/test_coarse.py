@@ -42,9 +42,9 @@ class Driven(Struct, frozen=True):
     dropped: int
 
 
-def drive(counts: int, seed: int, seconds: float) -> Driven:
+def drive(counts: int, seed: int, seconds: float, configured: int = 0) -> Driven:
     wheels = angles(np.random.default_rng(seed), seconds)
-    host = Host()
+    host = Host(counts=configured)
     for line in lines(wheels, counts):
         host.hear(line)
     assert host.session.count_recovery.counts == (counts,) * 4
@@ -65,6 +65,13 @@ def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_counter_says(c
     one = drive(counts, 1, 25.0)
     assert one.dropped == 0
     assert one.ours == pytest.approx(one.raw, abs=0.004)
+
+
+@pytest.mark.parametrize("counts", COUNTS + FINER)
+def test_with_configured_counts_a_minute_ends_exactly_where_the_counter_says(counts: int) -> None:
+    one = drive(counts, 2, 60.0, counts)
+    assert one.dropped == 0
+    assert one.ours == pytest.approx(one.raw, abs=0.0002)
 
 
 @pytest.mark.soak
