@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from statistics import fmean
+from statistics import fmean, median
 
 from acsard.checkup import line_loss, outcomes
 from acsard.checkup.board import Board
@@ -17,6 +17,9 @@ AGREES = 0.02
 COARSE = 0.015
 """Mean jump of a motor's angle from line to line, rad, from which on its encoder is coarse: the
 daemon then needs the counts."""
+
+LONGEST_S = 0.05
+"""Time between lines above which the motors' own accelerations look like such jumps, s."""
 
 LEAST_ANGLES = 20
 """Lines with a motor that turns, from which on the speeds show what they are."""
@@ -44,13 +47,17 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     Return None if the speeds do not jump from line to line by a count of a coarse encoder.
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
+    # The time of a single line may be wrong if this computer is late.
+    period = median([step.seconds for step in course] or [math.inf])
+    if period > LONGEST_S:
+        return None
     jumps, angles = [], []
     for motor in motors:
-        turned = [abs(step.speeds[motor]) * step.seconds for step in course]
-        angles += [angle for angle in turned if angle > 0.0]
-        for one, two, three in zip(turned, turned[1:], turned[2:], strict=False):
+        speeds = [abs(step.speeds[motor]) for step in course]
+        angles += [abs(s.speeds[motor]) * s.seconds for s in course if s.speeds[motor]]
+        for one, two, three in zip(speeds, speeds[1:], speeds[2:], strict=False):
             if one or two or three:
-                jumps.append(abs(one - 2 * two + three) / 2)
+                jumps.append(abs(one - 2 * two + three) / 2 * period)
     if len(angles) < LEAST_ANGLES or fmean(jumps) < COARSE:
         return None
     least = sorted(angles)[len(angles) // 20]
