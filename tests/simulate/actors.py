@@ -230,7 +230,7 @@ class Run:
         if event["lost"]:
             return
         latch, read_ns = None, None
-        if event.get("named") and self.product.alive:
+        if event.get("named") and self.product.shows_state:
             latch, read_ns = self.product.state()["latch"], self.true_ns
             if "typed" in event:
                 latch, read_ns = self._typed(latch, event["typed"])

@@ -304,6 +304,12 @@ class Product:
         bus.finished.clear()
         return found
 
+    @property
+    def shows_state(self) -> bool:
+        """Whether the daemon runs and has made its first step, before which it has no `state`."""
+        loop = self._world.loop
+        return self.alive and loop.report.current("state", loop._look) is not None
+
     def state(self) -> dict[str, Any]:
         """Return the present `state`, as a client reads it."""
         found: dict[str, Any] = msgspec.json.decode(encode_message(self._world.state, "json"))
