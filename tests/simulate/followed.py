@@ -14,6 +14,10 @@ from tests.simulate.product import HELD
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import FOREIGN, NS, Message, Sample, stable
 
+STOOD_NS = NS // 2
+"""After a step that stalled for this time, the next one may release and stop the robot again, and
+forget who held it."""
+
 KEPT = 4000
 """Commands that are remembered."""
 
@@ -87,6 +91,8 @@ class Followed:
         """The newest command of each adjusted clock that was followed."""
         self._armed_since_ns = witness.armed_since_ns
         self._mode = ""
+        self._decided_ns = 0
+        """Beginning of the step before."""
 
     def command(
         self,
@@ -169,7 +175,9 @@ class Followed:
         armed_since_ns = witness.armed_since_ns
         disarmed = armed_since_ns != self._armed_since_ns or (mode == "fault" != self._mode)
         self._armed_since_ns, self._mode = armed_since_ns, mode
-        if disarmed or witness.pending or link != "up":
+        stood = decided_ns - self._decided_ns > STOOD_NS
+        self._decided_ns = decided_ns
+        if disarmed or stood or witness.pending or link != "up":
             self.forget()
         elif self._count <= HELD:
             self._sure.update(self._waiting)
