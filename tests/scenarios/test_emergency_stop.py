@@ -7,7 +7,7 @@ import random
 import pytest
 
 from acsard.core.config.settings import Config, ControlConfig, McuConfig, SafetyConfig, SimConfig
-from acsard.core.values import NS_PER_S, Latches, Outputs
+from acsard.core.values import NS_PER_S, Latches, Outputs, Received
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import SIGNED, World
 
@@ -185,6 +185,16 @@ def test_a_robot_that_needs_the_input_waits_for_it_and_then_becomes_ready() -> N
     with world.mcu.estop():
         world.run(0.2)
         assert world.state.mode == "ready"
+
+
+def test_a_link_that_agreed_on_the_check_takes_no_status_line_without_it() -> None:
+    world = World(Config(mcu=McuConfig(link_check="auto")))
+    world.run(1.0)
+    for word, state, refused in ((b"", "", 1), (b"*F4BC", "pressed", 1)):
+        world.port.feed(Received(world.instant, b"!status estop=pressed%b\r\n" % word))
+        world.run(0.02)
+        assert world.state.emergency_stop == state
+        assert world.state.counters["line_status_without_crc"] == refused
 
 
 def test_a_press_survives_a_restart_of_the_daemon_and_of_the_board() -> None:

@@ -235,6 +235,14 @@ def test_a_press_between_two_ticks_goes_at_once_if_the_line_may() -> None:
     assert (out.mode, out.line) == ("stopped", ZERO_LINE)
 
 
+def test_a_press_between_two_ticks_is_zero_speed_even_if_no_line_may_go() -> None:
+    bench = Button()
+    bench.driving()
+    out = bench.status(PRESSED_LINE).step(GO, tick=False)
+    assert (out.mode, out.line, out.speeds) == ("stopped", None, STILL)
+    assert bench.step(GO).line == ZERO_LINE
+
+
 def test_a_zero_line_that_did_not_leave_is_repeated_as_zero() -> None:
     bench = Button()
     bench.driving()
