@@ -21,6 +21,7 @@ from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
+from acsard.core.link.board_status import STATUS
 from acsard.core.link.checksum import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
 from acsard.core.link.lines import LineReader
@@ -309,6 +310,9 @@ class Board:
         for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
             for line, following in self._lines.feed(data):
+                if line.startswith(STATUS):
+                    self.heard.statuses += 1
+                    continue
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
                 self.heard.line(line, reply is not None)

@@ -40,6 +40,9 @@ FAIL baud rate: garbage | only garbage
 FAIL baud rate: few | few good lines
     at {configured} baud {heard}; fewer good lines at any other
     -> use a short cable away from the motors' leads, one ground, a lower baud rate at both ends
+FAIL baud rate: statuses | only status lines
+    at {configured} baud {heard}; no good line at any other
+    -> the board hears nothing: connect this computer's TX to the board's RX
 FAIL baud rate: sparse | good lines, but too seldom
     at {configured} baud {heard}, all of them good; no good line at any other
     -> the board must answer each line, or report by its own clock at least every 0.25 s; does

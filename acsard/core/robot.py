@@ -18,12 +18,14 @@ from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
+from acsard.core.link.board_status import shown
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
+from acsard.core.motion.emergency_stop import MISSING, EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
@@ -113,6 +115,7 @@ class Robot:
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
+        self._estop = EmergencyStop(config.safety.estop)
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -146,6 +149,8 @@ class Robot:
             check=session.negotiation.in_force,
             encoders=session.count_recovery.counts,
             sender=self._choice.sender,
+            estop=self._estop.state,
+            board=self._board(now_ns),
         )
 
     @property
@@ -240,6 +245,8 @@ class Robot:
             # No sender drives before the first link, so a zero sent during the start counts.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
+        if session.statuses or self._estop.state:
+            self._watch_estop(inputs.now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, and the command before the loss is old.
             self._limiter.cut()
@@ -250,7 +257,7 @@ class Robot:
                 self._arbiter.require_neutral(inputs.now.mono_ns)
         else:
             self._linked_once = True
-            self._life.link(up=True)
+            self._life.link(up=not self._estop.missing)
         now = inputs.now
         if inputs.gyro:
             self._odometry.checks.hear(inputs.gyro)
@@ -259,6 +266,28 @@ class Robot:
         return tuple(
             [estimate for line in feedback if (estimate := self._believe(line, now, events))]
         )
+
+    def _watch_estop(self, now: Instant, events: list[Event]) -> None:
+        """Latch a stop if the emergency stop was pressed, also if it is released again already."""
+        estop = self._estop
+        reports = [(at_ns, status.estop) for at_ns, status in self.session.statuses]
+        events += estop.look(reports, now.mono_ns)
+        self._life.hold(estop.held)
+        if estop.pressed_now:
+            self.counters["emergency_stops"] += 1
+            self._life.press(estop.pressed_now, now)
+            # The hardware has cut the motors, so a ramp has no meaning: every line is zero.
+            self._limiter.cut()
+            self._speeds = STILL
+            self._made = self._said = (self._limiter.state, self._made_ns)
+
+    def _board(self, now_ns: int) -> dict[str, str]:
+        """Return the fields of the status lines as text, and the age of the last line."""
+        status_ns = self.session.status_ns
+        if status_ns is None:
+            return {}
+        age_s = (now_ns - status_ns) / NS_PER_S
+        return shown(self.session.status) | {"age_s": f"{age_s:.1f}"}
 
     def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
         """Fold a line that is possible, and return None for an impossible one.
@@ -275,7 +304,9 @@ class Robot:
             if self._sanity.doubtful:
                 self._fault(f"impossible feedback: {why}", now, events)
             return None
-        fault = self._sanity.watch(self._speeds, line.speeds, line.since)
+        # Motors without power obey no command, so they cannot contradict one.
+        sent = line.speeds if self._estop.held else self._speeds
+        fault = self._sanity.watch(sent, line.speeds, line.since)
         if fault:
             self._fault(fault, now, events)
         if self._sanity.turned:
@@ -427,6 +458,8 @@ class Robot:
             case Mode.READY:
                 return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
+                if self.session.link == "up":
+                    return MISSING
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why

@@ -174,6 +174,7 @@ EventName = Literal[
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_implausible", "lines_lost", "uncommanded_motion", "wheel_fault",
+    "emergency_stop", "emergency_stop_released",
     "gyro", "learned_track", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "not_a_router",
     "missed_periods", "recording", "latch_file",
@@ -316,6 +317,11 @@ class GyroStatus(Struct, frozen=True):
     track_deviation: float = 0.0
     """Learned effective track as a share of the configured one, and its relative deviation."""
     track_use: TrackUse = "shown"
+
+
+EstopState = Literal["", "released", "pressed", "silent"]
+"""The state of the emergency-stop input; "" if the board has never reported it. `silent` means that
+the board no longer reports it, which counts as pressed."""
 
 
 class Latch(Struct, frozen=True):
@@ -473,6 +479,9 @@ class Snapshot(Struct, frozen=True):
     """The daemon's own latencies, by the names in `daemon/latencies.py`."""
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
+    estop: EstopState = ""
+    board: dict[str, str] = {}
+    """The fields of the board's last status line, by name, as text."""
     check: str = "plain"
     """The check of the serial lines, in words."""
     encoders: tuple[int, ...] = ()

@@ -23,6 +23,7 @@ from acsard.core.formatting import listed, many
 from acsard.core.link.link_diagnosis import BUSY, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import DiagnosticStatus, Info, LogEvent, RobotState
+from acsard.core.motion.emergency_stop import MENDS, MISSING, PRESSED, SILENT
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.lifecycle import utc
 from acsard.core.values import NS_PER_S, AcsardError
@@ -196,6 +197,21 @@ def link(running: Running) -> Iterator[Finding]:
         yield Finding("link", "ok", "up, and no serial line is lost")
     if state.wheel_fault:
         yield Finding("wheels", "warning", state.wheel_fault, mend)
+    yield from _emergency_stop(config, state, mend)
+
+
+def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
+    """Yield a finding about an emergency stop that the board reports or should report."""
+    if state.emergency_stop == "pressed":
+        yield Finding(
+            "emergency stop", "warning", PRESSED, f"{MENDS[PRESSED]}, then `acsard call clear`"
+        )
+    elif state.emergency_stop == "silent":
+        yield Finding("emergency stop", "failure", SILENT, MENDS[SILENT])
+    elif state.emergency_stop:
+        yield Finding("emergency stop", "ok", "the board reports it, and it is released")
+    elif config.safety.estop == "required":
+        yield Finding("emergency stop", "failure", MISSING, mend)
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:

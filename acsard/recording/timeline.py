@@ -409,6 +409,7 @@ class TimelineWriter:
 INCIDENTS = {
     "fault": "fault",
     "stop": "stop",
+    "emergency_stop": "emergency stop",
     "link_down": "lost port",
     "link_stale": "board silence",
     "link_late": "computer stall",
@@ -424,7 +425,7 @@ INCIDENTS = {
 """
 
 
-SERIOUS = re.compile(r"(^|, )\d+ (stop|fault)s?\b")
+SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|stop|fault)s?\b")
 """A stop or a fault in a summary."""
 
 

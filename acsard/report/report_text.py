@@ -89,6 +89,8 @@ def summary(data: ReportData) -> str:
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
     faults = many(counts["fault"], "fault")
+    pressed = counts["emergency_stop"]
+    by += f", {many(pressed, 'emergency stop')}" if pressed else ""
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
     late = counts["link_late"]
@@ -183,10 +185,13 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         for name, driven in data.driven.items()
     ]
     yield "Driven by", ", ".join(drivers) or "no source"
-    for name, title in (("fault", "Faults"), ("stop", "Stops")):
+    stops = (("fault", "Faults"), ("stop", "Stops"), ("emergency_stop", "Emergency stops"))
+    for name, title in stops:
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
+        # Few robots report their emergency stop, so only a press has a row.
+        if count or name != "emergency_stop":
+            yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial
     told = (
         f"{lines.sent.total} lines sent, {lines.good.total} answers, {lines.dropped.total} dropped"

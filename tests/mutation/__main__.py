@@ -39,6 +39,7 @@ ROOT = Path(__file__).parents[2]
 CORE = (
     "acsard/core/motion",
     "acsard/core/guard.py",
+    "acsard/core/link/board_status.py",
     "acsard/core/link/checksum.py",
     "acsard/core/link/encoders.py",
     "acsard/core/link/codec.py",

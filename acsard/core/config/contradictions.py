@@ -17,6 +17,8 @@ from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
     FIELD,
+    STATUS_BYTES,
+    STATUS_HZ,
     highest_rate,
     line_bytes,
     wire_ns,
@@ -51,6 +53,18 @@ def warnings(config: Config) -> list[str]:
             f"limits.linear_speed = {limits.linear_speed:g} m/s needs wheels at {needed:.1f} "
             f"rad/s, but limits.wheel_speed = {limits.wheel_speed:g}: the robot will not reach "
             "that speed"
+        )
+    if config.safety.estop == "off":
+        found.append(
+            'safety.estop = "off": the robot ignores an emergency stop that its board reports'
+        )
+    status_use = wire_use(STATUS_HZ, config.mcu.baud_rate, STATUS_BYTES)
+    if config.safety.estop == "required" and use + status_use > 1.0:
+        left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
+        found.append(
+            f'safety.estop = "required": status lines take {status_use:.0%} of the wire at '
+            f"{config.mcu.baud_rate} baud, and replies at control.rate = {config.rate_hz:g} do not "
+            f"fit beside them; {left} Hz is comfortable"
         )
     if config.bus.insecure:
         found.append("bus.insecure = true: every program that reaches the bus can drive this robot")

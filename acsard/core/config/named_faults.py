@@ -20,7 +20,7 @@ FAULTS = (
     "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
     "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
     "late_watchdog", "watchdog_fed_by_bad_lines", "lost_replies", "lost_commands", "bit_errors",
-    "free_running", "ftdi",
+    "free_running", "ftdi", "estop",
 )  # fmt: skip
 """Faults without arguments."""
 
@@ -29,7 +29,7 @@ ARGUMENTS = {
     "reversed_encoder": "m",
     "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
     "swapped_wheels": "mm", "bias": "mn", "wrong_baud": "n",
-    "pushed": "n", "stalls": "nn",
+    "pushed": "n", "stalls": "nn", "estop_pressed": "nn", "estop_silent": "nn",
 }  # fmt: skip
 """Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
 
@@ -83,6 +83,10 @@ def named(text: str) -> NamedFault:
         raise ValueError(
             "give the seconds from one stall to the next, then fewer seconds for each stall; "
             f"both at least {SHORTEST_S}"
+        )
+    if name.startswith("estop_") and not min(fault.values) >= 0:
+        raise ValueError(
+            "give the seconds from the start until it begins, then its seconds (0: it stays)"
         )
     if name == "wrong_baud" and fault.values[0] not in get_args(Baud):
         raise ValueError(f"rates are {', '.join(map(str, get_args(Baud)))}")

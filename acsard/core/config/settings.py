@@ -205,6 +205,13 @@ class FeedbackConfig(Struct, frozen=True):
     fault_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s (0 = off)"})] = 0.5
 
 
+EstopUse = Literal["auto", "required", "off"]
+
+
+class SafetyConfig(Struct, frozen=True):
+    estop: EstopUse = "auto"
+
+
 class LimitsConfig(Struct, frozen=True):
     linear_speed: LinearSpeed = 1.0
     angular_speed: AngularSpeed = 4.0
@@ -382,6 +389,7 @@ class Config(Struct, frozen=True):
     joints: JointsConfig = JointsConfig()
     limits: LimitsConfig = LimitsConfig()
     feedback: FeedbackConfig = FeedbackConfig()
+    safety: SafetyConfig = SafetyConfig()
     commands: CommandsConfig = CommandsConfig()
     odometry: OdometryConfig = OdometryConfig()
     lidar: LidarConfig = LidarConfig()

@@ -19,6 +19,13 @@ SAMPLE_BYTES = 21
 A command asks for the fields with one more letter.
 """
 
+STATUS_BYTES = 28
+"""Length of `!status estop=pressed*F4BC` with CR LF, the line with which a board reports its
+emergency stop."""
+
+STATUS_HZ = 10
+"""Status lines per second."""
+
 FIELD = 65536
 """Number of values of a sample field, which has four hexadecimal digits. Then it wraps to 0."""
 

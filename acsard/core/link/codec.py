@@ -24,8 +24,9 @@ MAX_SPEED = 99.99
 """rad/s, the largest number with two integer digits and two decimals."""
 
 Reason = Literal[
-    "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence"
-]
+    "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
+    "status_malformed", "status_without_crc", "status_crc_error",
+]  # fmt: skip
 
 _TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
 TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3

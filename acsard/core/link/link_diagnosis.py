@@ -36,10 +36,11 @@ PATIENCE_NS = 3 * NS_PER_S
 SHOWN = 64
 """Most characters that are shown: a whole line and some noise on it."""
 
-Look = Literal["nothing", "cut", "foreign", "garbage", "few", "sparse"]
+Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
 """The look of the received bytes.
 
 - nothing: no byte at all
+- statuses: status lines of the board, and no reply
 - cut: pieces of valid lines, or lines without an end
 - foreign: valid lines with other bytes on them
 - garbage: nothing that resembles a line
@@ -50,6 +51,7 @@ Look = Literal["nothing", "cut", "foreign", "garbage", "few", "sparse"]
 LOOK_MENDS: dict[Look, str] = {
     "nothing": "has the board power, is this its port, does mcu.baud_rate fit, are TX and RX "
     "swapped?",
+    "statuses": "does the line from this computer (TX) reach the board's RX?",
     "cut": "does the board cut its lines short, or omit the line ends?",
     "foreign": "does something disturb the cable, or print on it too?",
     "garbage": "does mcu.baud_rate fit the board?",
@@ -129,6 +131,8 @@ class Heard(Struct):
     """Number of bytes."""
     lines: int = 0
     good: int = 0
+    statuses: int = 0
+    """Number of the board's status lines, which are not counted in `lines`."""
     last: bytes = b""
     late_s: float = 0.0
     """Longest time in the interval in which this computer did not run and received nothing, s."""
@@ -149,6 +153,8 @@ class Heard(Struct):
     @property
     def looks(self) -> Look:
         """The look of the bytes."""
+        if self.statuses and not self.lines:
+            return "statuses"
         if not self.size:
             return "nothing"
         if self.good:
@@ -160,6 +166,8 @@ class Heard(Struct):
     @property
     def counted(self) -> str:
         """Text with the number of received lines and the last bad line; bytes if no line ended."""
+        if self.statuses and not self.lines:
+            return "only status lines were received"
         if not self.size:
             return "nothing was received"
         if not self.lines:

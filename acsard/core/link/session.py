@@ -14,6 +14,7 @@ from collections import Counter
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
+from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged
 from acsard.core.link.checksum import Reading, unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.feedback import Feedback, Timeline
@@ -63,6 +64,13 @@ class McuSession:
         """
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
         self._lines = LineReader()
+        self._needs_check = mcu.link_check == "require"
+        self.statuses: list[tuple[int, BoardStatus]] = []
+        """The status lines of the last `update`, each with its monotonic time of arrival, ns."""
+        self.status = BoardStatus()
+        """The last value of each field of the status lines."""
+        self.status_ns: int | None = None
+        """Monotonic time of the last status line, None before the first one."""
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
@@ -119,6 +127,8 @@ class McuSession:
             unsent: True if the last line did not leave.
         """
         self.restarted, self._starting_over, self.events = False, False, []
+        if self.statuses:
+            self.statuses = []
         self._settle(not unsent, port_open)
         feedback = []
         if not port_open or opened != self._opened:
@@ -293,9 +303,15 @@ class McuSession:
     def _read(self, piece: Received) -> list[Feedback]:
         """Return the good lines of one read, and show each line to the timeline."""
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
-        link = self._link
+        link, came = self._link, piece.data
+        statuses = [line for line, _ in lines if line.startswith(STATUS)]
+        if statuses:
+            # A status line is no reply, so it says nothing about the times and the link.
+            lines = [each for each in lines if not each[0].startswith(STATUS)]
+            self._take_statuses(statuses, piece.at.mono_ns)
+            came = b"\n".join([line for line, _ in lines])
         if link.state != "up":
-            self._hearing.now.take(piece.data)
+            self._hearing.now.take(came)
         if lines:
             timeline.read(piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
@@ -307,6 +323,19 @@ class McuSession:
             if link.state != "up":
                 self._hearing.now.line(line, got is not None)
         return feedback
+
+    def _take_statuses(self, lines: list[bytes], at_ns: int) -> None:
+        check = self._needs_check or self.negotiation.checked
+        for line in lines:
+            try:
+                status = decode_status(line, check)
+            except FrameError as error:
+                self._reject(error.reason, line)
+                continue
+            self.status, self.status_ns = merged(self.status, status), at_ns
+            self.statuses.append((at_ns, status))
+            if self._link.state != "up":
+                self._hearing.now.statuses += 1
 
     def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
         if line.startswith(IDENTITY):

@@ -7,7 +7,8 @@ The levels have these meanings:
 - ERROR: it keeps the robot from driving.
 
 As long as the daemon runs, each message has the same rows. If a row were missing from a message,
-rqt_robot_monitor would show the row as stale.
+rqt_robot_monitor would show the row as stale. The row of the board appears with its first status
+line, and stays.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
 from acsard.core.motion.arbiter_text import waiting
+from acsard.core.motion.emergency_stop import MISSING, PRESSED, SILENT
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.learned_track import tracks
 from acsard.core.values import (
@@ -37,6 +39,14 @@ OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
 """Levels of the modes in which the robot waits for a person to clear a latch."""
+
+BOARD = {
+    "": (OK, "no emergency-stop input"),
+    "released": (OK, "emergency stop released"),
+    "pressed": (WARN, PRESSED),
+    "silent": (ERROR, SILENT),
+}
+"""Level and text of each state of the emergency-stop input."""
 
 REFUSED_S = 2.0
 """Time for which a refused command is shown, s. These are two messages at the default rate."""
@@ -80,6 +90,7 @@ def diagnostics(
         _control_loop(snapshot),
         _commands(outputs, snapshot, speed_limit),
         _wheels(snapshot.doubt, snapshot.counters),
+        *_board(config, snapshot),
         *_gyro(config, snapshot.gyro),
         *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
@@ -163,6 +174,18 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
     level, message = WARN if doubt.text else OK, doubt.text or "front and rear agree"
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
     return Row("wheels", level, message, values)
+
+
+def _board(config: Config, snapshot: Snapshot) -> list[Row]:
+    """Return the row of the board's inputs, or nothing if it reports none and none is required."""
+    required = config.safety.estop == "required"
+    if not (snapshot.board or required):
+        return []
+    level, message = BOARD[snapshot.estop]
+    if required and not snapshot.estop:
+        level, message = ERROR, MISSING
+    counted = _counted(snapshot.counters, "line_status") | _counted(snapshot.counters, "emergency")
+    return [Row("board", level, message, snapshot.board | counted)]
 
 
 def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:

@@ -263,6 +263,7 @@ class Report:
             latch=0 if outputs.latches.in_force is None else outputs.latches.in_force.number,
             latch_file_error=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
+            emergency_stop=snapshot.estop,
             settings_differ=self.settings_differ,
             speed_limit=self.speed_limit,
         )

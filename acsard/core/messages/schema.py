@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 from acsard.core.link.link_state import State
 from acsard.core.messages.topics import Direction
 from acsard.core.motion.modes import Mode
-from acsard.core.values import NS_PER_S, ROLES, EventName, GyroDoes, Level, Plain
+from acsard.core.values import NS_PER_S, ROLES, EstopState, EventName, GyroDoes, Level, Plain
 
 # These annotations tell `cdr.py` the width of an int and the fixed length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
@@ -276,6 +276,11 @@ class RobotState(Message, frozen=True):
     """
     feedback_age: float | None = None
     """Seconds since the last valid feedback line; null before the first one."""
+    emergency_stop: Annotated[str, one_of(get_args(EstopState))] = ""
+    """State of the emergency-stop input that the board reports; empty if it has never reported it.
+
+    `silent` means that the board no longer reports it, which counts as pressed.
+    """
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 

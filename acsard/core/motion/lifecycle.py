@@ -10,6 +10,9 @@ sender has not seen, however late the network delivers it:
   that persists latches again.
 - A request that arrived before the latch was set never releases it.
 
+A pressed emergency stop at the robot latches a stop too. Nothing releases a latch while it is
+pressed. `emergency_stop.py` decides when it counts as pressed.
+
 `modes.py` derives the mode. `core/robot.py` decides how the wheels follow it.
 """
 
@@ -20,6 +23,7 @@ from functools import lru_cache
 
 from msgspec.structs import replace
 
+from acsard.core.motion.emergency_stop import MENDS
 from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
@@ -55,6 +59,8 @@ class Lifecycle:
         """Monotonic time at which the last stop arrived."""
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off."""
+        self._held = ""
+        """Why the emergency stop counts as pressed, in words; "" while it does not."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, None before it."""
         self._derive()
@@ -77,6 +83,15 @@ class Lifecycle:
         if fresh is not self._commanded:
             self._commanded = fresh
             self._derive()
+
+    def press(self, why: str, now: Instant) -> None:
+        """Latch a stop under a new number, because the emergency stop was pressed."""
+        self._stopped_ns = self._stop_asked_ns = now.mono_ns
+        self._latch(stop=self._made(now, "", why))
+
+    def hold(self, why: str) -> None:
+        """Note why the emergency stop counts as pressed, or "" when it is released."""
+        self._held = why
 
     def leave(self) -> None:
         """Note that the daemon is going down."""
@@ -114,6 +129,8 @@ class Lifecycle:
             now: Both clocks at this step.
         """
         require_allowed(self.mode, "clear")
+        if self._held:
+            raise RefusedError(f"{self._held}: {MENDS[self._held]}, then call srv/clear again")
         latches, latch = self.latches, self.latches.next
         if latch is None:
             return ""
@@ -122,7 +139,7 @@ class Lifecycle:
             set_ns = max(self._stopped_ns, self._faulted_ns)
         else:
             if number != latch.number:
-                still = latch.why if latches.fault is None else f"in fault ({latch.why})"
+                still = f"in fault ({latch.why})" if latches.fault else _stopped(latch)
                 raise RefusedError(_not_in_force(number, still, "srv/clear"))
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
@@ -136,7 +153,7 @@ class Lifecycle:
         self._latch(fault=None)
         if latches.stop is None:
             return "cleared; each sender must send a zero before it drives"
-        return f"fault cleared; still {latches.stop.why}: call srv/clear again"
+        return f"fault cleared; still {_stopped(latches.stop)}: call srv/clear again"
 
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
         """Switch the robot on; return True if it was off.
@@ -180,14 +197,19 @@ class Lifecycle:
     @property
     def why(self) -> str:
         """Why the mode is `fault`, `stopped` or `inactive`, with the call that changes it."""
-        latches = self.latches
+        latches, held = self.latches, self._held
+        before = f"{MENDS[held]}, then " if held else ""
+        stop = "" if latches.stop is None else _said(latches.stop)
+        if held and latches.stop is not None and latches.stop.why != held:
+            # A client has stopped the robot since the emergency stop was pressed.
+            stop = f"{held}; also {stop}"
         if latches.fault is not None:
             fault = f"{latches.fault.why}, latched {_when(latches.fault)}"
-            if latches.stop is None:
+            if not stop:
                 return f"{fault}; call srv/clear"
-            return f"{fault}; also {_said(latches.stop)}; call srv/clear twice"
-        if latches.stop is not None:
-            return f"{_said(latches.stop)}; call srv/clear"
+            return f"{fault}; also {stop}; {before}call srv/clear twice"
+        if stop:
+            return f"{stop}; {before}call srv/clear"
         if latches.inactive is not None:
             return f"{_said(latches.inactive)}; call srv/activate"
         return "switched off; call srv/activate"
@@ -227,7 +249,7 @@ class Lifecycle:
             # The network may have delivered one clear twice.
             raise RefusedError(
                 f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
-                f"{stop.why}: look at it, then call srv/clear again"
+                f"{_stopped(stop)}: look at it, then call srv/clear again"
             )
         self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
 
@@ -238,11 +260,11 @@ class Lifecycle:
         if since >= LOOK_FIRST_S * NS_PER_S:
             return
         age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
-        came = f"the robot was {latch.why} {age_s:.1f} s ago"
+        came = f"the robot was {_stopped(latch)} {age_s:.1f} s ago"
         if set_ns < began_ns:
             # The monotonic clock does not reach back before the start, and the wall clock may have
             # been set since.
-            came = f"the daemon started {age_s:.1f} s ago and the robot is still {latch.why}"
+            came = f"the daemon started {age_s:.1f} s ago and the robot is still {_stopped(latch)}"
         raise RefusedError(
             f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, "
             "or with the number of the latch that you have seen"
@@ -256,6 +278,11 @@ def _not_in_force(number: int, still: str, call: str) -> str:
     )
 
 
+def _stopped(latch: Latch) -> str:
+    """Return the reason of a stop or of switching off as the end of "the robot is still"."""
+    return f"stopped ({latch.why})" if latch.why in MENDS else latch.why
+
+
 def _when(latch: Latch) -> str:
     return f"at {utc(latch.at_ns)}{', before the restart' if latch.kept else ''}"
 
@@ -263,7 +290,7 @@ def _when(latch: Latch) -> str:
 def _said(latch: Latch) -> str:
     """Return the words for a stop or for switching off, with the time."""
     if not latch.why.endswith(f" by {latch.by or 'request'}"):
-        # The daemon itself set it at a start, and its reason is a whole sentence.
+        # No client asked for it, and its reason is a whole sentence.
         return f"{latch.why} (latched {_when(latch)})"
     return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"
 

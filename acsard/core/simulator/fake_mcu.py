@@ -22,7 +22,7 @@ from acsard.core.config.named_faults import named
 from acsard.core.config.settings import Config, WheelMap
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.simulator import protocol
-from acsard.core.simulator.faults import USB_PACKET, Faults
+from acsard.core.simulator.faults import USB_PACKET, Fault, Faults
 from acsard.core.simulator.faults import WATCHDOG_NS as WATCHDOG_NS
 from acsard.core.simulator.vehicle import Vehicle
 from acsard.core.values import NS_PER_S
@@ -37,6 +37,12 @@ SHORTEST_WINDOW_NS = 4 * MS
 
 A reply within this time repeats the last speeds.
 """
+
+STATUS_NS = NS_PER_S // 10
+"""Time between two status lines, ns."""
+
+NEVER_NS = 2**62
+"""Monotonic time after every other one."""
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
 """Times from the end of a line to the start of its answer, ms. The board uses them in turn."""
@@ -77,6 +83,12 @@ class FakeMcu(Faults):
         """The last lines that the board received, valid or not, each with the time of its end."""
         self.valid_lines = 0
         self._watchdog_trips = 0
+        self._checks = False
+        """Whether the host has sent a checked line, so that status lines have a checksum too."""
+        self._inputs: tuple[tuple[int, int, str], ...] = ()
+        """The faults of the emergency-stop input, each with its begin and end, ns, and the word in
+        the status line, or `silent`. The last one that is on decides. Empty without an input."""
+        self._inputs_clock = b""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -136,6 +148,11 @@ class FakeMcu(Faults):
                 if due_ns >= self._boot_until_ns:
                     self._reply(due_ns, protocol.Command({}))
                 self._schedule(due_ns + self.unprompted_ns, "report", data)
+            elif what == "status":
+                self._tell_inputs(due_ns)
+            elif what == "inputs" and data == self._inputs_clock:
+                self._tell_inputs(due_ns)
+                self._schedule(due_ns + STATUS_NS, "inputs", data)
         self._now_ns = now_ns
         return out
 
@@ -154,8 +171,13 @@ class FakeMcu(Faults):
         self._measured, self._counted = [0.0] * 4, [0.0] * 4
         self._schedule(now_ns + deaf_ns // 2, "sent", b"\x00\xf8\xff~boot\r\n")
         self._schedule(now_ns + deaf_ns, "booted", b"")
+        self._checks = False
         if self._clock:
             self._schedule(now_ns + self.unprompted_ns, "report", self._clock)
+        if self._inputs:
+            self._schedule(now_ns + STATUS_NS, "inputs", self._inputs_clock)
+        for begin_ns, end_ns, _ in self._inputs:
+            self._schedule_changes(begin_ns, end_ns)
 
     def _schedule(self, due_ns: int, what: str, data: bytes) -> None:
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
@@ -211,6 +233,7 @@ class FakeMcu(Faults):
         speeds = tuple(self._speeds(now_ns))
         text = protocol.speeds_text(speeds, self.separator, self.unpadded_replies) + comma
         if command.sequence:
+            self._checks = True
             sample = self._sample() if command.wants_sample and self.samples else ()
             text += protocol.suffix(text, command.sequence, sample)
         if self._hit("reply", self.lose_reply):
@@ -282,7 +305,50 @@ class FakeMcu(Faults):
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
-    # This fault is here because it needs the events of the board.
+    def _tell_inputs(self, now_ns: int) -> None:
+        """Send a status line with the emergency-stop input, unless it is silent about it."""
+        now = [word for begin, end, word in self._inputs if begin <= now_ns < end]
+        word = now[-1] if now else "ok"
+        if not self._inputs or word == "silent" or self.muted or now_ns < self._boot_until_ns:
+            return
+        self._send(now_ns, self._damaged(protocol.status(word, self._checks)))
+
+    def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
+        """Send a status line at once when the input changes."""
+        for change_ns in (begin_ns, end_ns):
+            if self._now_ns <= change_ns < NEVER_NS:
+                self._schedule(change_ns, "status", b"")
+
+    # These faults are here because they need the events of the board.
+
+    def estop(self) -> Fault:
+        """Report a released emergency stop, ten times a second and at once when it changes."""
+        return self._input("ok")
+
+    def estop_pressed(self, after_s: float, length_s: float) -> Fault:
+        """Report an emergency stop that is pressed in `after_s` s, for `length_s` s (0: it stays).
+
+        Before and after that it is released.
+        """
+        return self._input("pressed", after_s, length_s)
+
+    def estop_silent(self, after_s: float, length_s: float) -> Fault:
+        """Report a released emergency stop, and nothing about it between these times."""
+        return self._input("silent", after_s, length_s)
+
+    @contextmanager
+    def _input(self, word: str, after_s: float = 0.0, length_s: float = 0.0) -> Iterator[None]:
+        begin_ns = self._now_ns + int(after_s * NS_PER_S)
+        end_ns = begin_ns + int(length_s * NS_PER_S) if length_s else NEVER_NS
+        clock = self._inputs_clock
+        if not clock:
+            clock = b"inputs %d" % next(self._order)
+            self._schedule(self._now_ns + STATUS_NS, "inputs", clock)
+        self._schedule_changes(begin_ns, end_ns)
+        inputs = (*self._inputs, (begin_ns, end_ns, word))
+        with self._with(_inputs=inputs, _inputs_clock=clock):
+            yield
+        self._schedule(self._now_ns, "status", b"")
 
     @contextmanager
     def free_running(self, period_s: float = 0.1) -> Iterator[None]:

@@ -126,6 +126,12 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
     return body + b"*%04X" % _crc(body, _crc_of_plain(text))
 
 
+def status(estop: str, check: bool) -> bytes:
+    """Return the status line with the emergency-stop input, `ok` or `pressed`."""
+    text = f"!status estop={estop}".encode()
+    return text + (b"*%04X" % _crc(text) if check else b"") + b"\r\n"
+
+
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 

@@ -34,6 +34,18 @@ def test_garbage_is_distinguished_from_silence() -> None:
         assert end.value.finding.figure.startswith(word)
 
 
+def test_a_board_that_sends_status_lines_but_hears_nothing_has_an_outcome_of_its_own() -> None:
+    robot = Robot("estop")
+    with (
+        robot.mcu.lost_commands(every=1),
+        robot.board(rest=False) as board,
+        pytest.raises(StoppedError) as end,
+    ):
+        dialect.baud(board)
+    assert end.value.finding.figure == "only status lines"
+    assert "only status lines were received" in end.value.finding.text
+
+
 def test_every_diagnosis_of_the_received_bytes_has_an_outcome_of_its_own() -> None:
     for look in get_args(Look):
         finding = find(f"baud rate: {look}", heard="2 lines", configured=115200)

@@ -44,6 +44,8 @@ GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "samples": ((), {"link_check": "require", "encoder_counts": 3200}),
     "old sketch": (("free_running", "plain_only"), {"reply_period": 0.1}),
     "comma sent": ((), {"trailing_comma": True}),
+    "status lines": (("plain_only", "estop"), {}),
+    "checked status lines": (("no_sample", "estop"), {"link_check": "auto"}),
 }
 
 

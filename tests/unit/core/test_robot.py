@@ -18,6 +18,7 @@ from acsard.core.config.settings import (
     LimitsConfig,
     McuConfig,
     OdometryConfig,
+    SafetyConfig,
     Source,
 )
 from acsard.core.link.codec import Codec
@@ -189,6 +190,218 @@ class Bench:
 
 def names(outputs: Outputs) -> list[str]:
     return [event.name for event in outputs.events]
+
+
+# the emergency stop
+
+OK_LINE, PRESSED_LINE = b"!status estop=ok\r\n", b"!status estop=pressed\r\n"
+
+
+class Button(Bench):
+    """A bench whose board also sends a status line in each step."""
+
+    def __init__(self, status: bytes = OK_LINE, config: Config | None = None) -> None:
+        super().__init__(config)
+        self.status(status)
+
+    def status(self, line: bytes) -> Button:
+        """Send this status line from now on, b"" for none."""
+        self.reply = self.codec.stop + line
+        return self
+
+
+def test_a_press_is_a_zero_line_and_a_stop_in_the_same_step() -> None:
+    bench = Button()
+    bench.driving()
+    out = bench.status(PRESSED_LINE).step(GO)
+    assert (out.mode, out.line, out.speeds) == ("stopped", ZERO_LINE, STILL)
+    assert out.reason.startswith("emergency stop pressed at the robot (latched at ")
+    assert {"emergency_stop", "mode"} <= set(names(out))
+    assert bench.counters()["emergency_stops"] == 1
+    assert bench.robot.snapshot(bench.now_ns).estop == "pressed"
+    assert bench.robot.snapshot(bench.now_ns).board == {
+        "emergency_stop": "pressed",
+        "age_s": "0.0",
+    }
+
+
+def test_a_press_between_two_ticks_goes_at_once_if_the_line_may() -> None:
+    bench = Button()
+    bench.driving()
+    inputs = Inputs(
+        bench.now, False, True, 1, received=(Received(bench.now, PRESSED_LINE),), at_once=True
+    )
+    out = bench.robot.step(inputs)
+    assert (out.mode, out.line) == ("stopped", ZERO_LINE)
+
+
+def test_a_press_between_two_ticks_is_zero_speed_even_if_no_line_may_go() -> None:
+    bench = Button()
+    bench.driving()
+    out = bench.status(PRESSED_LINE).step(GO, tick=False)
+    assert (out.mode, out.line, out.speeds) == ("stopped", None, STILL)
+    assert bench.step(GO).line == ZERO_LINE
+
+
+def test_a_zero_line_that_did_not_leave_is_repeated_as_zero() -> None:
+    bench = Button()
+    bench.driving()
+    bench.status(PRESSED_LINE).step(GO)
+    for _ in range(3):
+        assert bench.step(GO, superseded=True).line == ZERO_LINE
+
+
+def test_a_press_that_was_released_in_the_same_read_stays_a_stop() -> None:
+    bench = Button()
+    bench.driving()
+    out = bench.status(PRESSED_LINE + OK_LINE).step(GO)
+    assert (out.mode, out.line) == ("stopped", ZERO_LINE)
+    for _ in range(200):
+        out = bench.status(OK_LINE).step(GO)
+        assert (out.mode, out.line) == ("stopped", ZERO_LINE)
+
+
+def test_clear_is_refused_while_pressed_and_a_sender_needs_a_zero_after_it() -> None:
+    bench = Button(PRESSED_LINE)
+    bench.linked()
+    answer = bench.answer("clear")
+    assert not answer.success
+    assert answer.message == (
+        "emergency stop pressed at the robot: release it there, then call srv/clear again"
+    )
+    assert bench.mode() == "stopped"
+    bench.status(OK_LINE).step(GO)
+    assert bench.mode() == "stopped"
+    assert bench.answer("clear").success
+    assert bench.step(GO).mode == "ready"
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_a_clear_in_the_step_of_the_press_does_not_release_it() -> None:
+    bench = Button()
+    bench.driving()
+    bench.step(ask="stop")
+    bench.status(PRESSED_LINE + OK_LINE)
+    assert not bench.answer("clear").success
+    assert bench.mode() == "stopped"
+
+
+@each("before", ["stopped", "fault", "inactive", "waiting", "shutdown", "ready"])
+def test_a_press_is_latched_in_every_mode(before: str) -> None:
+    bench = Button()
+    bench.linked()
+    match before:
+        case "stopped":
+            bench.step(ask="stop")
+        case "fault":
+            bench.step(guard_trip="it is not a whole line of four wheels")
+        case "inactive":
+            bench.step(ask="deactivate")
+        case "waiting":
+            bench.reply = OK_LINE
+            for _ in range(12):
+                bench.step()
+        case "shutdown":
+            bench.shutting_down = True
+            bench.step()
+    assert bench.mode() == before
+    held = bench.out.latches.stop
+    bench.reply = PRESSED_LINE if before == "waiting" else bench.status(PRESSED_LINE).reply
+    out = bench.step()
+    assert out.mode == (before if before in ("fault", "shutdown") else "stopped")
+    assert out.latches.stop is not None
+    assert out.latches.stop.why == "emergency stop pressed at the robot"
+    assert held is None or out.latches.stop.number > held.number
+    assert out.line in (None, ZERO_LINE)
+
+
+def test_silence_about_the_input_is_a_press_also_without_a_port() -> None:
+    bench = Button()
+    bench.linked()
+    bench.unplug()
+    for _ in range(50):
+        assert bench.step().mode == "waiting"
+    out = bench.step()
+    assert (out.mode, bench.robot.snapshot(bench.now_ns).estop) == ("stopped", "silent")
+
+
+def test_a_required_input_that_is_not_reported_keeps_the_robot_from_ready() -> None:
+    bench = Button(b"", Config(safety=SafetyConfig(estop="required")))
+    bench.linked()
+    out = bench.step(GO)
+    assert (out.mode, out.link, out.line) == ("waiting", "up", ZERO_LINE)
+    assert out.reason == (
+        'safety.estop = "required", but the microcontroller has not reported an emergency-stop '
+        "input: does its firmware send status lines with `estop=`?"
+    )
+    assert bench.status(OK_LINE).step().mode == "ready"
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_a_restarted_daemon_starts_with_the_latch_of_the_press() -> None:
+    bench = Button(PRESSED_LINE)
+    latches = bench.linked().out.latches.after_restart()
+    after = Bench(latches=latches).linked()
+    assert after.mode() == "stopped"
+    assert after.out.reason.startswith("emergency stop pressed at the robot (latched at ")
+    assert after.out.reason.endswith("before the restart); call srv/clear")
+
+
+def test_wheels_that_roll_without_power_are_no_fault() -> None:
+    bench = Bench(fault_time=0.2)
+    bench.linked().step(REST)
+    for _ in range(100):
+        speed = bench.step(GO).speeds.front_left
+        # Equal speeds would be an echo of the lines.
+        bench.reply = bench.codec.encode(WheelSpeeds(*[0.95 * speed] * 4))
+    assert bench.mode() == "driving"
+    bench.reply = bench.codec.encode(ROLLING) + PRESSED_LINE
+    for _ in range(300):
+        assert bench.step().mode == "stopped"
+
+
+def test_damaged_status_lines_are_counted_and_say_nothing_about_the_link() -> None:
+    bench = Button(b"!status estop=prxssed\r\n!status estop=ok*0000\r\n")
+    bench.driving()
+    for _ in range(20):
+        assert bench.step(GO).mode == "driving"
+    counters = bench.counters()
+    assert counters["line_status_malformed"] > 50
+    assert counters["line_status_crc_error"] > 50
+    assert bench.robot.snapshot(bench.now_ns).board == {}
+
+
+def test_status_lines_change_neither_the_pose_nor_its_times() -> None:
+    plain, told = Bench(), Bench()
+    told.reply = OK_LINE + told.codec.stop
+    for _ in range(200):
+        one, other = plain.step(), told.step()
+        assert (one.line, one.mode, one.link, one.estimates) == (
+            other.line, other.mode, other.link, other.estimates,
+        )  # fmt: skip
+
+
+def test_a_board_that_sends_only_status_lines_is_diagnosed() -> None:
+    bench = Bench()
+    bench.reply = OK_LINE
+    for _ in range(400):
+        bench.step()
+    assert bench.out.reason == (
+        "the microcontroller: only status lines were received; does the line from this computer "
+        "(TX) reach the board's RX? `acsard mcu check` finds out more"
+    )
+
+
+def test_a_checked_link_takes_no_status_line_without_a_checksum() -> None:
+    bench = Bench(Config(mcu=McuConfig(link_check="require")))
+    bench.reply = OK_LINE
+    bench.step()
+    assert bench.counters()["line_status_without_crc"] == 1
+    bench.reply = b"!status estop=ok*9C94\r\n"
+    bench.step()
+    assert bench.robot.snapshot(bench.now_ns).estop == "released"
 
 
 # the link

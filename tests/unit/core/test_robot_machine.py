@@ -187,6 +187,12 @@ class RobotMachine(RuleBasedStateMachine):
         self.period_ms = 1000 / config.rate_hz
         self.books = {s.name: Books(s, config.commands.neutral_first) for s in SOURCES}
         self.now_ns = 50 * NS_PER_S
+        self.button: bool | None = None
+        """The emergency stop as the board reports it now, None if it does not."""
+        self.reported: bool | None = None
+        """The last report of the emergency stop, None before the first one."""
+        self.reported_ns = self.late_ns = 0
+        """Time of the last report, and the longest time between two steps since then."""
         self.port_open, self.opened, self.blocked, self.shutting_down = True, 1, False, False
         self.trip, self.superseded = "", False
         self.commands: list[Command] = []
@@ -372,6 +378,9 @@ class RobotMachine(RuleBasedStateMachine):
         """Clear both latches, activate and open the port; otherwise most runs end in a latch."""
         self.opened += not self.port_open
         self.port_open, self.blocked = True, False
+        if self.reported is not None:
+            self.button = False
+            self.step(reply=True)
         for _ in range(2):
             self.ask("clear")
             self.step(reply=True)
@@ -381,6 +390,15 @@ class RobotMachine(RuleBasedStateMachine):
         for name in NAMES:
             self.command(name, REST)
         self.step(reply=True)
+
+    @rule(button=st.sampled_from([None, False, True]), count=st.integers(0, 60))
+    def the_emergency_stop_changes(self, button: bool | None, count: int) -> None:
+        """The board reports it in each step from now on, or is silent about it with None."""
+        self.button = button
+        for i in range(count):
+            if i % 4 == 0:
+                self.command("app", Twist(0.7, 0.5))
+            self.step(reply=True)
 
     @rule(x=places, y=places, yaw=st.floats(-1e3, 1e3))
     def the_pose_is_set(self, x: float, y: float, yaw: float) -> None:
@@ -470,6 +488,7 @@ class RobotMachine(RuleBasedStateMachine):
         """Let time pass and run one step with all inputs, as the control loop does."""
         passed_ms = self.period_ms if ms is None else ms
         self.now_ns += int(passed_ms * MS)
+        self.late_ns = max(self.late_ns, int(passed_ms * MS))
         if self.opened != self.last_opened or not self.port_open:
             self.received.clear()
             self.heard_ns, self.good_in_row = None, 0
@@ -483,6 +502,13 @@ class RobotMachine(RuleBasedStateMachine):
             self.turning = self.told = (0.0, 0.0, 0.0, 0.0)  # the MCU's watchdog
         if reply and self.port_open:
             self.receive(write(self.turning), 1)
+        pressed = self.reported
+        if self.button is not None and self.port_open:
+            word = b"pressed" if self.button else b"ok"
+            self.receive(b"!status estop=%b\r\n" % word, 0)
+            self.reported, self.reported_ns, self.late_ns = self.button, self.now_ns, 0
+        # A press cuts the speed at once.
+        self.broken = self.broken or (self.reported and not pressed) is True
         now = Instant(self.now_ns, self.now_ns + WALL_NS)
         commands, requests = tuple(self.commands), tuple(self.requests)
         outputs = self.robot.step(
@@ -508,6 +534,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.keep_books(outputs, commands, requests)
         self.broken = self.broken or outputs.link != "up"
         self.check(outputs, requests)
+        self.check_emergency_stop(outputs, requests)
         self.send(outputs)
         self.before = outputs
 
@@ -609,6 +636,24 @@ class RobotMachine(RuleBasedStateMachine):
             assert (after.lowered.get(f"limits.{name}") == getattr(limits, name)) == lowered
         held = after.fault or after.stop or after.inactive
         assert not held or outputs.mode not in ("waiting", "ready", "driving")
+
+    def check_emergency_stop(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
+        """While it is pressed, or silent for long, the robot is stopped, and no clear succeeds."""
+        since_ns = self.now_ns - self.reported_ns
+        # A late computer is excused once for 0.1 s.
+        silent = self.reported is not None and since_ns > 600 * MS + 2 * self.late_ns
+        if self.reported and since_ns <= 500 * MS:
+            assert self.robot.snapshot(self.now_ns).estop == "pressed"
+        elif silent:
+            assert self.robot.snapshot(self.now_ns).estop in ("pressed", "silent")
+        if self.reported or silent:
+            assert outputs.mode in ("stopped", "fault", "shutdown")
+            assert outputs.speeds.as_tuple() == (0.0, 0.0, 0.0, 0.0)
+            assert outputs.latches.stop is not None
+            for request, answer in zip(requests, outputs.answers, strict=True):
+                assert request.verb != "clear" or not answer.success
+        elif self.reported is False and since_ns <= 500 * MS:
+            assert self.robot.snapshot(self.now_ns).estop == "released"
 
     def check_odometry(self, outputs: Outputs) -> None:
         """No step is longer than the fastest wheel at either of its ends allows in the time since.

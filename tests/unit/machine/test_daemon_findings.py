@@ -10,7 +10,14 @@ from msgspec.structs import replace
 
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import BusConfig, Config, DriveConfig, McuConfig, RobotConfig
+from acsard.core.config.settings import (
+    BusConfig,
+    Config,
+    DriveConfig,
+    McuConfig,
+    RobotConfig,
+    SafetyConfig,
+)
 from acsard.core.messages.schema import DiagnosticStatus, Info, LogEvent, RobotState, Time
 from acsard.machine.daemon_findings import (
     SHOWN,
@@ -296,6 +303,27 @@ def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_bo
 def test_a_wheel_that_is_left_out_is_reported() -> None:
     *_, finding = found({}, {}, wheel_fault="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")
+
+
+@pytest.mark.parametrize(
+    ("state", "level", "text"),
+    [
+        ("pressed", "warning", "emergency stop pressed at the robot"),
+        ("silent", "failure", "the board reported no emergency-stop input for 0.5 s"),
+        ("released", "ok", "the board reports it, and it is released"),
+    ],
+)
+def test_the_emergency_stop_of_the_board_is_reported(state: str, level: str, text: str) -> None:
+    *_, finding = found({}, {}, emergency_stop=state)
+    assert (finding.subject, finding.level) == ("emergency stop", level)
+    assert finding.text.startswith(text)
+
+
+def test_a_required_emergency_stop_that_the_board_does_not_report_is_a_failure() -> None:
+    config = replace(CONFIG, safety=SafetyConfig(estop="required"))
+    *_, finding = link(Running(INFO, config, STATE, STATE, 0))
+    assert (finding.subject, finding.level) == ("emergency stop", "failure")
+    assert finding.text.startswith('safety.estop = "required", but the microcontroller')
 
 
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}

@@ -15,6 +15,7 @@ from acsard.recording.timeline import (
     TimelineEntry,
     TimelineWriter,
     entry_of,
+    is_serious,
     summary,
 )
 from tests.scenarios.taped import Tape, recorded_world
@@ -323,6 +324,16 @@ def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
 def test_missing_steps_are_reported() -> None:
     gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
     assert gaps == ["60 steps are missing before this one: 0.3 s"]
+
+
+def test_a_pressed_emergency_stop_is_a_serious_incident_and_its_release_is_none() -> None:
+    events = [
+        TimelineEntry(1.0, "emergency_stop", "pressed", "error"),
+        TimelineEntry(2.0, "emergency_stop_released", "released"),
+    ]
+    assert summary(events) == "1 emergency stop"
+    assert is_serious(summary(events))
+    assert not is_serious("1 lost port")
 
 
 def test_a_summary_names_who_stopped_the_robot_and_counts_the_incidents() -> None:

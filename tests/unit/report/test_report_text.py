@@ -5,6 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, Source
+from acsard.report.figures import path_figure
 from acsard.report.report_text import Origin, Setting, differences, reasons, rows, summary
 from tests.scenarios.instant_watch import InstantWatch
 from tests.scenarios.world import World
@@ -38,6 +39,22 @@ def test_a_fault_is_listed_with_its_time_and_its_text() -> None:
     assert "front_right wheel" in table["Faults"]
     assert table["When"] == "<1800000000 day> to <1800000002 day>"
     assert table["Recorded by"] == "acsard 0.1.0, Python 3.11.0"
+
+
+def test_a_pressed_emergency_stop_is_counted_and_listed_and_drawn_on_the_path() -> None:
+    def pressed(world: World) -> None:
+        with world.mcu.estop():
+            world.drive(0.5, seconds=1.0)
+            with world.mcu.estop_pressed(0.0, 0.0):
+                world.run(0.5)
+            world.run(0.5)
+
+    report, _ = report_of(pressed)
+    assert summary(report).endswith("There were no faults, no stops, 1 emergency stop.")
+    origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
+    table = dict(rows(report, origin, lambda s, day: f"<{s:.0f}>"))
+    assert table["Emergency stops"].startswith("1: <1800000001> emergency stop pressed at the")
+    assert "emergency stop" in {key.meaning for key in path_figure(report).keys}
 
 
 def test_a_host_stall_does_not_count_as_a_loss_of_the_link() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.config.contradictions import contradictions, warnings
 from acsard.core.config.parsing import parse
@@ -15,6 +16,7 @@ from acsard.core.config.settings import (
     McuConfig,
     OdometryConfig,
     RosConfig,
+    SafetyConfig,
     SimConfig,
 )
 from tests.each import each
@@ -195,3 +197,24 @@ def test_a_track_is_learned_only_where_there_is_a_gyro() -> None:
     assert line.startswith("odometry.learned_track = true needs a gyro")
     assert "odometry.gyro = true" in line
     assert problems(odometry=OdometryConfig(learned_track=True, gyro=True)) == []
+
+
+def test_an_ignored_emergency_stop_is_a_warning() -> None:
+    (warning,) = warnings(Config(safety=SafetyConfig(estop="off")))
+    assert warning == (
+        'safety.estop = "off": the robot ignores an emergency stop that its board reports'
+    )
+
+
+def test_a_required_emergency_stop_needs_room_on_a_slow_wire() -> None:
+    slow = McuConfig(baud_rate=9600)
+    config = Config(mcu=slow, control=ControlConfig(rate="auto"))
+    assert warnings(config) == []
+    (warning,) = warnings(replace(config, safety=SafetyConfig(estop="required")))
+    assert warning == (
+        'safety.estop = "required": status lines take 29% of the wire at 9600 baud, and replies at '
+        "control.rate = 23 do not fit beside them; 14 Hz is comfortable"
+    )
+    safe = SafetyConfig(estop="required")
+    assert warnings(Config(mcu=slow, control=ControlConfig(rate=14.0), safety=safe)) == []
+    assert warnings(Config(safety=safe)) == []

@@ -49,6 +49,8 @@ REFUSED = [
     ("wrong_baud=300", "rates are 9600"),
     ("stalls=0.1:0.2", "fewer seconds for each"),
     ("stalls=0.2:0.2", "fewer seconds for each"),
+    ("estop_pressed=-1:2", "give the seconds from the start until it begins"),
+    ("estop_silent=1:-2", "give the seconds from the start until it begins"),
     ("stalls=5:0", "both at least 0.001"),
     ("stalls=5:0.0009", "both at least 0.001"),
 ]

@@ -7,9 +7,17 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
+from acsard.core.config.settings import (
+    BusConfig,
+    Config,
+    ControlConfig,
+    McuConfig,
+    RobotConfig,
+    SafetyConfig,
+)
 from acsard.core.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
+from acsard.core.motion.emergency_stop import MISSING, PRESSED, SILENT
 from acsard.core.values import (
     GyroStatus,
     Measured,
@@ -70,6 +78,31 @@ def test_a_gyro_once_configured_has_its_row_whatever_it_does(does: Any) -> None:
         *(one.name for one in rows()),
         "acsard: gyro",
     ]
+
+
+@each(
+    ("estop", "level", "message"),
+    [
+        ("", OK, "no emergency-stop input"),
+        ("released", OK, "emergency stop released"),
+        ("pressed", WARN, PRESSED),
+        ("silent", ERROR, SILENT),
+    ],
+)
+def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, message: str) -> None:
+    counters = {"line_status_malformed": 2, "emergency_stops": 1, "lines": 9}
+    one = row("board", snapshot=seen(estop=estop, board={"volts": "24.31"}, counters=counters))
+    assert (one.level, one.message) == (level, message)
+    assert values(one) == {
+        "volts": "24.31", "line_status_malformed": "2", "emergency_stops": "1",
+    }  # fmt: skip
+
+
+def test_a_required_input_has_its_row_before_the_board_reports_it() -> None:
+    config = replace(CONFIG, safety=SafetyConfig(estop="required"))
+    one = row("board", config)
+    assert (one.level, one.message) == (ERROR, MISSING)
+    assert row("board", config, snapshot=seen(estop="released")).level == OK
 
 
 def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() -> None:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.core.motion.emergency_stop import PRESSED, SILENT
 from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
@@ -46,6 +47,11 @@ def clear(life: Lifecycle, seconds: float, number: int | None = None) -> str:
 
 def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool:
     return life.activate(number, ns(seconds), at(seconds))
+
+
+def press(life: Lifecycle, seconds: float, why: str = PRESSED) -> None:
+    life.press(why, at(seconds))
+    life.hold(why)
 
 
 def number(life: Lifecycle) -> int:
@@ -414,6 +420,73 @@ def test_a_fault_that_goes_on_does_not_put_its_clear_off() -> None:
     assert mode(life) is Mode.READY
 
 
+# the emergency stop
+
+
+def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
+    life = ready()
+    press(life, 1.0)
+    assert mode(life) is Mode.STOPPED
+    latched = f"{PRESSED} (latched at {AT}:01 UTC)"
+    assert life.why == f"{latched}; release it there, then call srv/clear"
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 9.0, number(life))
+    assert str(caught.value) == f"{PRESSED}: release it there, then call srv/clear again"
+    life.hold("")
+    assert (mode(life), life.why) == (Mode.STOPPED, f"{latched}; call srv/clear")
+    assert clear(life, 9.5, number(life)).startswith("cleared; ")
+    assert mode(life) is Mode.READY
+
+
+def test_a_silent_input_names_the_board_and_its_cable() -> None:
+    life = ready()
+    press(life, 1.0, SILENT)
+    assert life.why == (
+        f"{SILENT} (latched at {AT}:01 UTC); check the board and its cable, then call srv/clear"
+    )
+
+
+def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() -> None:
+    life = ready()
+    press(life, 1.0)
+    stop(life, 2.0, "joe")
+    stopped = f"stopped by joe at {AT}:02 UTC"
+    assert life.why == (f"{PRESSED}; also {stopped}; release it there, then call srv/clear")
+    life.fault("a wheel is dead", at(3.0))
+    assert life.why == (
+        f"a wheel is dead, latched at {AT}:03 UTC; also {PRESSED}; also {stopped}; release it "
+        "there, then call srv/clear twice"
+    )
+    life.hold("")
+    assert clear(life, 9.0).startswith("fault cleared; still stopped by joe: ")
+    assert life.why == f"{stopped}; call srv/clear"
+
+
+def test_a_press_after_a_release_is_a_new_latch() -> None:
+    life = ready()
+    press(life, 1.0)
+    seen = number(life)
+    life.hold("")
+    press(life, 5.0)
+    life.hold("")
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 9.0, seen)
+    assert str(caught.value) == (
+        f"latch {seen} is not in force; the robot is still stopped ({PRESSED}): look at it, then "
+        "call srv/clear again"
+    )
+
+
+def test_a_plain_clear_is_refused_right_after_a_press() -> None:
+    life = ready()
+    press(life, 1.0)
+    life.hold("")
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 1.5)
+    assert str(caught.value).startswith(f"the robot was stopped ({PRESSED}) 0.5 s ago: look at")
+    assert clear(life, 3.0)
+
+
 # switched off
 
 
@@ -568,6 +641,7 @@ class State(NamedTuple):
     linked: bool
     commanded: bool
     dormant: bool
+    pressed: bool
 
 
 Do = Callable[[Lifecycle, float], object]
@@ -579,6 +653,8 @@ FACTS: dict[str, Do] = {
     "no command": lambda life, _: life.command(fresh=False),
     "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
     "leave": lambda life, _: life.leave(),
+    "press": lambda life, now: press(life, now),
+    "release": lambda life, _: life.hold(""),
 }
 
 REQUESTS: dict[str, Do] = {
@@ -625,6 +701,7 @@ def state_of(life: Lifecycle) -> State:
         life._linked,
         life._commanded,
         life._dormant,
+        bool(life._held),
     )
 
 
@@ -673,13 +750,14 @@ EDGES = explore()
 
 def test_every_combination_of_facts_and_latches_is_reached() -> None:
     states = {edge.before for edge in EDGES}
-    assert len(states) == 2**7
-    assert len({(e.before, e.trigger, e.pause_s) for e in EDGES}) == 2**7 * len(TRIGGERS) * 2
+    # A pressed emergency stop is always latched.
+    assert len(states) == 2**6 * 3
+    assert len({(e.before, e.trigger, e.pause_s) for e in EDGES}) == 2**6 * 3 * len(TRIGGERS) * 2
 
 
 def test_the_mode_always_follows_from_the_list() -> None:
     for edge in EDGES:
-        *held, inactive, linked, commanded, dormant = edge.after
+        *held, inactive, linked, commanded, dormant, _ = edge.after
         shutting_down, fault, stopped = held
         assert edge.mode is mode_of(
             shutting_down=shutting_down, fault=fault, stopped=stopped, inactive=inactive or dormant,
@@ -713,10 +791,36 @@ def test_clear_releases_exactly_one_latch_and_the_fault_first() -> None:
     assert cleared > 100
 
 
-def test_a_clear_by_the_current_number_succeeds_unless_the_daemon_goes_down() -> None:
+def test_a_clear_by_the_current_number_succeeds_unless_the_daemon_goes_down_or_it_is_pressed() -> (
+    None
+):
     for edge in EDGES:
         if edge.trigger == "clear by number":
-            assert edge.refused == edge.before.shutting_down
+            assert edge.refused == (edge.before.shutting_down or edge.before.pressed)
+
+
+def test_nothing_releases_a_latch_while_the_emergency_stop_is_pressed() -> None:
+    pressed = [edge for edge in EDGES if edge.before.pressed]
+    assert len(pressed) > 1000
+    for edge in pressed:
+        assert edge.after.stopped
+        assert edge.after.fault >= edge.before.fault
+        assert edge.trigger == "release" or edge.after.pressed
+
+
+def test_a_released_emergency_stop_stays_a_latched_stop() -> None:
+    for edge in EDGES:
+        if edge.trigger == "release":
+            assert edge.after == edge.before._replace(pressed=False)
+
+
+def test_a_press_always_ends_in_a_latched_stop_with_a_new_number() -> None:
+    for edge in EDGES:
+        if edge.trigger == "press":
+            assert edge.after == edge.before._replace(stopped=True, pressed=True)
+            (before, after) = (latches.stop for latches in edge.latches)
+            assert after is not None
+            assert before is None or after.number > before.number
 
 
 def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -> None:
@@ -731,7 +835,7 @@ def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -
 def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
     for edge in EDGES:
         if edge.trigger == "clear without a number" and edge.pause_s > LOOK_FIRST_S:
-            assert edge.refused == edge.before.shutting_down
+            assert edge.refused == (edge.before.shutting_down or edge.before.pressed)
 
 
 def test_nothing_but_activate_ends_inactive() -> None:
@@ -787,7 +891,7 @@ def test_driving_begins_only_without_any_latch() -> None:
     driving = [edge for edge in EDGES if edge.mode is Mode.DRIVING]
     assert driving
     for edge in driving:
-        assert edge.after == State(False, False, False, False, True, True, False)
+        assert edge.after == State(False, False, False, False, True, True, False, False)
 
 
 def test_latches_stay_the_same_object_until_one_changes() -> None:

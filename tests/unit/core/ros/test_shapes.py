@@ -73,8 +73,9 @@ def test_state_is_the_same_field_by_field() -> None:
     left_out = set(STATE.__struct_fields__) - set(told.__struct_fields__)
     # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
     # An exported recording does not contain the configuration file, and the robot that a replay
-    # makes knows no speed limit, only the setting that it lowers.
+    # makes knows no speed limit, only the setting that it lowers. Diagnostics report the emergency
+    # stop, and `reason` says that it is pressed.
     assert left_out == {
         "stamp", "latencies", "encoder_counts", "latch", "latch_file_error", "settings_differ",
-        "speed_limit",
+        "speed_limit", "emergency_stop",
     }  # fmt: skip

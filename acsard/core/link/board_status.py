@@ -1,0 +1,133 @@
+"""Decodes the status line, with which a board reports its inputs and its supply.
+
+    !status estop=ok bumpers=..X. driver=ok volts=24.31 amps=-1.20 charge=87% temp=41.5*HHHH
+
+Every field is optional, in any order, and at most once. The line is sent beside the replies and
+never in their place, so it says nothing about the speeds and does not count as a reply. Decoding is
+strict: a line counts as a whole or not at all. The forms make damage visible:
+
+- The words of an input differ in many bits, so no small damage turns `pressed` into `ok`.
+- Each number has a fixed number of decimals or ends with `%`, so a number that was cut is refused.
+
+After `*` comes the CRC-16/XMODEM of everything before it. A checked link requires it.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from functools import lru_cache
+
+from msgspec import Struct
+from msgspec.structs import astuple
+
+from acsard.core.link.codec import FrameError
+
+STATUS = b"!status"
+"""Begins every status line. A reply begins with a letter, and an identity with other letters."""
+
+_LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
+
+_FORMS = {
+    b"estop": re.compile(rb"ok|pressed"),
+    b"bumpers": re.compile(rb"[.X]{1,4}"),
+    b"driver": re.compile(rb"ok|fault"),
+    b"volts": re.compile(rb"[0-9]{1,2}\.[0-9]{2}"),
+    b"amps": re.compile(rb"-?[0-9]{1,3}\.[0-9]{2}"),
+    b"charge": re.compile(rb"(?:100|[0-9]{1,2})%"),
+    b"temp": re.compile(rb"-?[0-9]{1,3}\.[0-9]"),
+}
+"""The form of each field's value."""
+
+
+class BoardStatus(Struct, frozen=True):
+    """The fields of one status line. None stands for a field that the line does not have."""
+
+    estop: bool | None = None
+    """Whether the emergency stop is pressed."""
+    bumpers: tuple[bool, ...] | None = None
+    """Whether each bumper is pressed, in the order of the board, 1 to 4 values."""
+    driver_fault: bool | None = None
+    """Whether a motor driver reports a fault."""
+    volts: float | None = None
+    """Voltage of the battery, V."""
+    amps: float | None = None
+    """Current of the battery, A. It is negative while the battery discharges."""
+    charge: float | None = None
+    """State of charge of the battery, 0 to 1."""
+    temperature: float | None = None
+    """Temperature of the board, degrees Celsius."""
+
+
+def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
+    """Return the fields of `newer`, and those of `status` that `newer` does not have."""
+    pairs = zip(astuple(status), astuple(newer), strict=True)
+    return BoardStatus(*[old if new is None else new for old, new in pairs])
+
+
+def shown(status: BoardStatus) -> dict[str, str]:
+    """Return the fields as text for `diagnostics`, by a name with its unit."""
+    bumpers = status.bumpers
+    values = {
+        "emergency_stop": _word(status.estop, "pressed", "released"),
+        "bumpers": None if bumpers is None else "".join("X" if one else "." for one in bumpers),
+        "motor_driver": _word(status.driver_fault, "fault", "ok"),
+        "volts": None if status.volts is None else f"{status.volts:.2f}",
+        "amperes": None if status.amps is None else f"{status.amps:.2f}",
+        "charge": None if status.charge is None else f"{status.charge:.2f}",
+        "temperature_c": None if status.temperature is None else f"{status.temperature:.1f}",
+    }
+    return {name: value for name, value in values.items() if value is not None}
+
+
+# A board at rest sends the same line again and again.
+@lru_cache(8)
+def decode_status(line: bytes, check: bool) -> BoardStatus:
+    """Return the fields of a status line without its end.
+
+    Args:
+        line: The line, which begins with `STATUS`.
+        check: Whether the line must have a checksum. A checksum that it has must be right anyway.
+
+    Raises:
+        FrameError: The line is damaged, or it has an unknown field.
+    """
+    match = _LINE.fullmatch(line)
+    if match is None:
+        raise FrameError("status_malformed", line)
+    body, crc = match.groups()
+    if crc is None:
+        if check:
+            raise FrameError("status_without_crc", line)
+    elif binascii.crc_hqx(line[:-5], 0) != int(crc, 16):
+        raise FrameError("status_crc_error", line)
+    found: dict[bytes, bytes] = {}
+    for field in body.split():
+        name, _, value = field.partition(b"=")
+        form = _FORMS.get(name)
+        if form is None or name in found or form.fullmatch(value) is None:
+            raise FrameError("status_malformed", line)
+        found[name] = value
+    return BoardStatus(
+        estop=_is(found, b"estop", b"pressed"),
+        bumpers=tuple([mark == 0x58 for mark in found[b"bumpers"]])
+        if b"bumpers" in found
+        else None,
+        driver_fault=_is(found, b"driver", b"fault"),
+        volts=_number(found, b"volts"),
+        amps=_number(found, b"amps"),
+        charge=None if b"charge" not in found else int(found[b"charge"][:-1]) / 100,
+        temperature=_number(found, b"temp"),
+    )
+
+
+def _word(value: bool | None, yes: str, no: str) -> str | None:
+    return None if value is None else yes if value else no
+
+
+def _is(found: dict[bytes, bytes], name: bytes, word: bytes) -> bool | None:
+    return found[name] == word if name in found else None
+
+
+def _number(found: dict[bytes, bytes], name: bytes) -> float | None:
+    return float(found[name]) if name in found else None

@@ -1,0 +1,61 @@
+"""The Arduino example of the firmware's page sends status lines that the daemon takes."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from acsard.core.link.board_status import decode_status
+
+PAGE = Path(__file__).parents[2] / "deploy" / "firmware" / "README.md"
+
+ARDUINO = """
+#include <string.h>
+static char sent[4096];
+static int pin;
+static unsigned long now;
+static void print(const char *text) { strcat(sent, text); }
+static struct { void (*print)(const char *); } Serial = {print};
+static int digitalRead(int which) { return pin; }
+static unsigned long millis(void) { return now; }
+"""
+"""The functions of Arduino that the example uses, for a program on this machine."""
+
+TEST = """
+const char *run(int level, unsigned long at) {
+    sent[0] = 0;
+    pin = level;
+    now = at;
+    sendStatus();
+    return sent;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def sketch(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc")
+    blocks = PAGE.read_text(encoding="utf-8").split("```")
+    (code,) = [block for block in blocks if "void sendStatus()" in block]
+    assert len(code.strip().splitlines()) <= 10
+    place = tmp_path_factory.mktemp("sketch")
+    (place / "sketch.c").write_text(ARDUINO + code + TEST, encoding="utf-8")
+    command = ["gcc", "-shared", "-fPIC", "-Wall", "-o", "sketch.so", "sketch.c"]
+    subprocess.run(command, cwd=place, check=True)
+    library = ctypes.CDLL(str(place / "sketch.so"))
+    library.run.restype = ctypes.c_char_p
+    library.run.argtypes = (ctypes.c_int, ctypes.c_ulong)
+    return library
+
+
+def test_the_example_reports_ten_times_a_second_and_a_change_at_once(sketch: ctypes.CDLL) -> None:
+    told = [(at, line) for at in range(1000) if (line := sketch.run(350 <= at < 620, at))]
+    pressed = {at for at, line in told if decode_status(line.removesuffix(b"\r\n"), False).estop}
+    assert all(line.endswith(b"\r\n") for _, line in told)
+    assert pressed == {350, 450, 550}
+    assert {at for at, _ in told} - pressed == {0, 100, 200, 300, 620, 720, 820, 920}

@@ -1,0 +1,222 @@
+"""Status lines: every form, every refusal, and damage that must never look like a release."""
+
+from __future__ import annotations
+
+import binascii
+import random
+from collections import Counter
+
+import pytest
+
+from acsard.core.config.settings import WheelMap
+from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged, shown
+from acsard.core.link.checksum import unseal
+from acsard.core.link.codec import Codec, FrameError
+from acsard.core.motion.emergency_stop import SILENT_S, EmergencyStop
+from acsard.core.simulator import protocol
+from acsard.core.values import NS_PER_S
+from tests.each import each
+
+FULL = b"!status estop=ok bumpers=..X. driver=fault volts=24.31 amps=-1.20 charge=87% temp=-4.5"
+OK, PRESSED = b"!status estop=ok", b"!status estop=pressed"
+REPLIES = (
+    b"ap12.50,bn08.75,cp15.00,dn10.25",
+    b"ap1.5, bn8.75, cp15.000, dn10.25,",
+    b"ap12.50,bn08.75,cp15.00,dn10.25#07*585F",
+    b"ap00.00,bp00.00,cp00.00,dp00.00#07@0102AAAABBBBCCCCDDDD*1234",
+)
+
+
+def sealed(line: bytes) -> bytes:
+    return line + b"*%04X" % binascii.crc_hqx(line, 0)
+
+
+# forms
+
+
+@each("check", [False, True])
+def test_each_field_is_read(check: bool) -> None:
+    line = sealed(FULL) if check else FULL
+    assert decode_status(line, check) == BoardStatus(
+        estop=False, bumpers=(False, False, True, False), driver_fault=True, volts=24.31,
+        amps=-1.2, charge=0.87, temperature=-4.5,
+    )  # fmt: skip
+
+
+@each(
+    ("fields", "status"),
+    [
+        (b"estop=pressed", BoardStatus(estop=True)),
+        (b"volts=7.05 estop=ok", BoardStatus(estop=False, volts=7.05)),
+        (b"bumpers=X", BoardStatus(bumpers=(True,))),
+        (b"driver=ok", BoardStatus(driver_fault=False)),
+        (b"charge=0%", BoardStatus(charge=0.0)),
+        (b"charge=100%", BoardStatus(charge=1.0)),
+        (b"amps=120.00", BoardStatus(amps=120.0)),
+        (b"temp=101.5", BoardStatus(temperature=101.5)),
+    ],
+)
+def test_each_field_is_optional_and_the_order_is_free(fields: bytes, status: BoardStatus) -> None:
+    assert decode_status(STATUS + b" " + fields, False) == status
+
+
+@each(
+    "line",
+    [
+        b"!status", b"!status ", b"!statusestop=ok", b"!status  estop=ok", b"!status estop=ok ",
+        b"!status estop=ok estop=ok", b"!status estop=ok estop=pressed", b"!status estop=0",
+        b"!status estop=OK", b"!status estop=", b"!status estop", b"!status =ok",
+        b"!status estop=ok!status estop=pressed", b"!status estop=ok,", b"!status brakes=ok",
+        b"!status bumpers=", b"!status bumpers=.....", b"!status bumpers=01",
+        b"!status volts=24", b"!status volts=24.3", b"!status volts=24.311",
+        b"!status volts=124.31",
+        b"!status volts=-1.00", b"!status amps=1.5", b"!status amps=+1.50", b"!status charge=87",
+        b"!status charge=101%", b"!status charge=8.7%", b"!status temp=41", b"!status temp=nan",
+        b"!status estop=ok ap00.00,bp00.00,cp00.00,dp00.00", b"!status estop=ok\0",
+        b"!status\testop=ok", b"!status estop=ok*12", b"!status estop=ok*9c94",
+    ],
+)  # fmt: skip
+def test_any_other_form_is_refused_whole(line: bytes) -> None:
+    with pytest.raises(FrameError) as caught:
+        decode_status(line, False)
+    assert caught.value.reason == "status_malformed"
+
+
+def test_a_checksum_must_be_right_and_a_checked_link_requires_it() -> None:
+    assert sealed(OK) == b"!status estop=ok*9C94"
+    assert decode_status(sealed(OK), True) == decode_status(OK, False)
+    with pytest.raises(FrameError) as caught:
+        decode_status(OK, True)
+    assert caught.value.reason == "status_without_crc"
+    for check in (False, True):
+        with pytest.raises(FrameError) as caught:
+            decode_status(b"!status estop=ok*9C95", check)
+        assert caught.value.reason == "status_crc_error"
+
+
+@each("check", [False, True])
+@each("word", ["ok", "pressed"])
+def test_the_simulated_board_writes_the_same_line(word: str, check: bool) -> None:
+    line = protocol.status(word, check)
+    assert line == (sealed(b"!status estop=" + word.encode()) if check else
+                    b"!status estop=" + word.encode()) + b"\r\n"  # fmt: skip
+
+
+def test_a_field_keeps_its_last_value_until_a_newer_line_has_it() -> None:
+    status = merged(decode_status(FULL, False), BoardStatus(estop=True, volts=23.9))
+    assert (status.estop, status.volts, status.amps) == (True, 23.9, -1.2)
+    assert shown(status) == {
+        "emergency_stop": "pressed", "bumpers": "..X.", "motor_driver": "fault",
+        "volts": "23.90", "amperes": "-1.20", "charge": "0.87", "temperature_c": "-4.5",
+    }  # fmt: skip
+    assert shown(BoardStatus()) == {}
+
+
+# confusion
+
+
+@each("line", [OK, PRESSED, FULL, sealed(OK), sealed(FULL)])
+def test_a_status_line_is_no_reply_in_any_dialect(line: bytes) -> None:
+    for comma in (False, True):
+        with pytest.raises(FrameError):
+            Codec(WheelMap(), comma).decode(line)
+    with pytest.raises(FrameError):
+        unseal(line)
+    assert protocol.whole(line) is protocol.plain_only(line) is protocol.prefix(line) is None
+    assert protocol.latched(line + b",").values == {}
+
+
+@each("reply", REPLIES)
+def test_no_reply_with_two_wrong_bits_or_a_cut_is_a_status_line(reply: bytes) -> None:
+    whole = int.from_bytes(reply, "big")
+    bits = 8 * len(reply)
+    for one in range(bits):
+        for other in range(one):
+            damaged = (whole ^ 1 << one ^ 1 << other).to_bytes(len(reply), "big")
+            assert not damaged.startswith(STATUS)
+    assert not any(reply[cut:].startswith(STATUS) for cut in range(len(reply)))
+
+
+# damage
+
+
+def damaged(line: bytes, others: tuple[bytes, ...], dice: random.Random) -> bytes:
+    """Return the line after one kind of damage that a wire, an adapter or a full buffer does.
+
+    `others` are the lines that may follow it.
+    """
+    data, place = bytearray(line), dice.randrange(len(line))
+    match dice.randrange(8):
+        case 0:
+            data[place] ^= 1 << dice.randrange(8)
+        case 1:
+            for _ in range(dice.randint(2, 6)):
+                data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+        case 2:
+            del data[place:]
+        case 3:
+            del data[:place]
+        case 4:
+            del data[place : place + dice.randint(1, 8)]
+        case 5:
+            data[place:place] = dice.choice(others)[: dice.randint(1, 40)]
+        case 6:
+            data[place : place + 4] = dice.randbytes(4)
+        case _:
+            # The end of one line is lost, and the beginning of the next one.
+            del data[place:]
+            data += dice.choice(others)[dice.randrange(16) :]
+    return bytes(data)
+
+
+def wrongly_taken(count: int, check: bool) -> Counter[str]:
+    """Damage `count` lines, and count the accepted ones whose emergency stop is wrong."""
+    dice, taken = random.Random(33), Counter[str]()
+    extra = (b"", b" volts=24.31", b" bumpers=..X. volts=24.31 charge=87%")
+    for _ in range(count):
+        pressed = dice.random() < 0.5
+        # A line with another emergency stop would be true, because it is the later one.
+        word = PRESSED if pressed else OK
+        line = word + dice.choice(extra)
+        others = (word, *REPLIES)
+        heard = damaged(sealed(line) if check else line, others, dice)
+        if not heard.startswith(STATUS):
+            continue
+        try:
+            status = decode_status.__wrapped__(heard, check)
+        except FrameError:
+            continue
+        if status.estop is not None:
+            right = (
+                "right" if status.estop is pressed else "pressed" if status.estop else "released"
+            )
+            taken[right] += 1
+    return taken
+
+
+@each("check", [False, True])
+@pytest.mark.parametrize(
+    "count",
+    [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
+)
+def test_damage_makes_no_release_of_a_press(count: int, check: bool) -> None:
+    taken = wrongly_taken(count, check)
+    print(f"\n{count} damaged status lines, checked {check}: {dict(taken)}")
+    assert taken["released"] == 0
+    assert taken["pressed"] == 0
+
+
+def test_only_half_a_second_of_damage_is_a_false_press() -> None:
+    """Of each two lines one is damaged: each false press is a run of five lines, and no other."""
+    dice, estop = random.Random(5), EmergencyStop("auto")
+    step_ns, presses, runs, last_ns = NS_PER_S // 100, 0, 0, 0
+    for step in range(200_000):
+        now_ns, reports = step * step_ns, []
+        if step % 10 == 0 and (step == 0 or dice.random() < 0.5):
+            reports = [(now_ns, decode_status(OK, False).estop)]
+            last_ns = now_ns
+        estop.look(reports, now_ns)
+        presses += bool(estop.pressed_now)
+        runs += now_ns - last_ns == int(SILENT_S * NS_PER_S) + step_ns
+    assert presses == runs
+    assert 100 < presses < 1000

@@ -1,0 +1,156 @@
+"""Tests of the emergency-stop input: its states, its silence, and a computer that was late."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import get_args
+
+import pytest
+
+from acsard.core.config.settings import EstopUse
+from acsard.core.motion.emergency_stop import (
+    MENDS,
+    PRESSED,
+    SILENT,
+    TABLE,
+    WORDS,
+    EmergencyStop,
+    Sign,
+)
+from acsard.core.values import EstopState
+from tests.each import each
+
+MS = 1_000_000
+
+DRAWN = """
+              ok        pressed   silence
+    unknown   released  pressed   unknown
+    released  released  pressed   silent
+    pressed   released  pressed   pressed
+    silent    released  pressed   silent
+"""
+"""The whole table drawn by hand."""
+
+
+class Input:
+    """An input with its time. The first step is at 10 s."""
+
+    def __init__(self, use: EstopUse = "auto") -> None:
+        self.estop = EmergencyStop(use)
+        self.now_ms = 10_000
+        self.events: list[str] = []
+
+    def step(self, *reports: bool | None, ms: int = 10) -> str:
+        """Take these reports `ms` after the step before, and return the state."""
+        self.now_ms += ms
+        told = [(self.now_ms * MS, pressed) for pressed in reports]
+        self.events += [event.name for event in self.estop.look(told, self.now_ms * MS)]
+        return self.estop.state
+
+    def quiet(self, ms: int) -> str:
+        """Take steps without a report for so long."""
+        for _ in range(ms // 10):
+            self.step()
+        return self.estop.state
+
+
+def test_the_table_is_the_one_drawn_by_hand() -> None:
+    head, *rows = [line.split() for line in DRAWN.strip().splitlines()]
+    drawn = {(row[0], sign): cell for row in rows for sign, cell in zip(head, row[1:], strict=True)}
+    assert {state or "unknown" for state in get_args(EstopState)} == {row[0] for row in rows}
+    assert set(get_args(Sign)) == set(head)
+    for state, sign in product(get_args(EstopState), get_args(Sign)):
+        assert (TABLE.get((state, sign), state) or "unknown") == drawn[state or "unknown", sign]
+
+
+def test_each_state_that_counts_as_pressed_has_words_and_a_remedy() -> None:
+    assert WORDS == {"pressed": PRESSED, "silent": SILENT}
+    assert set(MENDS) == {PRESSED, SILENT}
+
+
+def test_an_input_that_is_never_reported_is_never_pressed() -> None:
+    pin = Input()
+    assert pin.quiet(2000) == pin.step(None) == ""
+    assert (pin.estop.held, pin.events) == ("", [])
+
+
+def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
+    pin = Input()
+    pin.step(False)
+    assert pin.step(True) == "pressed"
+    assert pin.estop.pressed_now == pin.estop.held == PRESSED
+    assert pin.step(True) == "pressed"
+    assert (pin.estop.pressed_now, pin.estop.held) == ("", PRESSED)
+    assert pin.step(False) == "released"
+    assert pin.estop.held == ""
+    assert pin.events == ["emergency_stop_released", "emergency_stop", "emergency_stop_released"]
+
+
+def test_a_press_and_its_release_in_one_read_still_count() -> None:
+    pin = Input()
+    pin.step(False)
+    assert pin.step(True, False) == "released"
+    assert (pin.estop.pressed_now, pin.estop.held) == (PRESSED, "")
+
+
+def test_the_first_report_may_be_a_press() -> None:
+    pin = Input()
+    assert pin.step(True) == "pressed"
+    assert pin.estop.pressed_now == PRESSED
+
+
+def test_half_a_second_without_the_input_counts_as_pressed() -> None:
+    pin = Input()
+    pin.step(False)
+    assert pin.quiet(500) == "released"
+    assert pin.step(None) == "silent"
+    assert pin.estop.pressed_now == pin.estop.held == SILENT
+    assert pin.quiet(1000) == "silent"
+    assert pin.estop.pressed_now == ""
+    assert pin.step(True) == "pressed"
+    assert pin.estop.pressed_now == PRESSED
+    assert pin.quiet(1000) == "pressed"
+    assert pin.step(False) == "released"
+
+
+def test_lines_without_the_field_do_not_count_as_reports_of_it() -> None:
+    pin = Input()
+    pin.step(False)
+    for _ in range(6):
+        state = pin.step(None, ms=100)
+    assert state == "silent"
+
+
+def test_a_late_computer_first_reads_the_lines_that_waited() -> None:
+    pin = Input()
+    pin.step(False)
+    assert pin.step(ms=3000) == "released"
+    assert pin.step(False) == "released"
+    # Without a line within 0.1 s after the stall the silence counts.
+    assert pin.step(ms=3000) == "released"
+    assert pin.quiet(100) == "released"
+    assert pin.step() == "silent"
+
+
+def test_a_computer_that_is_always_late_is_excused_once() -> None:
+    pin = Input()
+    pin.step(False)
+    states = [pin.step(ms=200) for _ in range(5)]
+    assert states == ["released", "released", "released", "silent", "silent"]
+
+
+@each("state", [True, False])
+def test_a_robot_without_the_input_ignores_reports(state: bool) -> None:
+    pin = Input("off")
+    assert pin.step(state) == pin.quiet(1000) == ""
+    assert (pin.estop.pressed_now, pin.estop.missing, pin.events) == ("", False, [])
+
+
+@pytest.mark.parametrize("use", ["auto", "required"])
+def test_a_required_input_is_missing_until_the_first_report(use: EstopUse) -> None:
+    pin = Input(use)
+    assert pin.estop.missing == (use == "required")
+    pin.step(None)
+    assert pin.estop.missing == (use == "required")
+    pin.step(True)
+    assert not pin.estop.missing
