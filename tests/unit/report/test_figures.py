@@ -126,7 +126,7 @@ def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:
     assert max(column(waits["x"])) > 1500  # in ms
     rows = [note["text"] for note in figures["sources"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
-    assert "Silent all the time: app, ros2_control." in figures["sources"].caption
+    assert "Silent all the time: app, ros2_control, dock." in figures["sources"].caption
 
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
