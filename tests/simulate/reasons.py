@@ -94,6 +94,8 @@ class _Heard:
         self.armed_ns = -1
         self.clock: _Clock | None = None
         self.foreign = self.shared = False
+        self.stamped = False
+        """A program with this identity has stamped its commands, so its zeros may have been late."""
 
 
 class Reasons:
@@ -123,6 +125,7 @@ class Reasons:
         heard = self._heard.setdefault(source, {}).setdefault(one.identity, _Heard())
         heard.arrived_ns, heard.armed_ns = at_ns, wish.armed_ns
         heard.shared = one.shared
+        heard.stamped |= bool(one.clock)
         heard.foreign = sender["way"] in FOREIGN
         if wish.v or wish.w:
             heard.speed_ns = at_ns
@@ -208,7 +211,9 @@ class Reasons:
         timeout_ns = witness.timeout[source]
         for heard in self._live(source, now_ns):
             clock, certain = heard.clock, not (heard.shared and source in self._junk)
-            if clock is not None:
+            if clock is None:
+                certain &= not heard.stamped
+            else:
                 certain &= clock.known(heard.armed_ns, timeout_ns)
                 may_be_known = not heard.foreign or clock.may_be_known(now_ns, timeout_ns)
                 if not clock.steady and may_be_known:
