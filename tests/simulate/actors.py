@@ -460,7 +460,7 @@ class Run:
         self.resumed_ns = product.now_ns
         product.step_wall(lasts_ns / NS)
         self.witness.suspended(true_ns + lasts_ns)
-        self.reasons.restart()
+        self.reasons.restart(stood=True)
         self.at(self.true_ns + 20_000_000, lambda: self.plug(False))
 
     def _restart(self, event: dict[str, Any], after_ns: int) -> None:
@@ -590,6 +590,8 @@ class Run:
                 witness.ages.clocks[clock].followed = True
         self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
+        if seen.link == "up" and not witness.linked:
+            witness.linked_ns = true_ns
         witness.linked = seen.link == "up"
         # Lines without the check that the configuration requires make no link.
         self._linked |= witness.linked

@@ -95,7 +95,7 @@ class _Heard:
         self.clock: _Clock | None = None
         self.foreign = self.shared = False
         self.stamped = False
-        """A program with this identity has stamped its commands, so its zeros may have been late."""
+        """A program of this identity has stamped its commands: its zeros may have been late."""
 
 
 class Reasons:
@@ -106,8 +106,12 @@ class Reasons:
         self._ready_ns = self._looked_ns = self._calm_ns = -1
         self.restart()
 
-    def restart(self) -> None:
-        """Forget all senders: another daemon starts, or the robot's clock stood."""
+    def restart(self, stood: bool = False) -> None:
+        """Forget all senders: another daemon starts, or the robot's clock `stood`.
+
+        A daemon whose clock stood still knows the delays from before, so they look changed to it.
+        """
+        self._stood = stood
         self._clocks: dict[str, _Clock] = {}
         self._heard: dict[str, dict[str, _Heard]] = {}
         self._junk: set[str] = set()
@@ -216,7 +220,7 @@ class Reasons:
             else:
                 certain &= clock.known(heard.armed_ns, timeout_ns)
                 may_be_known = not heard.foreign or clock.may_be_known(now_ns, timeout_ns)
-                if not clock.steady and may_be_known:
+                if may_be_known and (not clock.steady or self._stood):
                     found.add("late")
                 # A foreign clock that was known is not new again, however late it becomes.
                 if not (clock.known(now_ns, timeout_ns) or (heard.foreign and clock.proved)):
