@@ -21,7 +21,7 @@ class Course:
         """The command, the wheel speeds and the time at which the limits were last changed."""
         self._since_ns = self._lines = 0
         self._goal: tuple[object, ...] = ()
-        """The command, and the time at which the limits were last changed."""
+        """The command, and the times at which the limits and the mode were last changed."""
         self._from_ns = self._line_ns = 0
         """Time of the line from which the ramp to this command began, and of the last line."""
         self._from: tuple[float, ...] = ZERO
@@ -68,7 +68,7 @@ class Course:
         """Judge that the ramp to a command ends in time."""
         witness = self._witness
         late_ns, self._line_ns = true_ns - self._line_ns, true_ns
-        goal, limits = (wish, witness.changed_ns), witness.limits
+        goal, limits = (wish, witness.changed_ns, witness.mode_ns), witness.limits
         # A speed changes by that much time at most from one line to the next.
         late = late_ns > max(NS // 20, 3 * witness.period_ns // 2)
         if wish is None or late or goal != self._goal or witness.unsure:

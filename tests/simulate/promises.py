@@ -52,7 +52,7 @@ STAND_NS = 2 * NS
 
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
-    "stalls", "sparse_replies", "echo", "plain_only", "endless", "wrong_baud",
+    "stalls", "sparse_replies", "echo", "plain_only", "endless", "wrong_baud", "reset", "suspend",
 }  # fmt: skip
 """Troubles of the board for which the robot may not latch a fault."""
 
@@ -135,6 +135,8 @@ class Witness:
         self.ending_ns: int | None = None
         """When the daemon got SIGTERM."""
         self.fault_ns: int | None = None
+        self.mode_ns = 0
+        """Time of the last change of the mode."""
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
         self.lies: list[tuple[str, tuple[Any, ...]]] = []
@@ -384,6 +386,7 @@ class Witness:
                 self.fault_ns = at_ns
         if mode != self.mode:
             self.counts[f"mode {mode}"] += 1
+            self.mode_ns = at_ns
         self.mode, self.reason = mode, reason
 
     @property
