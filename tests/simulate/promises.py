@@ -126,8 +126,8 @@ class Witness:
         """Begin and end of the host's last stall, or of several that follow each other."""
         self.stops: list[int] = []
         """Arrivals of the stops that no clear has released."""
-        self.perhaps_latched = False
-        """Whether a latch may be in force that is not certain, since the daemon ended."""
+        self.perhaps_latched: set[str] = set()
+        """Calls that may have to release a latch, which is not certain since the daemon ended."""
         self.offs: list[int] = []
         """Arrivals of each `deactivate` that no `activate` has released."""
         self.dormant_ns: int | None = None
@@ -272,12 +272,12 @@ class Witness:
         if "still" in text:
             self.unfaulted_ns = asked_ns
             return
-        self.perhaps_latched = False
+        self.perhaps_latched.discard("clear")
         self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
 
     def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
         """Note an `activate` that worked, as the daemon says."""
-        self.perhaps_latched = False
+        self.perhaps_latched.discard("activate")
         if self.dormant_ns is not None or self.offs:
             self.arming(asked_ns)
         self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
@@ -324,7 +324,10 @@ class Witness:
 
         It may be in force after the restart, or not.
         """
-        self.perhaps_latched = True
+        if verb in ("stop", "clear"):
+            self.perhaps_latched.add("clear")
+        elif verb in ("activate", "deactivate"):
+            self.perhaps_latched.add("activate")
         match verb:
             case "stop":
                 self.stops = [at_ns for at_ns in self.stops if at_ns != arrived_ns]
@@ -343,7 +346,7 @@ class Witness:
 
     def file_is_behind(self) -> None:
         """Note that the daemon ended before it wrote the latches in force into the file."""
-        self.perhaps_latched = True
+        self.perhaps_latched |= {"clear", "activate"}
         self.stops.clear()
         self.offs.clear()
         self.fault_ns = None

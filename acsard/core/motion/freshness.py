@@ -344,14 +344,20 @@ class Freshness:
     def _forget(self, now_ns: int) -> None:
         """Forget the clocks that were silent for long, and any above the limit.
 
-        A recording begins with all of them, which the loop writes in one step.
+        Above the limit, clocks that were never believed and are silent now go first. Below it they
+        stay, because the lowest delay of a steady clock holds from its first command on.
+        A recording begins with all clocks, which the loop writes in one step.
         """
-        for held, silent_ns in ((self._newcomers, GAP_NS), (self._clocks, KEEP_NS)):
-            while held and now_ns - _oldest(held).at_ns > silent_ns:
+        both = [held for held in (self._newcomers, self._clocks) if held]
+        for held in both:
+            while held and now_ns - _oldest(held).at_ns > KEEP_NS:
                 del held[next(iter(held))]
         if len(self._newcomers) + len(self._clocks) > MAX_CLOCKS:
-            both = [held for held in (self._newcomers, self._clocks) if held]
-            held = min(both, key=lambda clocks: _oldest(clocks).at_ns)
+            both = [held for held in both if held]
+            if now_ns - _oldest(both[0]).at_ns > GAP_NS:
+                held = both[0]
+            else:
+                held = min(both, key=lambda clocks: _oldest(clocks).at_ns)
             del held[next(iter(held))]
 
 

@@ -411,6 +411,13 @@ def test_a_silence_does_not_make_a_known_steady_clock_forget_its_lowest_delay() 
     assert set(clock.steadily(8000.0, 1000)) == {"stale"}
 
 
+def test_a_new_steady_clock_that_is_silent_among_others_keeps_its_lowest_delay() -> None:
+    clock = Clock(known=False, steady=True)
+    clock.sends(3000.0)
+    clock.sends(0.0, 2500.0, name="another")
+    assert set(clock.steadily(8000.0, 10_000)) == {"stale"}
+
+
 def test_a_foreign_clock_is_forgiven_a_second_and_a_second_more_each_minute() -> None:
     clock = Clock()
     late, forgiven = 0.0, 0.0
