@@ -150,6 +150,7 @@ class Robot:
             encoders=session.count_recovery.counts,
             sender=self._choice.sender,
             estop=self._estop.state,
+            bumpers=self.session.status.bumpers,
             board=self._board(now_ns),
         )
 

@@ -281,6 +281,12 @@ class RobotState(Message, frozen=True):
 
     `silent` means that the board no longer reports it, which counts as pressed.
     """
+    bumpers: list[bool] | None = None
+    """Whether each bumper counts as pressed, in the order of the board, 1 to 4 values.
+
+    Null if the board has never reported its bumpers. If it no longer reports them, each value is
+    true.
+    """
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
