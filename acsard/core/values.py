@@ -482,6 +482,8 @@ class Snapshot(Struct, frozen=True):
     estop: EstopState = ""
     bumpers: tuple[bool, ...] | None = None
     """Whether each bumper counts as pressed, in the order of the board, None if never reported."""
+    bumper: str = ""
+    """Why a bumper counts as pressed, in words; "" while none does."""
     board: dict[str, str] = {}
     """The fields of the board's last status line, by name, as text."""
     check: str = "plain"

@@ -58,6 +58,8 @@ def warnings(config: Config) -> list[str]:
         found.append(
             'safety.estop = "off": the robot ignores an emergency stop that its board reports'
         )
+    if config.safety.bumper == "off":
+        found.append('safety.bumper = "off": the robot ignores bumpers that its board reports')
     status_use = wire_use(STATUS_HZ, config.mcu.baud_rate, STATUS_BYTES)
     if config.safety.estop == "required" and use + status_use > 1.0:
         left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
@@ -208,6 +210,15 @@ def _source_problems(config: Config) -> list[str]:
     return found
 
 
+def _bumper_problems(config: Config) -> list[str]:
+    if config.safety.bumper != "away" or config.safety.bumpers:
+        return []
+    return [
+        'safety.bumper = "away" needs the place of each bumper, but safety.bumpers = []; write '
+        'safety.bumpers = ["front", "rear"] in the order of the board, or safety.bumper = "stop"'
+    ]
+
+
 def _reachability_problems(config: Config) -> list[str]:
     """Find a configuration in which no client, or no client over TLS, could reach the daemon."""
     bus, found = config.bus, []
@@ -313,6 +324,7 @@ RULES: tuple[Rule, ...] = (
     _gyro_problems,
     *motion_rules.RULES,
     _source_problems,
+    _bumper_problems,
     _reachability_problems,
     lambda config: _endpoint_problems(config, "listen"),
     lambda config: _endpoint_problems(config, "connect"),

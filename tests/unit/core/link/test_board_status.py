@@ -213,7 +213,7 @@ def test_only_half_a_second_of_damage_is_a_false_press() -> None:
     for step in range(200_000):
         now_ns, reports = step * step_ns, []
         if step % 10 == 0 and (step == 0 or dice.random() < 0.5):
-            reports = [(now_ns, decode_status(OK, False).estop)]
+            reports = [(now_ns, decode_status(OK, False))]
             last_ns = now_ns
         estop.look(reports, now_ns)
         presses += bool(estop.pressed_now)
