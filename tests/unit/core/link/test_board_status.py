@@ -5,13 +5,15 @@ from __future__ import annotations
 import binascii
 import random
 from collections import Counter
+from contextlib import suppress
 
 import pytest
 
-from acsard.core.config.settings import WheelMap
+from acsard.core.config.settings import Place, SafetyConfig, WheelMap
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged, shown
 from acsard.core.link.checksum import unseal
 from acsard.core.link.codec import Codec, FrameError
+from acsard.core.motion.bumpers import Bumpers
 from acsard.core.motion.emergency_stop import SILENT_S, EmergencyStop
 from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S
@@ -204,6 +206,37 @@ def test_damage_makes_no_release_of_a_press(count: int, check: bool) -> None:
     print(f"\n{count} damaged status lines, checked {check}: {dict(taken)}")
     assert taken["released"] == 0
     assert taken["pressed"] == 0
+
+
+@each("check", [False, True])
+@pytest.mark.parametrize(
+    "count",
+    [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
+)
+@pytest.mark.parametrize("places", [("front", "rear", "left", "right"), ()])
+def test_damage_makes_no_release_of_a_pressed_bumper(
+    places: tuple[Place, ...], count: int, check: bool
+) -> None:
+    dice, extra = random.Random(34), (b"", b" volts=24.31", b" driver=ok temp=41.5")
+    # A release stays until the next line that counts, so each damaged line has bumpers of its own.
+    for number in range(count // 4):
+        bumpers, marks = Bumpers(SafetyConfig(bumpers=places)), bytearray(b"....")
+        for pressed in dice.sample(range(4), dice.randint(1, 4)):
+            marks[pressed] = b"X"[0]
+        line = STATUS + b" bumpers=" + marks + dice.choice(extra)
+        line = sealed(line) if check else line
+        whole = [(number, decode_status.__wrapped__(line, check))]
+        bumpers.look(whole, number)
+        for _ in range(4):
+            heard = damaged(line, (line, *REPLIES), dice)
+            if heard.startswith(STATUS):
+                with suppress(FrameError):
+                    status = decode_status.__wrapped__(heard, check)
+                    bumpers.look([(number, status)], number)
+            assert bumpers.state == "pressed", (number, line, heard)
+            if not places:
+                # Without places only a single damaged line is known by its number of bumpers.
+                bumpers.look(whole, number)
 
 
 def test_only_half_a_second_of_damage_is_a_false_press() -> None:
