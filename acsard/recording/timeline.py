@@ -410,6 +410,7 @@ INCIDENTS = {
     "fault": "fault",
     "stop": "stop",
     "emergency_stop": "emergency stop",
+    "bumper_pressed": "bumper hit",
     "link_down": "lost port",
     "link_stale": "board silence",
     "link_late": "computer stall",
@@ -425,8 +426,8 @@ INCIDENTS = {
 """
 
 
-SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|stop|fault)s?\b")
-"""A stop or a fault in a summary."""
+SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|stop|fault)s?\b")
+"""A stop, a bumper hit or a fault in a summary."""
 
 
 def is_serious(text: str) -> bool:

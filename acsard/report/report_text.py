@@ -55,6 +55,10 @@ class Setting(NamedTuple):
     default: str
 
 
+PRESSES = {"emergency_stop": "emergency stop", "bumper_pressed": "bumper hit"}
+"""Words for the presses of the inputs that the board reports, by event."""
+
+
 def differences(config: Config) -> list[Setting]:
     """Return the settings that differ from their defaults.
 
@@ -89,8 +93,8 @@ def summary(data: ReportData) -> str:
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
     faults = many(counts["fault"], "fault")
-    pressed = counts["emergency_stop"]
-    by += f", {many(pressed, 'emergency stop')}" if pressed else ""
+    for name, word in PRESSES.items():
+        by += f", {many(counts[name], word)}" if counts[name] else ""
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
     late = counts["link_late"]
@@ -185,12 +189,12 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         for name, driven in data.driven.items()
     ]
     yield "Driven by", ", ".join(drivers) or "no source"
-    stops = (("fault", "Faults"), ("stop", "Stops"), ("emergency_stop", "Emergency stops"))
-    for name, title in stops:
+    titles = {name: f"{word.capitalize()}s" for name, word in PRESSES.items()}
+    for name, title in {"fault": "Faults", "stop": "Stops", **titles}.items():
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        # Few robots report their emergency stop, so only a press has a row.
-        if count or name != "emergency_stop":
+        # Few boards report these inputs, so only a press has a row.
+        if count or name not in PRESSES:
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial
     told = (

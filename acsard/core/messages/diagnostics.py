@@ -182,8 +182,8 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
     """Return the row of the board's inputs, or nothing if it reports none and none is required."""
     safety, bumpers = config.safety, snapshot.bumpers
-    required = safety.estop == "required"
-    if not (snapshot.board or required or safety.bumpers):
+    required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
+    if not (snapshot.board or required or needed):
         return []
     found = [BOARD[snapshot.estop]]
     if required and not snapshot.estop:
@@ -192,7 +192,7 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
         found.append((ERROR if snapshot.bumper == SILENT_BUMPERS else WARN, snapshot.bumper))
     elif bumpers is not None:
         found.append((OK, f"{many(len(bumpers), 'bumper')} released"))
-    elif safety.bumpers and safety.bumper != "off":
+    elif needed:
         found.append((ERROR, missing(safety)))
     if snapshot.board.get("motor_driver") == "fault":
         found.append((ERROR, DRIVER_FAULT))

@@ -206,6 +206,21 @@ def test_an_ignored_emergency_stop_is_a_warning() -> None:
     )
 
 
+def test_ignored_bumpers_are_a_warning() -> None:
+    (warning,) = warnings(Config(safety=SafetyConfig(bumper="off")))
+    assert warning == 'safety.bumper = "off": the robot ignores bumpers that its board reports'
+
+
+def test_motion_away_from_a_bumper_needs_its_place() -> None:
+    away = Config(safety=SafetyConfig(bumper="away"))
+    assert contradictions(away) == [
+        'safety.bumper = "away" needs the place of each bumper, but safety.bumpers = []; write '
+        'safety.bumpers = ["front", "rear"] in the order of the board, or safety.bumper = "stop"'
+    ]
+    placed = Config(safety=SafetyConfig(bumpers=("rear",), bumper="away"))
+    assert contradictions(placed) == []
+
+
 def test_a_required_emergency_stop_needs_room_on_a_slow_wire() -> None:
     slow = McuConfig(baud_rate=9600)
     config = Config(mcu=slow, control=ControlConfig(rate="auto"))
