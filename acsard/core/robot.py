@@ -195,7 +195,10 @@ class Robot:
         applied = self._limiter.twist
         link = self.session.link
         # `value` itself would run Python code of the enum.
-        status = (self._life.mode._value_, self._reason(), link, self._choice.source)
+        reason = self._reason()
+        if self._bumpers.limiting:
+            reason = self._with_bumper(reason)
+        status = (self._life.mode._value_, reason, link, self._choice.source)
         another, self._status = status != self._status, status
         # Otherwise neither the mode nor the commander has changed.
         if another or news:
@@ -492,12 +495,22 @@ class Robot:
 
     # Report.
 
+    def _with_bumper(self, reason: str) -> str:
+        """Return the reason with the motion that a pressed bumper allows."""
+        match self._life.mode:
+            case Mode.DRIVING:
+                return f"{reason}; {self._bumpers.note()}"
+            case Mode.READY:
+                return f"{self._bumpers.note()}; {reason}"
+            case _:
+                return reason
+
     def _reason(self) -> str:
         match self._life.mode:
-            case Mode.DRIVING | Mode.READY as mode:
-                driving = "driving: " if mode is Mode.DRIVING else ""
-                bumper = f"{self._bumpers.note()}; " if self._bumpers.limiting else ""
-                return f"{bumper}{driving}{chosen(self._choice)}{self.session.note}"
+            case Mode.DRIVING:
+                return f"driving: {chosen(self._choice)}{self.session.note}"
+            case Mode.READY:
+                return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
                 if self.session.link == "up":
                     return MISSING if self._estop.missing else missing(self.config.safety)

@@ -447,7 +447,7 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
         assert out.applied.angular == 0.0
     assert (out.mode, out.applied.linear) == ("driving", -0.1)
     assert out.reason == (
-        "front bumper pressed: only straight backwards, at most 0.1 m/s; driving: commanded by app"
+        "driving: commanded by app; front bumper pressed: only straight backwards, at most 0.1 m/s"
     )
 
 
