@@ -37,7 +37,7 @@ class Pins:
         return self.bumpers.state
 
     def quiet(self, ms: int) -> str:
-        """Take steps without a report for so long."""
+        """Take steps without a report for this time."""
         for _ in range(ms // 10):
             self.step()
         return self.bumpers.state
