@@ -24,7 +24,7 @@ def checked(
 
     `presses` has the input that the person presses for each name: 0 is the emergency stop.
     """
-    places = ("front",) * reports
+    places: tuple[Place, ...] = ("front",) * reports
     robot = Robot(*faults, config=Config(safety=SafetyConfig(bumpers=places)))
     shown: list[str] = []
 
