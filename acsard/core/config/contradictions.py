@@ -61,10 +61,13 @@ def warnings(config: Config) -> list[str]:
     if config.safety.bumper == "off":
         found.append('safety.bumper = "off": the robot ignores bumpers that its board reports')
     status_use = wire_use(STATUS_HZ, config.mcu.baud_rate, STATUS_BYTES)
-    if config.safety.estop == "required" and use + status_use > 1.0:
+    required = 'safety.estop = "required"' if config.safety.estop == "required" else ""
+    if config.safety.bumpers and config.safety.bumper != "off":
+        required = required or f"safety.bumpers = {show(config.safety.bumpers)}"
+    if required and use + status_use > 1.0:
         left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
         found.append(
-            f'safety.estop = "required": status lines take {status_use:.0%} of the wire at '
+            f"{required}: status lines take {status_use:.0%} of the wire at "
             f"{config.mcu.baud_rate} baud, and replies at control.rate = {config.rate_hz:g} do not "
             f"fit beside them; {left} Hz is comfortable"
         )

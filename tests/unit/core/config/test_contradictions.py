@@ -230,6 +230,10 @@ def test_a_required_emergency_stop_needs_room_on_a_slow_wire() -> None:
         'safety.estop = "required": status lines take 29% of the wire at 9600 baud, and replies at '
         "control.rate = 23 do not fit beside them; 14 Hz is comfortable"
     )
+    bumpers = SafetyConfig(bumpers=("front", "rear"))
+    (warning,) = warnings(replace(config, safety=bumpers))
+    assert warning.startswith('safety.bumpers = ["front", "rear"]: status lines take 29% of the')
+    assert len(warnings(replace(config, safety=replace(bumpers, bumper="off")))) == 1
     safe = SafetyConfig(estop="required")
     assert warnings(Config(mcu=slow, control=ControlConfig(rate=14.0), safety=safe)) == []
     assert warnings(Config(safety=safe)) == []
