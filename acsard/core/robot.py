@@ -288,10 +288,10 @@ class Robot:
         events += bumpers.look(statuses, now.mono_ns)
         if bumpers.pressed_now:
             self.counters["bumper_presses"] += 1
-            if bumpers.limiting:
-                self._arbiter.require_neutral(now.mono_ns)
-            else:
+            if bumpers.latching:
                 self._life.press(bumpers.pressed_now, now)
+            else:
+                self._arbiter.require_neutral(now.mono_ns)
         if estop.pressed_now or bumpers.pressed_now:
             # The hardware has cut the motors, or the robot touches an obstacle: no ramp.
             self._limiter.cut()

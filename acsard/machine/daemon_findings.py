@@ -220,6 +220,8 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
     if pressed is not None and any(pressed):
         # A board that has fallen silent looks as if all were pressed.
         todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
+        if safety.bumper == "away":
+            todo = f"drive straight away from it, or {todo} if the robot is stopped"
         yield Finding("bumpers", "warning", bumpers.pressed_words(safety.bumpers, pressed), todo)
     elif pressed is not None:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"

@@ -72,9 +72,14 @@ class Bumpers(BoardInput):
         return self._away and self.state == "pressed"
 
     @property
+    def latching(self) -> bool:
+        """Whether a press latches a stop. Silence of the board always does."""
+        return not self._away or self.state == "silent"
+
+    @property
     def held(self) -> str:
         """Why a stop stays latched, in words; "" if the bumpers keep no latch."""
-        return "" if self.limiting else self.why
+        return self.why if self.latching else ""
 
     def away(self, twist: Twist) -> Twist | None:
         """Return the part of a twist that the pressed bumpers allow.

@@ -134,7 +134,7 @@ class BoardInput(ABC):
 
     @abstractmethod
     def released(self, first: bool) -> str:
-        """Return the text that logs a release; `first` if it was never pressed before."""
+        """Return the text that logs a release or, if `first`, the first report of the inputs."""
 
     def advice(self) -> str:
         """Return what follows from a press, for the log."""

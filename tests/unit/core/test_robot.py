@@ -451,6 +451,17 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
     )
 
 
+def test_a_tap_in_one_read_stops_a_robot_that_a_bumper_only_limits_and_latches_nothing() -> None:
+    bench = Button(FREE, AWAY)
+    bench.driving()
+    out = bench.status(FRONT + FREE).step(GO)
+    assert (out.mode, out.line, out.latches.in_force) == ("ready", ZERO_LINE, None)
+    bench.status(FREE)
+    assert bench.step(GO).line == ZERO_LINE
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
 @each("wrong", [GO, Twist(0.0, 1.0), Twist(0.001, -0.5)])
 def test_a_command_against_a_pressed_bumper_makes_its_sender_unarmed(wrong: Twist) -> None:
     bench = Button(FRONT, AWAY)

@@ -343,6 +343,14 @@ def test_the_bumpers_of_the_board_are_reported(
     *_, finding = link(Running(INFO, config, state, state, 0))
     assert (finding.subject, finding.level) == ("bumpers", level)
     assert finding.text.startswith(text)
+    assert finding.mend.startswith("release it there; if none") == (level == "warning")
+
+
+def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() -> None:
+    config = replace(CONFIG, safety=SafetyConfig(bumpers=("front",), bumper="away"))
+    state = replace(STATE, bumpers=[True])
+    *_, finding = link(Running(INFO, config, state, state, 0))
+    assert finding.mend.startswith("drive straight away from it, or release it there; if none")
 
 
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
