@@ -321,7 +321,8 @@ class Robot:
         away = self._bumpers.away(twist)
         if away is None:
             self._arbiter.require_neutral(now_ns)
-            self._choice = replace(self._arbiter.choose(now_ns), twist=None, arrived_ns=None)
+            # Without the commands so far nothing is left to follow.
+            self._choice = self._arbiter.choose(now_ns)
         elif away != twist:
             self._choice = replace(self._choice, twist=away)
 
