@@ -24,7 +24,8 @@ def checked(
 
     `presses` has the input that the person presses for each name: 0 is the emergency stop.
     """
-    places: tuple[Place, ...] = ("front",) * reports
+    front: Place = "front"
+    places = (front,) * reports
     robot = Robot(*faults, config=Config(safety=SafetyConfig(bumpers=places)))
     shown: list[str] = []
 
