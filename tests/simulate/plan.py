@@ -101,7 +101,8 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> None:
     """
     if dice.random() >= 0.25:
         return
-    seconds, first, *others = plan["seconds"], *plan["senders"]
+    seconds: float = plan["seconds"]
+    first: dict[str, Any] = plan["senders"][0]
     source = max(plan["config"]["commands"]["sources"], key=lambda one: one["priority"])
     below = {
         one["name"]
@@ -117,7 +118,7 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> None:
     }  # fmt: skip
     plan["senders"] = [first] + [
         one
-        for one in others
+        for one in plan["senders"][1:]
         if one["source"] in below and not (one["junk"] or one["churn"]) and one["id"] != first["id"]
     ]
 
