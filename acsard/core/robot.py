@@ -416,9 +416,7 @@ class Robot:
                 assert_never(request.verb)
 
     def _place(self, pose: Pose) -> str:
-        """Set the pose, and drop the corrections that were due to the pose before."""
         self._odometry.set_pose(pose)
-        self.session.count_recovery.forgive()
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 

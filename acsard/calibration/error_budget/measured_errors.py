@@ -30,8 +30,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
+from acsard.calibration.error_budget.quantization_step import quantization_step
 from acsard.calibration.log_table import Floats
-from acsard.core.link.quantization_step import Search
 from acsard.core.motion.error_model import DECIMAL
 from acsard.core.motion.gap_filling import Gaps
 from acsard.core.motion.kinematics import Kinematics
@@ -360,13 +360,8 @@ def _runs(values: Floats) -> Floats:
 def _quantum(speeds: Floats) -> float:
     """Return the speed in rad/s of which all speeds are multiples, or 0 without such a speed."""
     # A value that is repeated for a whole drive is no more evidence than a single one.
-    seen = np.unique(np.abs(speeds[speeds != 0.0])).tolist()
-    if len(seen) < LEAST_VALUES:
-        return 0.0
-    search = Search(dict.fromkeys(seen, 1))
-    while not search.go_on():
-        pass
-    return search.found.quantum if search.found is not None else 0.0
+    seen = np.unique(np.abs(speeds[speeds != 0.0]))
+    return quantization_step(seen) if len(seen) >= LEAST_VALUES else 0.0
 
 
 class Steps(Struct, frozen=True):

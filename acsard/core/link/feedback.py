@@ -79,7 +79,7 @@ class Feedback(Struct, frozen=True, gc=False):
     """Monotonic time at which the line was complete here."""
     counted: Motors | None = None
     """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
-    the speeds show whole counts (`quantization.py`, `whole_counts.py`)."""
+    the counts per turn are configured and the speeds show whole counts (`whole_counts.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
     count: float = 0.0

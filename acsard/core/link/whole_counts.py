@@ -20,7 +20,9 @@ from __future__ import annotations
 import math
 
 from acsard.core.link.codec import Motors
-from acsard.core.link.quantization_step import ROUNDING
+
+ROUNDING = 0.0052
+"""Largest rounding error of a speed in two decimals, rad/s."""
 
 MOST_TRIES = 16
 """Candidates that are tried at most, which bounds the time of a control step."""

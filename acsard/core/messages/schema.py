@@ -248,9 +248,9 @@ class RobotState(Message, frozen=True):
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
     """Use of the gyro in odometry."""
     encoder_counts: list[int] = []
-    """Encoder counts per wheel turn, inferred from the speeds, in the order of `wheels`.
+    """Configured encoder counts per wheel turn, in the order of `wheels`.
 
-    0 means unknown.
+    0 means that they are not configured, or that the speeds are not whole counts of them.
     """
     wheel_fault: str = ""
     """The wheel that the pose leaves out, or the side that slips, in words; else empty."""

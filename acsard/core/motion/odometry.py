@@ -23,7 +23,6 @@ from msgspec import Struct
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization_step import on
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.error_model import ErrorModel, TwistUncertainty
 from acsard.core.motion.gap_filling import NOWHERE, Gaps, Rolled, Rolling, plus
@@ -90,8 +89,6 @@ class Odometry:
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
         """Counts at rest whose direction is not clear yet, rad."""
-        self._steps_seen = NOWHERE
-        """Quantization steps, rad/s, whose count the pose's covariance finally uses."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
         """Quantization steps of the last line, and the largest known one of them, rad/s."""
         self._path = Path()
@@ -167,9 +164,10 @@ class Odometry:
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
-        steps = feedback.steps
-        if steps is not self._steps_of or (feedback.counted and steps is not self._steps_seen):
-            self._see(feedback)
+        if feedback.steps is not self._steps_of:
+            self._steps_of = feedback.steps
+            known = [step for step in feedback.steps if step < math.inf]
+            self._coarsest = max(known, default=0.0)
         if checks.look(feedback, rolled, commanded):
             self._take_back()
         turn, slips = checks.turn, checks.slips
@@ -200,20 +198,6 @@ class Odometry:
             feedback.asked_ns,
             feedback.heard_ns,
         )
-
-    def _see(self, line: Feedback) -> None:
-        """Take the resolution of the line's speeds for the twist's covariance.
-
-        Take its count for the pose's covariance, finally once every wheel turns.
-        """
-        if line.steps is not self._steps_of:
-            self._steps_of = line.steps
-            self._coarsest = max([step for step in line.steps if step < math.inf], default=0.0)
-        if line.counted is None or line.steps is self._steps_seen:
-            return
-        if all(line.speeds.as_tuple()):
-            self._steps_seen = line.steps
-        self._uncertainty.show_count(_count_of(line))
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
         """Return the wheel angles to advance by.
@@ -322,12 +306,3 @@ class Odometry:
             seconds * (before.angular + after.angular) / 2,
             *self._gaps.unseen(seconds, before, after),
         )
-
-
-def _count_of(line: Feedback) -> float:
-    """Return the angle of the coarsest encoder's count that a line shows, rad, 0 if unknown."""
-    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
-    return max([
-        step * turned / speed for turned, speed, step in rows
-        if speed and 0.0 < step < math.inf and on(speed, step)
-    ], default=0.0)  # fmt: skip

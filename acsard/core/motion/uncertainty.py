@@ -56,9 +56,6 @@ MAX_VARIANCE = 1e9
 COARSE_COUNTS = 400
 """Encoder counts per wheel turn that are assumed if none are configured. Few have fewer."""
 
-SAME_COUNT = 0.02
-"""Relative difference between two measured angles of a count that rounding can cause."""
-
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 GYRO_SCALE = 0.004
@@ -84,7 +81,7 @@ class PoseUncertainty:
         """Start at the pose 0, 0, 0. `counts` are encoder counts per wheel turn, 0 if unknown."""
         self._model = model
         self._parameters = self._effects = model.columns
-        self._configured = self._counted = counts > 0
+        self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
@@ -134,21 +131,6 @@ class PoseUncertainty:
         self.covariance = self._p
         """The published covariance of x, y and yaw in odom."""
         self._publish()
-
-    def show_count(self, angle: float) -> None:
-        """Take the angle of one encoder count, as detected in the feedback lines, rad.
-
-        A configured count angle takes precedence. From now on the pose is computed from whole
-        counts, so the position of the start within a count is unknown as well.
-        """
-        if self._configured or angle <= 0.0:
-            return
-        if self._counted and abs(angle - self._count) < SAME_COUNT * self._count:
-            return
-        self._stand_within(angle)
-        if not self._counted:
-            self._counted = True
-            self._p = added(self._p, *self._phase, self._cos, self._sin)
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,

@@ -12,7 +12,6 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
-from acsard.core.link.quantization_step import Search
 from acsard.core.motion.freshness import Freshness
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, REST, Command, Instant
@@ -156,12 +155,6 @@ def drawn(recording: Recording) -> None:
             report.step(step, outputs, robot)
     if looked.notes:
         raise RecordingError(looked.notes[0])
-
-
-def test_a_forged_state_cannot_make_a_search_endless() -> None:
-    search = Search({1.0: 3})
-    search._tried = -(1 << 60)
-    assert not search.go_on()
 
 
 def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Path) -> None:

@@ -726,16 +726,6 @@ def test_an_encoder_that_is_unknown_makes_no_twist_infinitely_uncertain() -> Non
     assert math.isfinite(some.twist_variances.linear)
 
 
-def test_rounding_made_good_to_one_wheel_is_no_lie_and_no_slip() -> None:
-    robot, speeds = odometry(), WheelSpeeds(10.0, 10.0, 10.0, 10.0)
-    steady, owing = (0.1,) * 4, (2.0, 0.1, 0.1, 0.1)
-    for i in range(100):
-        line = Feedback(AT, speeds, 0.01, counted=owing if i == 50 else steady)
-        robot.fold(line, speeds)
-        assert robot.checks.wheels.status.text == ""
-        assert robot.checks.events == []
-
-
 # a track that was learned
 
 

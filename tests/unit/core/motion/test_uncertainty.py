@@ -12,17 +12,15 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import DriveConfig, McuConfig, OdometryConfig
+from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.session import McuSession
 from acsard.core.motion.error_model import ErrorModel
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
-from acsard.core.values import Instant, Received, WheelSpeeds
-from tests.unit.core.link.counted import RADIUS, TRACK, angles
-from tests.unit.core.link.counted import lines as counted_lines
+from acsard.core.values import STILL, WheelSpeeds
+from tests.unit.core.link.counted import RADIUS, TRACK
 from tests.unit.core.motion.nees import (
     AT,
     DEFAULT,
@@ -265,50 +263,17 @@ def test_trembling_within_a_count_is_no_turning() -> None:
     assert one.covariance.yawyaw - start < 1e-1 * 20.0 * 1e-2
 
 
-@pytest.mark.parametrize("counts", [16, 96, 400, 4000])
-def test_counts_that_the_lines_show_are_as_uncertain_as_configured_ones(counts: int) -> None:
-    config, kinematics = OdometryConfig(), Kinematics(DriveConfig())
-    told, shown = (PoseUncertainty(ErrorModel(config, kinematics), known) for known in (counts, 0))
-    shown.show_count(math.tau / counts)
-    for one in (told, shown):
-        for _ in range(100):
-            one.advance(0.01, 0.02 / counts, 0.01, 0.0, 0.0)
-    ours, theirs = shown.covariance, told.covariance
-    assert (ours.xx, ours.yy, ours.yawyaw) == pytest.approx(
-        (theirs.xx, theirs.yy, theirs.yawyaw), rel=1e-4
-    )
-
-
-def test_what_is_configured_counts_before_what_the_lines_show() -> None:
-    told, plain_one = (
-        PoseUncertainty(ErrorModel(OdometryConfig(), Kinematics(DriveConfig())), 400)
-        for _ in range(2)
-    )
-    told.show_count(math.tau / 16)
-    for one in (told, plain_one):
-        one.advance(0.01, 0.0, 0.01, 0.0, 0.0)
-    assert told.covariance == plain_one.covariance
-
-
 @pytest.mark.parametrize("counts", [16, 96, 400])
-def test_of_a_firmware_that_reports_whole_counts_the_pose_is_as_uncertain_as_they_make_it(
+def test_the_heading_is_as_uncertain_as_the_place_of_the_wheels_within_their_counts(
     counts: int,
 ) -> None:
-    """The session finds the counts in the bytes; nothing is configured."""
-    session, odometry = (
-        McuSession(McuConfig(), 100.0),
-        Odometry(OdometryConfig(), Kinematics(DriveConfig())),
+    kinematics, count = Kinematics(DriveConfig()), RADIUS * math.tau / counts
+    known, unknown = (
+        Odometry(OdometryConfig(), kinematics, given).fold(Feedback(AT, STILL, 0.01)).covariance
+        for given in (counts, 0)
     )
-    variances = []
-    for n, line in enumerate(counted_lines(angles(np.random.default_rng(1), 20.0), counts)):
-        now = Instant(10**9 + n * 10**7, n * 10**7)
-        for feedback in session.update(now, True, 1, (Received(now, line),)):
-            variances.append(odometry.fold(feedback).covariance.yawyaw)
-    before, after = variances[:-1], variances[1:]
-    count = RADIUS * math.tau / counts
-    leap = max(b - a for a, b in zip(before, after, strict=True))
-    assert session.count_recovery.counts == (counts,) * 4
-    assert leap >= 2 * count**2 / 24 * 2 / TRACK**2, "of where it started, and of where it is"
+    places = 2 * count**2 / 24 * 2 / TRACK**2
+    assert known.yawyaw - unknown.yawyaw == pytest.approx(places), "at the start, and now"
 
 
 def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:

@@ -1,0 +1,77 @@
+"""Finds the quantization step of reported wheel speeds.
+
+A firmware that divides counts by its period reports only multiples of q = 2 pi / (counts T), in two
+decimals. The search finds the largest q of which nearly all speeds are multiples. It rejects a q
+that chance could have produced. Speeds that a filter has smoothed are not multiples of any step.
+(A mean over M periods has a step that is M times as fine, as if it counted in M-ths.)
+
+Some speed V is j q for a whole j, so the candidates are V / j for j = 1, 2 and so on.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from acsard.calibration.log_table import Floats
+from acsard.core.link.whole_counts import ROUNDING
+
+FINEST = 4 * ROUNDING
+"""Finest step that is searched, rad/s. Half of all speeds fit a finer step by chance."""
+
+DEVIATION = 0.01 / math.sqrt(12)
+"""Standard deviation of the rounding to two decimals, rad/s."""
+
+STRAYS = 0.005
+"""Share of the speeds that need not be multiples of the step, because of damaged lines."""
+
+BY_CHANCE = 1e-5
+"""Highest probability that chance has produced an accepted step."""
+
+STEEP = 1.0
+"""rad/s. A wheel's speed alternates by this much from line to line only because of its encoder, so
+no test against chance is needed."""
+
+
+def quantization_step(speeds: Floats) -> float:
+    """Return the quantization step of these speeds, or 0 if they have none; all in rad/s.
+
+    Args:
+        speeds: At least three different speeds above 0 in rising order, shape (n,).
+    """
+    spare = max(1, int(STRAYS * len(speeds)))
+    # The largest speed, without the few that need not be multiples of the step.
+    anchor = float(speeds[-1 - spare])
+    for part in range(1, int(anchor / FINEST) + 1):
+        # The anchor is rounded too, and each speed is off by its share of that.
+        if _strays(speeds, anchor / part, ROUNDING / anchor) <= spare:
+            step = _fitted(speeds, anchor / part, spare, part)
+            if step:
+                return step
+    return 0.0
+
+
+def _strays(speeds: Floats, step: float, doubt: float) -> int:
+    """Return how many speeds in two decimals are not multiples of `step`.
+
+    `doubt` is the relative error of `step`.
+    """
+    off = np.abs(speeds - step * np.round(speeds / step))
+    return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
+
+
+def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
+    """Return the step near `rough` by least squares, 0 if it fails the closer tests."""
+    whole = np.round(speeds / rough)
+    near = np.abs(speeds - whole * rough) <= 2 * ROUNDING
+    whole = whole[near]
+    squares = float(whole @ whole)
+    if not squares:
+        return 0.0
+    step, deviation = float(whole @ speeds[near]) / squares, DEVIATION / math.sqrt(squares)
+    # A multiple is off by the step's error times the factor.
+    if step < FINEST or _strays(speeds, step, 4 * deviation / step) > spare:
+        return 0.0
+    by_chance = tries * (FINEST / step) ** (len(np.unique(whole)) - 1)
+    return 0.0 if step < STEEP and by_chance > BY_CHANCE else step
