@@ -239,7 +239,7 @@ class Robot:
         session, before = self.session, self.session.link
         unsent = inputs.superseded or bool(inputs.guard_trip)
         feedback = session.update(
-            inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent
+            inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent, inputs.late_ns
         )
         link = session.link
         told = self._answered.look(self.counters["lines_sent"], session.good_lines, link == "up")

@@ -220,7 +220,7 @@ class Estimate(Struct, frozen=True, gc=False):
     """Wheel angles since the start, rad, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time at which the answered line was made, None if that line is unknown."""
+    """Monotonic time at which the answered line left, None if that line is unknown."""
     heard_ns: int = 0
     """Monotonic time at which the line was complete here."""
 
@@ -401,6 +401,9 @@ class Inputs(Struct, frozen=True):
     at_once: bool = False
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
+    late_ns: int = 0
+    """How much later than its step the last line left, ns. 0 if the process ran on without a
+    stall."""
 
 
 class Outputs(Struct, frozen=True):

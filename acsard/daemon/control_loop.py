@@ -62,6 +62,10 @@ FEEDBACK = ("odom", "tf", "wheel_states")
 QUERIES_PER_STEP = 8
 """Most queries that one step answers. The others wait, so that many of them cost no period."""
 
+LATE_NS = 1_000_000
+"""Time from the begin of a step until its line leaves, ns, from which on the robot is told of it.
+Most steps take less, and nobody knows the time of a sample better."""
+
 BUS_STUCK = Event("bus_stuck", "the bus accepts no messages; driving goes on", "warning")
 
 
@@ -127,8 +131,9 @@ class ControlLoop:
         self._turn_rates: list[GyroSample] = []
         """Samples of a gyro since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
-        self._superseded, self._trip = False, ""
-        """The fate of the last line, for the next step: superseded, and replaced by the guard."""
+        self._superseded, self._trip, self._late_ns = False, "", 0
+        """The fate of the last line, for the next step: superseded, replaced by the guard, and how
+        much later than its step it left, ns."""
         # The longest line of either direction: answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -184,7 +189,7 @@ class ControlLoop:
         port, pace = self._port, self._pace
         # Take the bytes first: `take` closes the port when the computer was suspended.
         received = port.take(now if missed else None)
-        # Pass by position: with sixteen names a struct takes three times as long.
+        # Pass by position: with seventeen names a struct takes three times as long.
         inputs = Inputs(
             now,
             ended and pace.period_ended(missed),
@@ -202,6 +207,7 @@ class ControlLoop:
             tuple(self._others),
             pace.at_once(now.mono_ns, port.sent_ns),
             self.shutting_down,
+            self._late_ns,
         )
         if inputs.events:
             self._others.clear()
@@ -386,7 +392,7 @@ class ControlLoop:
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
         """Offer the line, and return it if it left. The next step tells the robot its fate."""
         line, self._trip = self._guard.check(outputs)
-        self._superseded = False
+        self._superseded, self._late_ns = False, 0
         if line is None:
             return None
         before_ns = self._port.sent_ns
@@ -394,6 +400,8 @@ class ControlLoop:
         if offered == "sent":
             self._guard.left(line)
             self._stopwatch.line(outputs, self._port.sent_ns, before_ns)
+            late_ns = self._port.sent_ns - now.mono_ns
+            self._late_ns = late_ns if late_ns >= LATE_NS else 0
             self.robot.counters["lines_sent"] += 1
             return line
         self._superseded = True

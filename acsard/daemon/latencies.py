@@ -78,8 +78,8 @@ Name = Literal[
   carries it; a command that first waited for its source's turn is not counted
 - feedback_to_bus: from the read of a feedback line's end to its messages in the queue of the bus;
   before the read the line may have waited in the kernel while the loop stood still
-- mcu_round_trip: from a line to the end of its answer, only for checked replies, because only these
-  tell which of the pipelined lines they answer
+- mcu_round_trip: from the leaving of a line to the end of its answer, only for checked replies,
+  because only these tell which of the pipelined lines they answer
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)

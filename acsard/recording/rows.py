@@ -73,6 +73,7 @@ class Rare(Struct, frozen=True, omit_defaults=True):
     trouble: str | None = None
     status: Status | None = None
     missed: int = 0
+    late_ns: Annotated[int, Meta(ge=0, le=MAX_TIME_NS)] = 0
     guard_trip: str = ""
     commands: tuple[Command, ...] = ()
     requests: tuple[Request, ...] = ()
@@ -213,6 +214,7 @@ def _rares(taken: Sequence[Taken]) -> Iterator[Rare]:
             trouble=inputs.port_trouble if inputs.port_trouble != trouble else None,
             status=now if now != status else None,
             missed=inputs.missed,
+            late_ns=inputs.late_ns,
             guard_trip=inputs.guard_trip,
             commands=inputs.commands,
             requests=inputs.requests,
@@ -284,6 +286,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
             missed=rare.missed,
             events=rare.events_in,
             shutting_down=row.shutting_down,
+            late_ns=rare.late_ns,
         )
         recorded = RecordedOutputs(
             line=row.line,

@@ -6,12 +6,13 @@ import math
 import random
 from contextlib import ExitStack, nullcontext
 
+import numpy as np
 import pytest
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.messages.schema import JointState, RobotState
 from acsard.core.motion.path import Path
-from acsard.core.values import Pose
+from acsard.core.values import Estimate, Outputs, Pose
 from tests.scenarios.world import World
 
 FINE = SimConfig(encoder_counts=20_000)
@@ -75,6 +76,32 @@ REPORTS = pytest.mark.parametrize("reports", [False, True], ids=["prompted", "re
 @pytest.mark.parametrize("stall", [0.09, 0.25])
 def test_stalls_of_the_host_cost_no_distance(stall: float, reports: bool) -> None:
     assert Drive(World(Config(sim=FINE)), reports).error(stall) < 0.005
+
+
+@pytest.mark.parametrize("link", ["plain", "checked", "checked with counts"])
+def test_a_stop_line_that_leaves_late_is_no_sample_of_the_time_before_it(link: str) -> None:
+    """A person pushes the robot, so that it moves while only stop lines are sent."""
+    mcu = McuConfig(
+        link_check="off" if link == "plain" else "auto",
+        encoder_counts=COUNTS if link == "checked with counts" else 0,
+    )
+    world, estimates, true = World(Config(mcu=mcu)), list[Estimate](), list[tuple[int, float]]()
+
+    def watch(outputs: Outputs) -> None:
+        estimates.extend(outputs.estimates)
+        true.append((world.now_ns, world.mcu.vehicle.pose.x))
+
+    world.watch = watch
+    world.run(1.0)
+    with world.mcu.pushed(1.0):
+        for _ in range(5):
+            world.stall_in_step(0.15)
+            world.run(0.4)
+    times, places = zip(*true, strict=True)
+    at = np.interp([estimate.at.mono_ns for estimate in estimates], times, places)
+    off = at - [estimate.pose.x for estimate in estimates]
+    assert np.abs(off).max() < 0.025
+    assert at[-1] > 1.5
 
 
 @pytest.mark.parametrize(("after", "every"), [(0.8, 3), (2.0, 2)])

@@ -13,7 +13,7 @@ from tests.simulate.roads import NS
 LIARS = {
     "bias", "stuck_encoder", "frozen_encoder", "reversed_encoder", "reversed_motor", "dead_motor",
     "swapped_motors", "swapped_encoders", "bit_errors", "noise", "partial_line", "echo", "mute",
-    "free_running", "pushed", "plain_only", "endless", "wrong_baud",
+    "free_running", "plain_only", "endless", "wrong_baud",
 }  # fmt: skip
 """Board faults with which the encoders lie, or say nothing while the robot may move."""
 

@@ -71,7 +71,7 @@ class Feedback(Struct, frozen=True, gc=False):
     """Seconds at the start of `dt` that no line reported. The speeds of the lines around it stand
     in."""
     asked_ns: int | None = None
-    """Monotonic time at which the answered line was made, None if that line is unknown."""
+    """Monotonic time at which the answered line left, None if that line is unknown."""
     since: float = 0.0
     """Seconds since the previous line arrived, 0 after a silence. The plausibility checks use
     it."""
@@ -181,9 +181,9 @@ class Timeline:
         self._prompts.forget()
         self._forgotten = True
 
-    def left(self, made_ns: int) -> None:
-        """Note that a command line left that was made at `made_ns`."""
-        self._prompts.left(made_ns)
+    def left(self, at_ns: int) -> None:
+        """Note that a command line left at `at_ns`."""
+        self._prompts.left(at_ns)
         self._style.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
@@ -235,7 +235,7 @@ class Timeline:
             following: Bytes of the read that came behind the line.
             length: Bytes of the line.
             silent: Whether the link was silent before it.
-            asked_ns: When the line was made that this reply answers, if it is known.
+            asked_ns: When the line left that this reply answers, if it is known.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.

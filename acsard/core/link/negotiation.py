@@ -289,10 +289,14 @@ class Negotiation:
         """Note that this line left, with its end."""
         self._echo.left(line)
 
-    def settle(self, went: bool) -> None:
-        """Note whether the last line left. No answer can come to a line that did not."""
+    def settle(self, went: bool, late_ns: int = 0) -> None:
+        """Note whether the last line left, `late_ns` after it was made.
+
+        No answer can come to a line that did not leave.
+        """
         if self._made is not None and went:
-            self._pending.append(self._made)
+            sequence, made_ns = self._made
+            self._pending.append((sequence, made_ns + late_ns))
             self._open = self.asking
         if self._just_asked and not went:
             self._asked.undo()
@@ -334,7 +338,7 @@ class Negotiation:
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
-        """Take a correct reply; return when the line that it answers was made.
+        """Take a correct reply; return when the line that it answers left.
 
         Raises `FrameError` unless the reply answers a line that was sent and is unanswered.
         """
@@ -343,19 +347,19 @@ class Negotiation:
         if reply.sequence not in [sequence for sequence, _ in self._pending]:
             raise FrameError("stale_sequence", reply.plain)
         # The board answers lines in order, so the lines before this one get no more answers.
-        sequence, made_ns = self._pending.popleft()
+        sequence, left_ns = self._pending.popleft()
         while sequence != reply.sequence:
-            sequence, made_ns = self._pending.popleft()
+            sequence, left_ns = self._pending.popleft()
         has_sample = reply.reading is not None
         if self.asking:
             self.settled_ns, self._without = at_ns, 0
             self.trouble, self._knows = "", True
             self._sign("sample" if has_sample else "answer")
-            return made_ns
+            return left_ns
         self._without = 0 if has_sample else self._without + 1
         if self._without >= FEW_SAMPLES:
             self._sign("samples_end")
-        return made_ns
+        return left_ns
 
     def judge(self, now_ns: int) -> None:
         """Count a question without an answer.

@@ -421,10 +421,9 @@ class PromptedTimes:
         """Mean deviation of the usual delay, and the least delay; both ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
-        self._made: int | None = None
+        self._sent: int | None = None
         self._apart = self._missing = 0.0
-        """Time at which the last line was made, usual distance of two lines, share of lost
-        replies."""
+        """Time at which the last line left, usual distance of two lines, share of lost replies."""
         self._last: int | None = None
         """Time of the line that was answered last, plus the excess of its reply over the usual
         delay, ns."""
@@ -457,13 +456,13 @@ class PromptedTimes:
         """Whether an adapter holds replies back, so that one read brings several."""
         return self._several > SEVERAL
 
-    def left(self, made_ns: int) -> None:
-        """Note that a line left that was made at `made_ns`."""
-        if self._made is not None:
-            apart, usual = made_ns - self._made, self._apart
+    def left(self, at_ns: int) -> None:
+        """Note that a line left at `at_ns`."""
+        if self._sent is not None:
+            apart, usual = at_ns - self._sent, self._apart
             self._apart = usual + FAST * (min(apart, 2 * usual) - usual) if usual else apart
-        self._made = made_ns
-        self._left.append(made_ns)
+        self._sent = at_ns
+        self._left.append(at_ns)
 
     def read(self, at_ns: int, lines: int) -> None:
         """Take a read of `lines` lines, of which the last was complete at `at_ns`.
@@ -485,7 +484,7 @@ class PromptedTimes:
     def place(self, asked_ns: int | None = None) -> Placed | None:
         """Return the time of the next reply, or None if no line waits for a reply.
 
-        `asked_ns` is when the line was made, if the reply names its line.
+        `asked_ns` is when the line left, if the reply names its line.
         """
         left = self._left
         if asked_ns is not None:

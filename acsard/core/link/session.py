@@ -98,7 +98,7 @@ class McuSession:
         self._made: tuple[bytes, int] | None = None
         """The line just made and its time, until its fate is known."""
         self._left_ns = 0
-        """When the last line that left was made, or when the port was opened."""
+        """When the last line left, or when the port was opened."""
         self._held_up = False
         """True if the last line made did not leave."""
         self.blocked = False
@@ -116,6 +116,7 @@ class McuSession:
         opened: int,
         received: tuple[Received, ...],
         unsent: bool = False,
+        late_ns: int = 0,
     ) -> list[Feedback]:
         """Take the port's state and bytes, and return the good lines in order.
 
@@ -125,11 +126,12 @@ class McuSession:
             opened: The number of openings of the port. Another number starts a new session.
             received: The bytes since the last update.
             unsent: True if the last line did not leave.
+            late_ns: How much later than it was made the last line left, ns.
         """
         self.restarted, self._starting_over, self.events = False, False, []
         if self.statuses:
             self.statuses = []
-        self._settle(not unsent, port_open)
+        self._settle(not unsent, port_open, late_ns)
         feedback = []
         if not port_open or opened != self._opened:
             self._begin(port_open, opened, now.mono_ns)
@@ -198,20 +200,23 @@ class McuSession:
 
     # sessions
 
-    def _settle(self, went: bool, port_open: bool) -> None:
-        """Note whether the line just made has left. A line that did not uses up no throttle."""
+    def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
+        """Note whether the line just made has left, and when.
+
+        A line that did not leave uses up no throttle.
+        """
         made = self._made
         if made is None:
             return
         blind, self._made, self._just_blind = self._just_blind, None, False
-        self.negotiation.settle(went)
+        self.negotiation.settle(went, late_ns)
         self._held_up = not went
         if went:
-            line, made_ns = made
+            line, left_ns = made[0], made[1] + late_ns
             self.negotiation.left(line)
-            self._timeline.left(made_ns)
-            self.restarted = self.blocked and made_ns - self._left_ns >= LONG_GAP_NS
-            self._left_ns = made_ns
+            self._timeline.left(left_ns)
+            self.restarted = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
+            self._left_ns = left_ns
         elif blind and port_open:
             self._blind.undo()
 

@@ -76,6 +76,7 @@ PARTS: dict[str, st.SearchStrategy[object]] = {
     "events": st.lists(st.builds(Event, st.just("imu_refused"), TEXT), max_size=1).map(tuple),
     "at_once": st.booleans(),
     "shutting_down": st.booleans(),
+    "late_ns": st.integers(0, 1 << 61),
 }
 INPUTS = st.builds(Inputs, **PARTS)
 
