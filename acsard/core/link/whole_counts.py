@@ -11,6 +11,10 @@ rad of the wheel, and 30 % of T is 30 % of that. A count, however, is a whole nu
 3. The error of the host's time is carried to the next line: a sample that was later than the host
    believed leaves less time until the next one. A wrong candidate is thereby made good.
 
+If the host's time shows the number of counts too badly, as with fine encoders, the line is its
+speed times its time. That time includes the part that the lines before have left over, so that no
+time is lost and none counts twice.
+
 The speeds of a firmware that filters, or that measures the time between two edges, are not whole
 counts. Such lines are noticed by their other wheels, and the caller then uses speed times time.
 """
@@ -44,8 +48,9 @@ REPEATED = 0.65
 """Share of the firmware's last time. A line with the same speeds after less time repeats the line
 before: firmware that is asked again too soon has no new counts."""
 
-OFF = 0.25
-"""Counts by which the time of such a line must differ from that of whole counts."""
+SOON, OFF = 0.45, 0.25
+"""Share of the firmware's last time below which such a line is a repetition in any case. Above it,
+its time must also differ by so many counts from that of whole counts."""
 
 UNSURE, SLOW = 0.2, 0.025
 """Mean error of the host's time, in counts of the fastest wheel, above which the nearest number of
@@ -90,7 +95,7 @@ class WholeCounts:
     def turned(self, speeds: Motors, own: float) -> Motors | None:
         """Return how far each wheel turned in the `own` s of this line, rad.
 
-        Return None if the speeds do not show whole counts.
+        Return None if the firmware does not report whole counts, or too slow a speed.
         """
         before, self._before = self._before, speeds
         a, b, c, d = speeds
@@ -105,22 +110,28 @@ class WholeCounts:
         if (
             speeds == before
             and want < REPEATED * self._period
-            and (not number or abs(want - period) > OFF * self.angle / fastest)
+            and (
+                not number
+                or want < SOON * self._period
+                or abs(want - period) > OFF * self.angle / fastest
+            )
         ):
             self._apart = want
             return 0.0, 0.0, 0.0, 0.0
         if shown is not None:
             # Only the other wheels can prove or refute whole counts.
             self._doubt += GAIN * ((not shown) - self._doubt)
-        if not number or not self.believed:
-            self._apart *= KEPT
+        if not self.believed:
+            self.pause()
             return None
-        if shown is None:
+        if number and shown is None:
             off = abs(want - period) * fastest / self.angle
             self._unsure += SLOW * (off - self._unsure)
-            if self._unsure > UNSURE:
-                self.pause()
-                return None
+        if not number or (shown is None and self._unsure > UNSURE):
+            # Speed times time, with the time that the lines before have left over.
+            self.pause()
+            self._period = want
+            return a * want, b * want, c * want, d * want
         # The first time is between two samples of which the host knows neither better.
         self._run += 1
         kept = min(KEPT, self._run / (self._run + 1))
