@@ -20,12 +20,6 @@ LIARS = {
 MOTORS = {"reversed_motor", "dead_motor", "swapped_motors"}
 """Faults behind which a wheel still turns against its command until its motor has followed."""
 
-COUNTLESS = {"no_sample", "no_check", "plain_only"}
-"""Faults behind which the lines may have no counts until the board is connected again."""
-
-RATES = {None, "auto", 10.0, 20.0, 50.0, 100.0}
-"""Control rates at which the pose does not drift with 96 counts."""
-
 GAP_NS = 3 * NS // 10
 """A gap of the estimates of this length and more is judged by itself."""
 
@@ -38,8 +32,8 @@ nearly unknown also falls."""
 
 SIGMAS = 6.0
 COARSE_COUNTS = 6
-"""Counts by which encoders of 96 counts may be off until the daemon knows the counts, if neither
-the configuration nor the lines tell them: a line then shows a speed over an inexact time."""
+"""Counts by which encoders of 96 counts may be off if the configuration does not tell the counts:
+a line then shows a speed over an inexact time."""
 
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
@@ -61,8 +55,6 @@ class PoseWitness:
         )
         """Time that a motor needs to follow its command again."""
         counts = config.get("sim", {}).get("encoder_counts")
-        self._coarse = counts == 96 and config.get("control", {}).get("rate") not in RATES
-        """Whether the pose drifts if the lines do not have the counts."""
         untold = counts == 96 and not config["mcu"].get("encoder_counts")
         turn = COARSE_COUNTS * math.tau / 96 if untold else 0.0
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
@@ -137,7 +129,6 @@ class PoseWitness:
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         self._speed = self._present_speed()
         lies = not LIARS.isdisjoint(faults) or now_ns < self._known_ns
-        self._drifts |= self._coarse and not COUNTLESS.isdisjoint(faults)
         silent_only = not lies or faults & LIARS == {"mute"}
         if lies:
             self.doubt(silent_only)

@@ -105,6 +105,18 @@ def test_slow_wheels_whose_firmware_times_the_edges_are_not_a_count_in_each_line
     assert total == pytest.approx(1.0, abs=found.angle)
 
 
+@pytest.mark.parametrize("counts", [96, 400, 3200])
+def test_equal_lines_at_uneven_times_lose_no_time(counts: int) -> None:
+    """The host knows the times too badly for whole counts, and a short one is no repetition."""
+    found, dice, turned, seconds = WholeCounts(counts), random.Random(1), 0.0, 0.0
+    for _ in range(1000):
+        own = dice.uniform(0.004, 0.014)
+        seconds += own
+        angles = found.turned((13.45,) * 4, own)
+        turned += 13.45 * own if angles is None else angles[0]
+    assert turned == pytest.approx(13.45 * seconds, rel=0.005)
+
+
 def test_one_damaged_line_ends_nothing() -> None:
     found = WholeCounts(16)
     for number, (speeds, own, whole) in enumerate(lines(16, 0.001)):
