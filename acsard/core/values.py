@@ -324,6 +324,26 @@ EstopState = Literal["", "released", "pressed", "silent"]
 the board no longer reports it, which counts as pressed."""
 
 
+BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
+"""The level of the battery by the thresholds in `[battery]`; "ok" if none is set. `unknown` means
+that the board no longer reports the battery, or does not report what the thresholds compare."""
+
+
+class BatteryStatus(Struct, frozen=True, gc=False):
+    """The battery as the board reports it. None stands for a value that it does not report now."""
+
+    level: BatteryLevel
+    reported_ns: int
+    """Monotonic time of the last report, ns."""
+    volts: float | None = None
+    charge: float | None = None
+    """State of charge, 0 to 1."""
+    amps: float | None = None
+    """Current, A. It is negative while the battery discharges."""
+    filtered: float | None = None
+    """The filtered value that the thresholds compare, V or %."""
+
+
 class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
@@ -480,6 +500,8 @@ class Snapshot(Struct, frozen=True):
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
     estop: EstopState = ""
+    battery: BatteryStatus | None = None
+    """The battery, None if the board has never reported it."""
     board: dict[str, str] = {}
     """The fields of the board's last status line, by name, as text."""
     check: str = "plain"

@@ -212,6 +212,17 @@ class SafetyConfig(Struct, frozen=True):
     estop: EstopUse = "auto"
 
 
+Threshold = Annotated[float, Meta(ge=0.0, le=100.0, extra={"unit": "V or % (0 = off)"})]
+
+
+class BatteryConfig(Struct, frozen=True):
+    measure: Literal["volts", "percent"] = "volts"
+    warning_below: Threshold = 0.0
+    return_below: Threshold = 0.0
+    stop_below: Threshold = 0.0
+    hysteresis: Annotated[float, Meta(ge=0.1, le=50.0, extra={"unit": "V or %"})] = 0.5
+
+
 class LimitsConfig(Struct, frozen=True):
     linear_speed: LinearSpeed = 1.0
     angular_speed: AngularSpeed = 4.0
@@ -390,6 +401,7 @@ class Config(Struct, frozen=True):
     limits: LimitsConfig = LimitsConfig()
     feedback: FeedbackConfig = FeedbackConfig()
     safety: SafetyConfig = SafetyConfig()
+    battery: BatteryConfig = BatteryConfig()
     commands: CommandsConfig = CommandsConfig()
     odometry: OdometryConfig = OdometryConfig()
     lidar: LidarConfig = LidarConfig()
