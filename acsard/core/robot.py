@@ -25,7 +25,8 @@ from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
-from acsard.core.motion.emergency_stop import MISSING, EmergencyStop
+from acsard.core.motion.battery import Battery
+from acsard.core.motion.emergency_stop import MENDS, MISSING, EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
@@ -108,6 +109,8 @@ class Robot:
         """State of the limiter and its time, at the last line made and at the last line that left.
         A line that did not leave does not count."""
         self._status = ("", "", "", "")
+        self._level = ""
+        """The level of the battery in the step before, "" before its first report."""
         self.counters: Counter[str] = Counter()
         """Totals since the start: `commands`, `commands_of_new_senders` of new senders whose delays
         were not proved yet, and `command_<reason>` for each reason to refuse. The control loop adds
@@ -116,6 +119,7 @@ class Robot:
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
         self._estop = EmergencyStop(config.safety.estop)
+        self._battery = Battery(config.battery)
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -150,6 +154,7 @@ class Robot:
             encoders=session.count_recovery.counts,
             sender=self._choice.sender,
             estop=self._estop.state,
+            battery=self._battery.status,
             board=self._board(now_ns),
         )
 
@@ -188,7 +193,10 @@ class Robot:
         link = self.session.link
         # `value` itself would run Python code of the enum.
         status = (self._life.mode._value_, self._reason(), link, self._choice.source)
-        another, self._status = status != self._status, status
+        battery = self._battery.status
+        level = battery.level if battery else ""
+        another = status != self._status or level != self._level
+        self._status, self._level = status, level
         # Otherwise neither the mode nor the commander has changed.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
@@ -245,8 +253,9 @@ class Robot:
             # No sender drives before the first link, so a zero sent during the start counts.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
-        if session.statuses or self._estop.state:
+        if session.statuses or self._estop.state or self._battery.status:
             self._watch_estop(inputs.now, events)
+            self._watch_battery(inputs.now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, and the command before the loss is old.
             self._limiter.cut()
@@ -272,7 +281,6 @@ class Robot:
         estop = self._estop
         reports = [(at_ns, status.estop) for at_ns, status in self.session.statuses]
         events += estop.look(reports, now.mono_ns)
-        self._life.hold(estop.held)
         if estop.pressed_now:
             self.counters["emergency_stops"] += 1
             self._life.press(estop.pressed_now, now)
@@ -280,6 +288,19 @@ class Robot:
             self._limiter.cut()
             self._speeds = STILL
             self._made = self._said = (self._limiter.state, self._made_ns)
+
+    def _watch_battery(self, now: Instant, events: list[Event]) -> None:
+        """Latch a stop if the battery has become too low, and hold it while the battery is."""
+        battery, pressed = self._battery, self._estop.held
+        events += battery.look(self.session.statuses, now.mono_ns)
+        if battery.stopped_now:
+            self._life.press(battery.why, now)
+        if pressed:
+            self._life.hold(pressed, MENDS[pressed])
+        elif battery.held:
+            self._life.hold(battery.why, battery.mend)
+        else:
+            self._life.hold()
 
     def _board(self, now_ns: int) -> dict[str, str]:
         """Return the fields of the status lines as text, and the age of the last line."""

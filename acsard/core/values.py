@@ -174,7 +174,7 @@ EventName = Literal[
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_implausible", "lines_lost", "uncommanded_motion", "wheel_fault",
-    "emergency_stop", "emergency_stop_released",
+    "emergency_stop", "emergency_stop_released", "battery", "battery_stop",
     "gyro", "learned_track", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "not_a_router",
     "missed_periods", "recording", "latch_file",
@@ -333,15 +333,15 @@ class BatteryStatus(Struct, frozen=True, gc=False):
     """The battery as the board reports it. None stands for a value that it does not report now."""
 
     level: BatteryLevel
-    reported_ns: int
+    reported_ns: int | None = None
     """Monotonic time of the last report, ns."""
     volts: float | None = None
-    charge: float | None = None
-    """State of charge, 0 to 1."""
+    percent: float | None = None
+    """State of charge, 0 to 100."""
     amps: float | None = None
     """Current, A. It is negative while the battery discharges."""
-    filtered: float | None = None
-    """The filtered value that the thresholds compare, V or %."""
+    mean: float | None = None
+    """The mean that the thresholds are compared with, V or %."""
 
 
 class Latch(Struct, frozen=True):
@@ -444,7 +444,8 @@ class Outputs(Struct, frozen=True):
     command_ns: int | None
     """Monotonic arrival of the command that is followed, None without one."""
     status_changed: bool
-    """Whether `mode`, `reason`, `link` or `source` differs from the step before."""
+    """Whether `mode`, `reason`, `link`, `source` or the battery's level differs from the step
+    before."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False

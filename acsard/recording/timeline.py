@@ -410,6 +410,7 @@ INCIDENTS = {
     "fault": "fault",
     "stop": "stop",
     "emergency_stop": "emergency stop",
+    "battery_stop": "battery stop",
     "link_down": "lost port",
     "link_stale": "board silence",
     "link_late": "computer stall",
@@ -425,7 +426,7 @@ INCIDENTS = {
 """
 
 
-SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|stop|fault)s?\b")
+SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|battery stop|stop|fault)s?\b")
 """A stop or a fault in a summary."""
 
 

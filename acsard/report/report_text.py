@@ -76,6 +76,10 @@ def _shown(table: dict[str, object], key: str) -> str:
     return show(table[key]) if key in table else "-"
 
 
+OF_THE_BOARD = {"emergency_stop": "emergency stop", "battery_stop": "battery stop"}
+"""The events of stops that the board caused, in words."""
+
+
 def summary(data: ReportData) -> str:
     """Return a summary of the recording in two sentences."""
     fast, counts = data.fastest, data.marks.counts
@@ -89,8 +93,8 @@ def summary(data: ReportData) -> str:
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
     faults = many(counts["fault"], "fault")
-    pressed = counts["emergency_stop"]
-    by += f", {many(pressed, 'emergency stop')}" if pressed else ""
+    for name, title in OF_THE_BOARD.items():
+        by += f", {many(counts[name], title)}" if counts[name] else ""
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
     late = counts["link_late"]
@@ -185,12 +189,13 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         for name, driven in data.driven.items()
     ]
     yield "Driven by", ", ".join(drivers) or "no source"
-    stops = (("fault", "Faults"), ("stop", "Stops"), ("emergency_stop", "Emergency stops"))
-    for name, title in stops:
+    titles = {"fault": "Faults", "stop": "Stops"}
+    titles |= {name: f"{title.capitalize()}s" for name, title in OF_THE_BOARD.items()}
+    for name, title in titles.items():
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        # Few robots report their emergency stop, so only a press has a row.
-        if count or name != "emergency_stop":
+        # Few boards report what these stops need, so they have a row only if they happened.
+        if count or name not in OF_THE_BOARD:
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial
     told = (

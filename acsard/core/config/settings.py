@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.core.values import Role
+from acsard.core.values import BatteryLevel, Role
 
 Name = Annotated[
     str,
@@ -221,6 +221,16 @@ class BatteryConfig(Struct, frozen=True):
     return_below: Threshold = 0.0
     stop_below: Threshold = 0.0
     hysteresis: Annotated[float, Meta(ge=0.1, le=50.0, extra={"unit": "V or %"})] = 0.5
+
+    @property
+    def bounds(self) -> dict[BatteryLevel, float]:
+        """The thresholds that are set, by level, the worst level last."""
+        found: dict[BatteryLevel, float] = {
+            "warning": self.warning_below,
+            "return": self.return_below,
+            "stop": self.stop_below,
+        }
+        return {level: below for level, below in found.items() if below}
 
 
 class LimitsConfig(Struct, frozen=True):

@@ -226,7 +226,7 @@ class Battery(Message, frozen=True):
     """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full. It follows from `current`."""
     power_supply_health: Annotated[Byte, one_of(range(9))] = 0
     """Always 0, unknown."""
-    power_supply_technology: Annotated[Byte, one_of(range(7))] = 0
+    power_supply_technology: Annotated[Byte, one_of(range(9))] = 0
     """Always 0, unknown."""
     present: bool = False
     """Whether the board reports a battery at present."""

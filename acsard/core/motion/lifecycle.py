@@ -10,8 +10,8 @@ sender has not seen, however late the network delivers it:
   that persists latches again.
 - A request that arrived before the latch was set never releases it.
 
-A pressed emergency stop at the robot latches a stop too. Nothing releases a latch while it is
-pressed. `emergency_stop.py` decides when it counts as pressed.
+The emergency stop at the robot and an empty battery latch a stop too. Nothing releases a latch
+while such a cause lasts. `emergency_stop.py` and `battery.py` decide how long it lasts.
 
 `modes.py` derives the mode. `core/robot.py` decides how the wheels follow it.
 """
@@ -23,7 +23,6 @@ from functools import lru_cache
 
 from msgspec.structs import replace
 
-from acsard.core.motion.emergency_stop import MENDS
 from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
@@ -59,8 +58,8 @@ class Lifecycle:
         """Monotonic time at which the last stop arrived."""
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off."""
-        self._held = ""
-        """Why the emergency stop counts as pressed, in words; "" while it does not."""
+        self._held = self._mend = ""
+        """The cause of a stop that still lasts, and what ends it, in words; "" without one."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, None before it."""
         self._derive()
@@ -85,13 +84,13 @@ class Lifecycle:
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop under a new number, because the emergency stop was pressed."""
+        """Latch a stop under a new number that no client asked for. `why` is a whole sentence."""
         self._stopped_ns = self._stop_asked_ns = now.mono_ns
         self._latch(stop=self._made(now, "", why))
 
-    def hold(self, why: str) -> None:
-        """Note why the emergency stop counts as pressed, or "" when it is released."""
-        self._held = why
+    def hold(self, why: str = "", mend: str = "") -> None:
+        """Note the cause of a stop that still lasts, and what ends it; "" when it has ended."""
+        self._held, self._mend = why, mend
 
     def leave(self) -> None:
         """Note that the daemon is going down."""
@@ -130,7 +129,7 @@ class Lifecycle:
         """
         require_allowed(self.mode, "clear")
         if self._held:
-            raise RefusedError(f"{self._held}: {MENDS[self._held]}, then call srv/clear again")
+            raise RefusedError(f"{self._held}: {self._mend}, then call srv/clear again")
         latches, latch = self.latches, self.latches.next
         if latch is None:
             return ""
@@ -198,10 +197,10 @@ class Lifecycle:
     def why(self) -> str:
         """Why the mode is `fault`, `stopped` or `inactive`, with the call that changes it."""
         latches, held = self.latches, self._held
-        before = f"{MENDS[held]}, then " if held else ""
+        before = f"{self._mend}, then " if held else ""
         stop = "" if latches.stop is None else _said(latches.stop)
         if held and latches.stop is not None and latches.stop.why != held:
-            # A client has stopped the robot since the emergency stop was pressed.
+            # A client has stopped the robot since, or another cause has.
             stop = f"{held}; also {stop}"
         if latches.fault is not None:
             fault = f"{latches.fault.why}, latched {_when(latches.fault)}"
@@ -280,7 +279,15 @@ def _not_in_force(number: int, still: str, call: str) -> str:
 
 def _stopped(latch: Latch) -> str:
     """Return the reason of a stop or of switching off as the end of "the robot is still"."""
-    return f"stopped ({latch.why})" if latch.why in MENDS else latch.why
+    return latch.why if _requested(latch) else f"stopped ({latch.why})"
+
+
+def _requested(latch: Latch) -> bool:
+    """Return whether a client asked for this stop or switched the robot off.
+
+    The reason of any other stop is a whole sentence.
+    """
+    return latch.why.endswith(f" by {latch.by or 'request'}")
 
 
 def _when(latch: Latch) -> str:
@@ -289,8 +296,7 @@ def _when(latch: Latch) -> str:
 
 def _said(latch: Latch) -> str:
     """Return the words for a stop or for switching off, with the time."""
-    if not latch.why.endswith(f" by {latch.by or 'request'}"):
-        # No client asked for it, and its reason is a whole sentence.
+    if not _requested(latch):
         return f"{latch.why} (latched {_when(latch)})"
     return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"
 

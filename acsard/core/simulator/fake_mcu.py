@@ -41,6 +41,16 @@ A reply within this time repeats the last speeds.
 STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
+EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
+"""Battery of six cells: its voltage when empty, the rise to a full one, V, and its resistance, ohm.
+"""
+
+REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
+"""Current at rest, A, and the current for each rad/s of each wheel, A."""
+
+START_AMPS, START_NS = 10.0, 300 * MS
+"""Additional current while the motors start, A, and its duration, ns. The voltage drops by 2 V."""
+
 NEVER_NS = 2**62
 """Monotonic time after every other one."""
 
@@ -89,6 +99,11 @@ class FakeMcu(Faults):
         """The faults of the emergency-stop input, each with its begin and end, ns, and the word in
         the status line, or `silent`. The last one that is on decides. Empty without an input."""
         self._inputs_clock = b""
+        self._battery_clock = b""
+        self._charge = self._capacity = 1.0
+        """Charge of the battery, 0 to 1, and its capacity, As."""
+        self._drained_ns = self._rested_ns = now_ns
+        """Times at which the charge was last computed, and at which no motor was commanded."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -153,6 +168,9 @@ class FakeMcu(Faults):
             elif what == "inputs" and data == self._inputs_clock:
                 self._tell_inputs(due_ns)
                 self._schedule(due_ns + STATUS_NS, "inputs", data)
+            elif what == "battery" and data == self._battery_clock:
+                self._tell_battery(due_ns)
+                self._schedule(due_ns + STATUS_NS, "battery", data)
         self._now_ns = now_ns
         return out
 
@@ -176,6 +194,8 @@ class FakeMcu(Faults):
             self._schedule(now_ns + self.unprompted_ns, "report", self._clock)
         if self._inputs:
             self._schedule(now_ns + STATUS_NS, "inputs", self._inputs_clock)
+        if self._battery_clock:
+            self._schedule(now_ns + STATUS_NS, "battery", self._battery_clock)
         for begin_ns, end_ns, _ in self._inputs:
             self._schedule_changes(begin_ns, end_ns)
 
@@ -309,9 +329,26 @@ class FakeMcu(Faults):
         """Send a status line with the emergency-stop input, unless it is silent about it."""
         now = [word for begin, end, word in self._inputs if begin <= now_ns < end]
         word = now[-1] if now else "ok"
-        if not self._inputs or word == "silent" or self.muted or now_ns < self._boot_until_ns:
+        if not self._inputs or word == "silent":
             return
-        self._send(now_ns, self._damaged(protocol.status(word, self._checks)))
+        self._tell(now_ns, f"estop={word}")
+
+    def _tell(self, now_ns: int, fields: str) -> None:
+        if not self.muted and now_ns >= self._boot_until_ns:
+            self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
+
+    def _tell_battery(self, now_ns: int) -> None:
+        """Send a status line with the battery, after it was drained since the last one."""
+        seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
+        turning = sum(map(abs, self.vehicle.set_points))
+        if not turning:
+            self._rested_ns = now_ns
+        amps = REST_AMPS + AMPS_PER_SPEED * turning
+        if turning and now_ns - self._rested_ns <= START_NS:
+            amps += START_AMPS
+        self._charge = max(0.0, self._charge - amps * seconds / self._capacity)
+        volts = EMPTY_VOLTS + CHARGED_VOLTS * self._charge - RESISTANCE * amps
+        self._tell(now_ns, f"volts={volts:.2f} amps={-amps:.2f} charge={100 * self._charge:.0f}%")
 
     def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
         """Send a status line at once when the input changes."""
@@ -335,6 +372,23 @@ class FakeMcu(Faults):
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
         """Report a released emergency stop, and nothing about it between these times."""
         return self._input("silent", after_s, length_s)
+
+    @contextmanager
+    def battery(self, percent: float, minutes: float) -> Iterator[None]:
+        """Report a battery ten times a second. It begins with this charge, %, and is drained.
+
+        A full one lasts `minutes` while the robot stands, and shorter while it drives.
+        """
+        clock = b"battery %d" % next(self._order)
+        self._schedule(self._now_ns + STATUS_NS, "battery", clock)
+        with self._with(
+            _battery_clock=clock,
+            _charge=percent / 100,
+            _capacity=REST_AMPS * 60 * minutes,
+            _drained_ns=self._now_ns,
+            _rested_ns=self._now_ns,
+        ):
+            yield
 
     @contextmanager
     def _input(self, word: str, after_s: float = 0.0, length_s: float = 0.0) -> Iterator[None]:

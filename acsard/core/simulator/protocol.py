@@ -126,9 +126,9 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
     return body + b"*%04X" % _crc(body, _crc_of_plain(text))
 
 
-def status(estop: str, check: bool) -> bytes:
-    """Return the status line with the emergency-stop input, `ok` or `pressed`."""
-    text = f"!status estop={estop}".encode()
+def status(fields: str, check: bool) -> bytes:
+    """Return the status line with these fields, such as `estop=ok volts=24.31`."""
+    text = f"!status {fields}".encode()
     return text + (b"*%04X" % _crc(text) if check else b"") + b"\r\n"
 
 

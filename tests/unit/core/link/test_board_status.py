@@ -97,7 +97,7 @@ def test_a_checksum_must_be_right_and_a_checked_link_requires_it() -> None:
 @each("check", [False, True])
 @each("word", ["ok", "pressed"])
 def test_the_simulated_board_writes_the_same_line(word: str, check: bool) -> None:
-    line = protocol.status(word, check)
+    line = protocol.status(f"estop={word}", check)
     assert line == (sealed(b"!status estop=" + word.encode()) if check else
                     b"!status estop=" + word.encode()) + b"\r\n"  # fmt: skip
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.emergency_stop import PRESSED, SILENT
+from acsard.core.motion.emergency_stop import MENDS, PRESSED, SILENT
 from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
@@ -51,7 +51,7 @@ def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool
 
 def press(life: Lifecycle, seconds: float, why: str = PRESSED) -> None:
     life.press(why, at(seconds))
-    life.hold(why)
+    life.hold(why, MENDS[why])
 
 
 def number(life: Lifecycle) -> int:
@@ -432,7 +432,7 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, number(life))
     assert str(caught.value) == f"{PRESSED}: release it there, then call srv/clear again"
-    life.hold("")
+    life.hold()
     assert (mode(life), life.why) == (Mode.STOPPED, f"{latched}; call srv/clear")
     assert clear(life, 9.5, number(life)).startswith("cleared; ")
     assert mode(life) is Mode.READY
@@ -457,7 +457,7 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
         f"a wheel is dead, latched at {AT}:03 UTC; also {PRESSED}; also {stopped}; release it "
         "there, then call srv/clear twice"
     )
-    life.hold("")
+    life.hold()
     assert clear(life, 9.0).startswith("fault cleared; still stopped by joe: ")
     assert life.why == f"{stopped}; call srv/clear"
 
@@ -466,9 +466,9 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     life = ready()
     press(life, 1.0)
     seen = number(life)
-    life.hold("")
+    life.hold()
     press(life, 5.0)
-    life.hold("")
+    life.hold()
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
@@ -480,7 +480,7 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
 def test_a_plain_clear_is_refused_right_after_a_press() -> None:
     life = ready()
     press(life, 1.0)
-    life.hold("")
+    life.hold()
     with pytest.raises(RefusedError) as caught:
         clear(life, 1.5)
     assert str(caught.value).startswith(f"the robot was stopped ({PRESSED}) 0.5 s ago: look at")
@@ -654,7 +654,7 @@ FACTS: dict[str, Do] = {
     "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
     "leave": lambda life, _: life.leave(),
     "press": lambda life, now: press(life, now),
-    "release": lambda life, _: life.hold(""),
+    "release": lambda life, _: life.hold(),
 }
 
 REQUESTS: dict[str, Do] = {
