@@ -109,7 +109,7 @@ class Robot:
         """State of the limiter and its time, at the last line made and at the last line that left.
         A line that did not leave does not count."""
         self._status = ("", "", "", "")
-        self._level = ""
+        self._battery_level = ""
         """The level of the battery in the step before, "" before its first report."""
         self.counters: Counter[str] = Counter()
         """Totals since the start: `commands`, `commands_of_new_senders` of new senders whose delays
@@ -195,8 +195,8 @@ class Robot:
         status = (self._life.mode._value_, self._reason(), link, self._choice.source)
         battery = self._battery.status
         level = battery.level if battery else ""
-        another = status != self._status or level != self._level
-        self._status, self._level = status, level
+        another = status != self._status or level != self._battery_level
+        self._status, self._battery_level = status, level
         # Otherwise neither the mode nor the commander has changed.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])

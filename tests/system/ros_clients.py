@@ -25,7 +25,16 @@ import zenoh
 import zenoh.ext
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.system.harness import ROOT, Bus, Daemon, Program, client_config, environment, until
+from tests.system.harness import (
+    ROOT,
+    Bus,
+    Daemon,
+    Program,
+    Tables,
+    client_config,
+    environment,
+    until,
+)
 from tests.system.strangers import words
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -107,7 +116,7 @@ ROUTE_S = 5.0
 The bridge reads the nodes of its domain ten times a second.
 """
 
-QUICK = {
+QUICK: Tables = {
     "limits": {
         "linear_acceleration": 5.0,
         "linear_deceleration": 5.0,

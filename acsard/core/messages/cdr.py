@@ -187,9 +187,8 @@ class _Numbers:
                 raise CdrError(f"{values[index]} is outside the range from {low:g} to {high:g}")
         found += values
         for index in self._nullable:
-            at = index - len(values)
-            if math.isnan(found[at]):
-                found[at] = None
+            if math.isnan(values[index]):
+                found[index - len(values)] = None
 
 
 class _Text:

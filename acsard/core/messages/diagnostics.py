@@ -198,7 +198,7 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
         return [Row("battery", WARN, battery.MISSING, {})] if bounds else []
-    shown = {"level": status.level}
+    shown: dict[str, str] = {"level": status.level}
     numbers = {
         "volts": status.volts,
         "percent": status.percent,

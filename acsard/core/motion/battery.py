@@ -22,7 +22,8 @@ TIME_CONSTANT_S = 10.0
 A battery takes minutes from one level to the next, so the robot reacts soon enough."""
 
 SETTLE_S = 3.0
-"""Time of reports, s, after which the mean counts. It begins again after a silence."""
+"""Time of reports, s, after which the mean counts. It begins again after a silence. A motor start
+within this time lowers the mean by up to a tenth of the drop."""
 
 SILENT_S = 5.0
 """Age, s, at which a value no longer counts. A board that reports its battery once a second may
