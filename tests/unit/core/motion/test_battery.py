@@ -225,6 +225,8 @@ def test_one_line_after_a_gap_counts_for_a_second_at_most() -> None:
 
 def test_several_lines_of_one_read_count_once() -> None:
     pack = Pack()
+    pack.step(BoardStatus(volts=24.0), BoardStatus(volts=20.0))
+    assert pack.status.mean == 24.0
     pack.at(24.0, 30.0)
     pack.step(*[BoardStatus(volts=20.0)] * 50)
     assert pack.status.mean == pytest.approx(23.96)
@@ -260,6 +262,8 @@ def test_a_silence_does_not_release_a_stop() -> None:
     pack.at(20.0, 10.0)
     assert pack.quiet(600.0) == "unknown"
     assert pack.battery.held
+    # A clear would be refused, so the event does not advise it.
+    assert pack.events[-1] == ("battery", SILENT)
     assert pack.at(20.0, 10.0) == "stop"
     assert pack.stops == 1
 
