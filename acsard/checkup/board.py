@@ -21,7 +21,7 @@ from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
-from acsard.core.link.board_status import STATUS
+from acsard.core.link.board_status import STATUS, decode_status
 from acsard.core.link.checksum import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
 from acsard.core.link.lines import LineReader
@@ -110,6 +110,9 @@ class Board:
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
         """Lines that are not good replies."""
+        self.inputs: dict[int, bool] = {}
+        """Whether each input was pressed in the last status line that had it: 0 is the emergency
+        stop, and the bumpers follow from 1."""
         self.heard = Heard()
         """Everything that was received since the port was opened."""
         self.sent_lines = 0
@@ -312,6 +315,7 @@ class Board:
             for line, following in self._lines.feed(data):
                 if line.startswith(STATUS):
                     self.heard.statuses += 1
+                    self._take_status(line)
                     continue
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
@@ -326,6 +330,17 @@ class Board:
             if self.armed:
                 self._guard()
         return got
+
+    def _take_status(self, line: bytes) -> None:
+        try:
+            status = decode_status(line, self.sealed)
+        except FrameError:
+            return
+        if status.estop is not None:
+            self.inputs[0] = status.estop
+        if status.bumpers is not None:
+            estop = {0: self.inputs[0]} if 0 in self.inputs else {}
+            self.inputs = estop | dict(enumerate(status.bumpers, 1))
 
     def _reply(self, line: bytes, at_s: float) -> Reply | None:
         try:

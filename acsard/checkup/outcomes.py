@@ -263,6 +263,21 @@ WARN damaged lines: lenient | {took} of {kinds} kinds moved
 FAIL damaged lines: taken | {took} of {kinds} kinds moved
     motors followed broken lines: {which}; noise on a cable would drive the robot
     -> the firmware must accept a line whole or not at all, like deploy/firmware
+
+SKIPPED inputs: none
+    no emergency stop and no bumpers are reported or configured
+SKIPPED inputs: not pressed | not checked
+    nobody pressed the inputs of the board: {listed}
+    -> check again at the robot, in a terminal and without --yes
+PASS inputs: right | {listed}
+    each press and each release was reported
+FAIL inputs: missing | not reported
+    the configuration has inputs that the board does not report: {listed}
+    -> let the firmware send `!status {fields}` ten times a second, or correct [safety]
+FAIL inputs: wrong | {figure}
+    {wrong}
+    -> check the leads of these inputs, their pins in the firmware, and the order in safety.bumpers
+
 FAIL wheels: not lifted
     the operator did not confirm that the wheels are lifted
 FAIL runaway: along | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/s

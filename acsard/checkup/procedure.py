@@ -11,6 +11,7 @@ from acsard.checkup import (
     damage,
     dialect,
     encoder_counts,
+    inputs,
     lateness,
     line_loss,
     outcomes,
@@ -25,7 +26,7 @@ from acsard.checkup.outcomes import Unsure
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
 from acsard.core.config.motion_rules import longest_reply
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.formatting import many
 
 LIFTED = "lifted"
@@ -40,7 +41,7 @@ CONFIRM = (
 STEPS = (
     "baud rate", "identification", "reply form", "reply rate", "round trip", "checked link",
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
-    "damaged lines",
+    "damaged lines", "inputs",
 )  # fmt: skip
 """Steps in their order. Those that an early end leaves out are listed in one row."""
 
@@ -96,7 +97,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
-            _Steps(board, operator, once, seen).all()
+            _Steps(board, operator, once, seen).all(config.safety)
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
@@ -127,7 +128,7 @@ class _Steps:
         self._channels: list[Channel] = []
         self._late_left = LATE_MOST
 
-    def all(self) -> None:
+    def all(self, safety: SafetyConfig) -> None:
         board, operator = self._board, self._operator
         for doing, step in SILENT:
             self._measure(doing, partial(step, board))
@@ -144,6 +145,7 @@ class _Steps:
         self._measure(together, lambda: watchdog.finding(board, right))
         broken = "sending broken lines; no motor may turn"
         self._measure(broken, lambda: damage.finding(board, right))
+        self._take("", lambda: inputs.finding(board, operator, safety))
 
     def _stand(self) -> None:
         self._board.rest()

@@ -13,6 +13,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import assert_never
 
+from msgspec.structs import replace
+
 from acsard.core.config.live import changed
 from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.motion_rules import longest_reply
@@ -26,7 +28,8 @@ from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
 from acsard.core.motion.battery import Battery
-from acsard.core.motion.emergency_stop import MENDS, MISSING, EmergencyStop
+from acsard.core.motion.bumpers import Bumpers, missing
+from acsard.core.motion.emergency_stop import DRIVER_FAULT, DRIVER_MEND, MISSING, EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
@@ -119,6 +122,7 @@ class Robot:
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
         self._estop = EmergencyStop(config.safety.estop)
+        self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery)
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
@@ -154,6 +158,8 @@ class Robot:
             encoders=session.count_recovery.counts,
             sender=self._choice.sender,
             estop=self._estop.state,
+            bumpers=self._bumpers.pressed,
+            bumper=self._bumpers.why,
             battery=self._battery.status,
             board=self._board(now_ns),
         )
@@ -184,6 +190,8 @@ class Robot:
         if inputs.commands or inputs.refusals:
             self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
+        if self._bumpers.limiting:
+            self._keep_away(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
         # A newer command or mode than that of the last line may go at once.
         news = (self._choice.arrived_ns, self._life.mode) != self._made_of
@@ -192,7 +200,10 @@ class Robot:
         applied = self._limiter.twist
         link = self.session.link
         # `value` itself would run Python code of the enum.
-        status = (self._life.mode._value_, self._reason(), link, self._choice.source)
+        reason = self._reason()
+        if self._bumpers.limiting:
+            reason = self._with_bumper(reason)
+        status = (self._life.mode._value_, reason, link, self._choice.source)
         battery = self._battery.status
         level = battery.level if battery else ""
         another = status != self._status or level != self._battery_level
@@ -253,9 +264,8 @@ class Robot:
             # No sender drives before the first link, so a zero sent during the start counts.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
-        if session.statuses or self._estop.state or self._battery.status:
-            self._watch_estop(inputs.now, events)
-            self._watch_battery(inputs.now, events)
+        if session.statuses or self._estop.state or self._bumpers.state or self._battery.status:
+            self._watch_inputs(inputs.now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, and the command before the loss is old.
             self._limiter.cut()
@@ -266,7 +276,7 @@ class Robot:
                 self._arbiter.require_neutral(inputs.now.mono_ns)
         else:
             self._linked_once = True
-            self._life.link(up=not self._estop.missing)
+            self._life.link(up=not (self._estop.missing or self._bumpers.missing))
         now = inputs.now
         if inputs.gyro:
             self._odometry.checks.hear(inputs.gyro)
@@ -276,31 +286,59 @@ class Robot:
             [estimate for line in feedback if (estimate := self._believe(line, now, events))]
         )
 
-    def _watch_estop(self, now: Instant, events: list[Event]) -> None:
-        """Latch a stop if the emergency stop was pressed, also if it is released again already."""
-        estop = self._estop
-        reports = [(at_ns, status.estop) for at_ns, status in self.session.statuses]
-        events += estop.look(reports, now.mono_ns)
+    def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
+        """Obey the inputs of the board, also a press that is over already."""
+        estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
+        events += estop.look(statuses, now.mono_ns)
         if estop.pressed_now:
             self.counters["emergency_stops"] += 1
             self._life.press(estop.pressed_now, now)
-            # The hardware has cut the motors, so a ramp has no meaning: every line is zero.
+        events += bumpers.look(statuses, now.mono_ns)
+        if bumpers.pressed_now:
+            self.counters["bumper_presses"] += 1
+            if bumpers.latching:
+                self._life.press(bumpers.pressed_now, now)
+            else:
+                self._arbiter.require_neutral(now.mono_ns)
+        if estop.pressed_now or bumpers.pressed_now:
+            # The hardware has cut the motors, or the robot touches an obstacle: no ramp.
             self._limiter.cut()
             self._speeds = STILL
             self._made = self._said = (self._limiter.state, self._made_ns)
-
-    def _watch_battery(self, now: Instant, events: list[Event]) -> None:
-        """Latch a stop if the battery has become too low, and hold it while the battery is."""
-        battery, pressed = self._battery, self._estop.held
-        events += battery.look(self.session.statuses, now.mono_ns)
+        # A driver without power reports a fault too, and the emergency stop cuts its power.
+        if not estop.why and any(status.driver_fault for _, status in statuses):
+            self._fault(DRIVER_FAULT, now, events)
+        battery = self._battery
+        events += battery.look(statuses, now.mono_ns)
         if battery.stopped_now:
             self._life.press(battery.why, now)
-        if pressed:
-            self._life.hold(pressed, MENDS[pressed])
+        if estop.why:
+            self._life.hold(estop.why, estop.mend)
+        elif bumpers.held:
+            self._life.hold(bumpers.held, bumpers.mend)
+        elif self.session.status.driver_fault:
+            self._life.hold(DRIVER_FAULT, DRIVER_MEND)
         elif battery.held:
             self._life.hold(battery.why, battery.mend)
         else:
             self._life.hold()
+
+    def _keep_away(self, now_ns: int) -> None:
+        """Follow the choice only away from the pressed bumpers.
+
+        After a command that leads elsewhere each sender must send a zero again. Otherwise the robot
+        would drive against the obstacle as soon as the bumper is released.
+        """
+        twist = self._choice.twist
+        if twist is None:
+            return
+        away = self._bumpers.away(twist)
+        if away is None:
+            self._arbiter.require_neutral(now_ns)
+            # Without the commands so far nothing is left to follow.
+            self._choice = self._arbiter.choose(now_ns)
+        elif away != twist:
+            self._choice = replace(self._choice, twist=away)
 
     def _board(self, now_ns: int) -> dict[str, str]:
         """Return the fields of the status lines as text, and the age of the last line."""
@@ -326,7 +364,7 @@ class Robot:
                 self._fault(f"impossible feedback: {why}", now, events)
             return None
         # Motors without power obey no command, so they cannot contradict one.
-        sent = line.speeds if self._estop.held else self._speeds
+        sent = line.speeds if self._estop.why else self._speeds
         fault = self._sanity.watch(sent, line.speeds, line.since)
         if fault:
             self._fault(fault, now, events)
@@ -472,6 +510,16 @@ class Robot:
 
     # Report.
 
+    def _with_bumper(self, reason: str) -> str:
+        """Return the reason with the motion that a pressed bumper allows."""
+        match self._life.mode:
+            case Mode.DRIVING:
+                return f"{reason}; {self._bumpers.note()}"
+            case Mode.READY:
+                return f"{self._bumpers.note()}; {reason}"
+            case _:
+                return reason
+
     def _reason(self) -> str:
         match self._life.mode:
             case Mode.DRIVING:
@@ -480,7 +528,7 @@ class Robot:
                 return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
                 if self.session.link == "up":
-                    return MISSING
+                    return MISSING if self._estop.missing else missing(self.config.safety)
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why

@@ -174,7 +174,8 @@ EventName = Literal[
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_implausible", "lines_lost", "uncommanded_motion", "wheel_fault",
-    "emergency_stop", "emergency_stop_released", "battery", "battery_stop",
+    "emergency_stop", "emergency_stop_released", "bumper_pressed", "bumper_released",
+    "battery", "battery_stop",
     "gyro", "learned_track", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "not_a_router",
     "missed_periods", "recording", "latch_file",
@@ -501,6 +502,10 @@ class Snapshot(Struct, frozen=True):
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
     estop: EstopState = ""
+    bumpers: tuple[bool, ...] | None = None
+    """Whether each bumper counts as pressed, in the order of the board, None if never reported."""
+    bumper: str = ""
+    """Why a bumper counts as pressed, in words; "" while none does."""
     battery: BatteryStatus | None = None
     """The battery, None if the board has never reported it."""
     board: dict[str, str] = {}

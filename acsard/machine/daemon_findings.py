@@ -30,9 +30,10 @@ from acsard.core.messages.schema import (
     LogEvent,
     RobotState,
 )
+from acsard.core.motion import bumpers
 from acsard.core.motion.battery import MISSING as NO_BATTERY
 from acsard.core.motion.battery import words as battery_words
-from acsard.core.motion.emergency_stop import MENDS, MISSING, PRESSED, SILENT
+from acsard.core.motion.emergency_stop import CHECK, MISSING, PRESSED, RELEASE, SILENT
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.lifecycle import utc
 from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus
@@ -207,21 +208,36 @@ def link(running: Running) -> Iterator[Finding]:
     if state.wheel_fault:
         yield Finding("wheels", "warning", state.wheel_fault, mend)
     yield from _emergency_stop(config, state, mend)
+    yield from _bumpers(config, state, mend)
     yield from _battery(config.battery, state.battery, mend)
 
 
 def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
     """Yield a finding about an emergency stop that the board reports or should report."""
     if state.emergency_stop == "pressed":
-        yield Finding(
-            "emergency stop", "warning", PRESSED, f"{MENDS[PRESSED]}, then `acsard call clear`"
-        )
+        yield Finding("emergency stop", "warning", PRESSED, f"{RELEASE}, then `acsard call clear`")
     elif state.emergency_stop == "silent":
-        yield Finding("emergency stop", "failure", SILENT, MENDS[SILENT])
+        yield Finding("emergency stop", "failure", SILENT, CHECK)
     elif state.emergency_stop:
         yield Finding("emergency stop", "ok", "the board reports it, and it is released")
     elif config.safety.estop == "required":
         yield Finding("emergency stop", "failure", MISSING, mend)
+
+
+def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
+    """Yield a finding about bumpers that the board reports or should report."""
+    safety, pressed = config.safety, state.bumpers
+    if pressed is not None and any(pressed):
+        # A board that has fallen silent looks as if all were pressed.
+        todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
+        if safety.bumper == "away":
+            todo = f"drive straight away from it, or {todo} if the robot is stopped"
+        yield Finding("bumpers", "warning", bumpers.pressed_words(safety.bumpers, pressed), todo)
+    elif pressed is not None:
+        text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
+        yield Finding("bumpers", "ok", text)
+    elif safety.bumpers and safety.bumper != "off":
+        yield Finding("bumpers", "failure", bumpers.missing(safety), mend)
 
 
 def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -> Iterator[Finding]:

@@ -410,6 +410,7 @@ INCIDENTS = {
     "fault": "fault",
     "stop": "stop",
     "emergency_stop": "emergency stop",
+    "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
     "link_down": "lost port",
     "link_stale": "board silence",
@@ -426,8 +427,8 @@ INCIDENTS = {
 """
 
 
-SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|battery stop|stop|fault)s?\b")
-"""A stop or a fault in a summary."""
+SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
+"""A stop, a bumper hit or a fault in a summary."""
 
 
 def is_serious(text: str) -> bool:

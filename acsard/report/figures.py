@@ -173,6 +173,7 @@ NOTED = {
     "fault": ("✖", "x", COLOURS["error"]),
     "stop": ("◆", "diamond", COLOURS["warning"]),
     "emergency_stop": ("⬢", "hexagon", COLOURS["error"]),
+    "bumper_pressed": ("■", "square", COLOURS["warning"]),
     "battery_stop": ("⬒", "square-open", COLOURS["error"]),
     "link_down": ("▼", "triangle-down", "#b04fc4"),
     "link_stale": ("▲", "triangle-up", "#e0b400"),

@@ -55,6 +55,14 @@ class Setting(NamedTuple):
     default: str
 
 
+OF_THE_BOARD = {
+    "emergency_stop": "emergency stop",
+    "bumper_pressed": "bumper hit",
+    "battery_stop": "battery stop",
+}
+"""The events of stops that the board caused, in words."""
+
+
 def differences(config: Config) -> list[Setting]:
     """Return the settings that differ from their defaults.
 
@@ -76,10 +84,6 @@ def _shown(table: dict[str, object], key: str) -> str:
     return show(table[key]) if key in table else "-"
 
 
-OF_THE_BOARD = {"emergency_stop": "emergency stop", "battery_stop": "battery stop"}
-"""The events of stops that the board caused, in words."""
-
-
 def summary(data: ReportData) -> str:
     """Return a summary of the recording in two sentences."""
     fast, counts = data.fastest, data.marks.counts
@@ -93,8 +97,8 @@ def summary(data: ReportData) -> str:
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
     faults = many(counts["fault"], "fault")
-    for name, title in OF_THE_BOARD.items():
-        by += f", {many(counts[name], title)}" if counts[name] else ""
+    for name, word in OF_THE_BOARD.items():
+        by += f", {many(counts[name], word)}" if counts[name] else ""
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
     late = counts["link_late"]
@@ -189,9 +193,8 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         for name, driven in data.driven.items()
     ]
     yield "Driven by", ", ".join(drivers) or "no source"
-    titles = {"fault": "Faults", "stop": "Stops"}
-    titles |= {name: f"{title.capitalize()}s" for name, title in OF_THE_BOARD.items()}
-    for name, title in titles.items():
+    titles = {name: f"{word.capitalize()}s" for name, word in OF_THE_BOARD.items()}
+    for name, title in {"fault": "Faults", "stop": "Stops", **titles}.items():
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
         # Few boards report what these stops need, so they have a row only if they happened.

@@ -146,10 +146,13 @@ def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:
     return replay
 
 
+INPUTS = {"estop", "bumpers"}
+"""Faults after which the board no longer reports an input, which would keep the robot stopped."""
+
+
 def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
     """Yield each fault of the simulator as a context manager."""
-    # After `estop` the board no longer reports the input, which would keep the robot stopped.
-    plain = [(name, getattr(mcu, name)) for name in FAULTS if name != "estop"]
+    plain = [(name, getattr(mcu, name)) for name in FAULTS if name not in INPUTS]
     cases = WITH_ARGUMENTS.items()
     return plain + [
         (name, lambda name=name, given=given: getattr(mcu, name)(*given)) for name, given in cases

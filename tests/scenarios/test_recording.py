@@ -12,6 +12,7 @@ from acsard.core.robot import Robot
 from acsard.recording.replay import Replay
 from acsard.recording.state import adopt, thaw
 from tests.scenarios.taped import (
+    INPUTS,
     WITH_ARGUMENTS,
     Tape,
     drive_through_faults,
@@ -79,8 +80,8 @@ def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(afte
 )
 def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config) -> None:
     tape, world = recorded_world(config)
-    # `estop` would keep the robot stopped; `test_emergency_stop.py` replays it.
-    assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS} - {"estop"}
+    # `test_emergency_stop.py` and `test_bumpers.py` replay the inputs.
+    assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS} - INPUTS
     inputs = [taken.inputs for taken in tape.taken]
     for has in ("superseded", "missed", "refusals", "requests", "port_trouble", "commands"):
         assert any(getattr(one, has) for one in inputs), has

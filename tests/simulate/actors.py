@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.simulate.bumpers import Bumpers
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
@@ -94,6 +95,7 @@ class Run:
         self.liveness = Liveness(self)
         self.plugging = Plugging(self.witness.period_ns)
         self.reasons = Reasons(self)
+        self.bumpers = Bumpers(self.witness)
         self.failure: BrokenError | None = None
         self.todo: list[tuple[int, int, Callable[[], None]]] = []
         self._order = 0
@@ -304,6 +306,7 @@ class Run:
                 return
             match verb:
                 case "clear":
+                    self.bumpers.cleared(true_ns)
                     witness.cleared(true_ns, read_ns, text, event["by"])
                 case "activate":
                     witness.activated(true_ns, read_ns, event["by"])
@@ -514,6 +517,7 @@ class Run:
             self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
         if self._plain:
             self.damage.fed(data)
+        self.bumpers.fed(at_ns - START_NS + self.slept_ns, data)
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
         if "endless" in self._names and b"\n" not in data and not self.echo.on:
@@ -621,6 +625,7 @@ class Run:
         if self.pose.end_step():
             self.spread.forget()
         self.log_lines.see(true_ns, seen)
+        self.bumpers.step(true_ns, seen.decided_ns + offset, seen.lines)
         calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
         self.plugging.see(true_ns, seen, self.product, calm_ns)
         if self.log is not None:

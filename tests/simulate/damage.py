@@ -49,7 +49,7 @@ class Damage:
         for line in ends:
             if WHOLE.fullmatch(line):
                 self._whole += self._whole >= 0
-            elif line not in (b"", b"\r"):
+            elif line not in (b"", b"\r") and not line.startswith(b"!status "):
                 self._whole, self._counted, self._short_ns = 0, None, None
         self._held = rest[-MAX_LINE:]
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from tests.simulate import bumpers
 from tests.simulate.product import problems
 
 Plan = dict[str, Any]
@@ -89,6 +90,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     _draw_lawful_driver(random.Random(f"lawful driver {seed}"), plan)
     events = _events(dice, kinds, length, config, plan["senders"])
     plan["events"] = sorted(events, key=lambda one: one["at"])
+    bumpers.add(plan)
     return plan
 
 
@@ -99,7 +101,8 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> None:
     """
     if dice.random() >= 0.25:
         return
-    seconds, first, *others = plan["seconds"], *plan["senders"]
+    seconds: float = plan["seconds"]
+    first: dict[str, Any] = plan["senders"][0]
     source = max(plan["config"]["commands"]["sources"], key=lambda one: one["priority"])
     below = {
         one["name"]
@@ -115,7 +118,7 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> None:
     }  # fmt: skip
     plan["senders"] = [first] + [
         one
-        for one in others
+        for one in plan["senders"][1:]
         if one["source"] in below and not (one["junk"] or one["churn"]) and one["id"] != first["id"]
     ]
 

@@ -40,8 +40,9 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 FIRST_SEED = 1
 
 MEASURED_WITH = (
-    "plan", "roads", "actors", "ages", "course", "damage", "followed", "jerk", "liveness",
-    "log_lines", "plugging", "pose", "product", "promises", "reasons", "reports", "spread",
+    "plan", "roads", "actors", "ages", "bumpers", "course", "damage", "followed", "jerk",
+    "liveness", "log_lines", "plugging", "pose", "product", "promises", "reasons", "reports",
+    "spread",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""
 

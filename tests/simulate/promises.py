@@ -53,6 +53,7 @@ STAND_NS = 2 * NS
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
     "stalls", "sparse_replies", "echo", "plain_only", "endless", "wrong_baud", "reset", "suspend",
+    "bumpers", "bumper_pressed",
 }  # fmt: skip
 """Troubles of the board for which the robot may not latch a fault."""
 

@@ -9,6 +9,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
 from tests.simulate.ages import Ages
+from tests.simulate.bumpers import Bumpers
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.differences import CORRECTED, REWORDED
@@ -177,6 +179,54 @@ def test_the_witness_sees_what_must_not_be(what: Callable[[Witness], None], prom
     with pytest.raises(BrokenError) as broken:
         run()
     assert broken.value.promise == promise
+
+
+FREE, HIT = b"!status bumpers=..\r\n", b"!status bumpers=X.\r\n"
+MOVES = (0, b"ap00.02,bp00.02,cp00.02,dp00.02\r\n")
+
+
+def test_a_bumper_in_a_status_line_is_a_stop_behind_which_nothing_may_move() -> None:
+    witness = witnessed()
+    bumpers = Bumpers(witness)
+    bumpers.fed(NS, FREE + HIT[:8])
+    bumpers.step(NS, NS, [MOVES])
+    assert witness.stops == []
+    bumpers.fed(2 * NS, HIT[8:] + HIT)
+    assert witness.stops == [2 * NS]
+    bumpers.step(2 * NS + 1, 2 * NS, [MOVES])
+    with pytest.raises(BrokenError, match="nothing moves while a bumper is pressed"):
+        bumpers.step(2 * NS + 1, 2 * NS + 1, [MOVES])
+    with pytest.raises(BrokenError, match="no clear works while a bumper is pressed"):
+        bumpers.cleared(2 * NS + 1)
+    bumpers.fed(3 * NS, FREE)
+    bumpers.step(3 * NS + 1, 3 * NS + 1, [MOVES])
+    bumpers.cleared(4 * NS)
+    with pytest.raises(BrokenError, match="nothing moves after a stop"):
+        moves(witness, 3.0)
+
+
+def test_some_plans_have_bumpers_and_no_other_trouble_of_the_board() -> None:
+    plans = [one for one in map(made, range(100)) if "safety" in one["config"]]
+    assert 3 <= len(plans) <= 16
+    for one in plans:
+        faults = {event["fault"][0] for event in one["events"] if event["do"] == "board"}
+        assert faults == {"bumper_pressed"}
+        assert not {"reset", "restart", "unplug"} & {event["do"] for event in one["events"]}
+        older = pairs.comparable(one)
+        assert "bumper" not in json.dumps([older["config"], older["board"], older["events"]])
+
+
+def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_does() -> None:
+    plan = next(one for one in map(made, range(100)) if "safety" in one["config"])
+    result = played(plan)
+    assert result.finding == ""
+    assert result.counts["bumper pressed"] > 0
+    ignored = deepcopy(plan)
+    ignored["config"]["safety"]["bumper"] = "off"
+    assert played(ignored).promise in (
+        "nothing moves after a stop", "nothing moves while a bumper is pressed",
+        "no clear works while a bumper is pressed",
+    )  # fmt: skip
 
 
 def ramp(witness: Witness, fastest: float, share: float) -> None:

@@ -57,8 +57,8 @@ FIELDS = {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate_expiry", "latencies",
         "gyro", "effective_track", "encoder_counts", "wheel_fault", "sender", "recording_error",
-        "latch", "latch_file_error", "feedback_age", "emergency_stop", "speed_limit",
-        "settings_differ", "battery",
+        "latch", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
+        "speed_limit", "settings_differ",
     },
     "diagnostics": {"header", "status"},
     "battery": {

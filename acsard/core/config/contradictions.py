@@ -62,11 +62,16 @@ def warnings(config: Config) -> list[str]:
         found.append(
             'safety.estop = "off": the robot ignores an emergency stop that its board reports'
         )
+    if config.safety.bumper == "off":
+        found.append('safety.bumper = "off": the robot ignores bumpers that its board reports')
     status_use = wire_use(STATUS_HZ, config.mcu.baud_rate, STATUS_BYTES)
-    if config.safety.estop == "required" and use + status_use > 1.0:
+    required = 'safety.estop = "required"' if config.safety.estop == "required" else ""
+    if config.safety.bumpers and config.safety.bumper != "off":
+        required = required or f"safety.bumpers = {show(config.safety.bumpers)}"
+    if required and use + status_use > 1.0:
         left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
         found.append(
-            f'safety.estop = "required": status lines take {status_use:.0%} of the wire at '
+            f"{required}: status lines take {status_use:.0%} of the wire at "
             f"{config.mcu.baud_rate} baud, and replies at control.rate = {config.rate_hz:g} do not "
             f"fit beside them; {left} Hz is comfortable"
         )
@@ -231,6 +236,15 @@ def _source_problems(config: Config) -> list[str]:
     return found
 
 
+def _bumper_problems(config: Config) -> list[str]:
+    if config.safety.bumper != "away" or config.safety.bumpers:
+        return []
+    return [
+        'safety.bumper = "away" needs the place of each bumper, but safety.bumpers = []; write '
+        'safety.bumpers = ["front", "rear"] in the order of the board, or safety.bumper = "stop"'
+    ]
+
+
 def _reachability_problems(config: Config) -> list[str]:
     """Find a configuration in which no client, or no client over TLS, could reach the daemon."""
     bus, found = config.bus, []
@@ -337,6 +351,7 @@ RULES: tuple[Rule, ...] = (
     _battery_problems,
     *motion_rules.RULES,
     _source_problems,
+    _bumper_problems,
     _reachability_problems,
     lambda config: _endpoint_problems(config, "listen"),
     lambda config: _endpoint_problems(config, "connect"),

@@ -20,7 +20,7 @@ FAULTS = (
     "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
     "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
     "late_watchdog", "watchdog_fed_by_bad_lines", "lost_replies", "lost_commands", "bit_errors",
-    "free_running", "ftdi", "estop",
+    "free_running", "ftdi", "estop", "bumpers",
 )  # fmt: skip
 """Faults without arguments."""
 
@@ -30,9 +30,13 @@ ARGUMENTS = {
     "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
     "swapped_wheels": "mm", "bias": "mn", "wrong_baud": "n",
     "pushed": "n", "stalls": "nn", "estop_pressed": "nn", "estop_silent": "nn",
+    "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
     "battery": "nn",
 }  # fmt: skip
 """Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
+
+INPUTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
+"""Faults that end with the seconds until they begin, and with their length in seconds."""
 
 RESET = "reset"
 """Fault that restarts the simulated board again and again, with a number of seconds in between.
@@ -85,7 +89,9 @@ def named(text: str) -> NamedFault:
             "give the seconds from one stall to the next, then fewer seconds for each stall; "
             f"both at least {SHORTEST_S}"
         )
-    if name.startswith("estop_") and not min(fault.values) >= 0:
+    if name == "bumper_pressed" and fault.values[0] not in (1, 2, 3, 4):
+        raise ValueError("the bumpers are 1 to 4, in the order of the board")
+    if name in INPUTS and not min(fault.values) >= 0:
         raise ValueError(
             "give the seconds from the start until it begins, then its seconds (0: it stays)"
         )

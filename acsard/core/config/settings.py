@@ -206,10 +206,14 @@ class FeedbackConfig(Struct, frozen=True):
 
 
 EstopUse = Literal["auto", "required", "off"]
+Place = Literal["front", "rear", "left", "right"]
+BumperUse = Literal["stop", "away", "off"]
 
 
 class SafetyConfig(Struct, frozen=True):
     estop: EstopUse = "auto"
+    bumpers: Annotated[tuple[Place, ...], Meta(max_length=4)] = ()
+    bumper: BumperUse = "stop"
 
 
 Threshold = Annotated[float, Meta(ge=0.0, le=100.0, extra={"unit": "V or % (0 = off)"})]

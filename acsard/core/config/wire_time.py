@@ -21,7 +21,7 @@ A command asks for the fields with one more letter.
 
 STATUS_BYTES = 28
 """Length of `!status estop=pressed*F4BC` with CR LF, the line with which a board reports its
-emergency stop."""
+emergency stop. A line with bumpers is about as long."""
 
 STATUS_HZ = 10
 """Status lines per second."""

@@ -19,10 +19,13 @@ from msgspec import Struct
 
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
+from acsard.core.formatting import many
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
 from acsard.core.motion import battery
 from acsard.core.motion.arbiter_text import waiting
-from acsard.core.motion.emergency_stop import MISSING, PRESSED, SILENT
+from acsard.core.motion.bumpers import SILENT as SILENT_BUMPERS
+from acsard.core.motion.bumpers import missing
+from acsard.core.motion.emergency_stop import DRIVER_FAULT, MISSING, PRESSED, SILENT
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.learned_track import tracks
 from acsard.core.values import (
@@ -183,13 +186,25 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
     """Return the row of the board's inputs, or nothing if it reports none and none is required."""
-    required = config.safety.estop == "required"
-    if not (snapshot.board or required):
+    safety, bumpers = config.safety, snapshot.bumpers
+    required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
+    if not (snapshot.board or required or needed):
         return []
-    level, message = BOARD[snapshot.estop]
+    found = [BOARD[snapshot.estop]]
     if required and not snapshot.estop:
-        level, message = ERROR, MISSING
-    counted = _counted(snapshot.counters, "line_status") | _counted(snapshot.counters, "emergency")
+        found = [(ERROR, MISSING)]
+    if snapshot.bumper:
+        found.append((ERROR if snapshot.bumper == SILENT_BUMPERS else WARN, snapshot.bumper))
+    elif bumpers is not None:
+        found.append((OK, f"{many(len(bumpers), 'bumper')} released"))
+    elif needed:
+        found.append((ERROR, missing(safety)))
+    if snapshot.board.get("motor_driver") == "fault":
+        found.append((ERROR, DRIVER_FAULT))
+    counted: dict[str, str] = {}
+    for kind in ("line_status", "emergency", "bumper"):
+        counted |= _counted(snapshot.counters, kind)
+    level, message = max(level for level, _ in found), "; ".join(text for _, text in found)
     return [Row("board", level, message, snapshot.board | counted)]
 
 

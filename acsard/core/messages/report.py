@@ -283,6 +283,7 @@ class Report:
             latch_file_error=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
             emergency_stop=snapshot.estop,
+            bumpers=None if snapshot.bumpers is None else list(snapshot.bumpers),
             battery=_summary(snapshot.battery),
             settings_differ=self.settings_differ,
             speed_limit=self.speed_limit,

@@ -344,6 +344,12 @@ class RobotState(Message, frozen=True):
 
     `silent` means that the board no longer reports it, which counts as pressed.
     """
+    bumpers: list[bool] | None = None
+    """Whether each bumper counts as pressed, in the order of the board, 1 to 4 values.
+
+    Null if the board has never reported its bumpers. If it no longer reports them, each value is
+    true.
+    """
     battery: BatterySummary | None = None
     """The battery; null if the board has never reported its voltage or its charge."""
     settings_differ: str = ""

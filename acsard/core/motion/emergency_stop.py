@@ -1,20 +1,25 @@
-"""Follows the emergency-stop input that the board reports, and decides when it counts as pressed.
+"""Follows the inputs that the board reports, and decides when one of them counts as pressed.
 
-This is not the safety function. The hardware emergency stop cuts the motors by itself. The daemon
-only learns of it, commands zeros, and keeps the robot stopped after the button is released.
+`BoardInput` is the mechanism of each of them, `EmergencyStop` the emergency stop. `bumpers.py` has
+the bumpers. A board that has reported an input once must go on: if it is silent about it for
+`SILENT_S`, the input counts as pressed. A cable may be cut, or the emergency stop may have cut the
+board's own supply. `lifecycle.py` keeps the latch, which only `clear` releases.
 
-A board that has reported the input once must go on: if it is silent about it for `SILENT_S`, the
-input counts as pressed. A cable may be cut, or the emergency stop may have cut the board's own
-supply. `lifecycle.py` keeps the latch, which only `clear` releases.
+The emergency stop here is not the safety function. The hardware emergency stop cuts the motors by
+itself. The daemon only learns of it, commands zeros, and keeps the robot stopped after the button
+is released.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from itertools import zip_longest
 from typing import Literal
 
 from acsard.core.config.settings import EstopUse
-from acsard.core.values import NS_PER_S, EstopState, Event
+from acsard.core.link.board_status import BoardStatus
+from acsard.core.values import NS_PER_S, EstopState, Event, EventName
 
 Sign = Literal["ok", "pressed", "silence"]
 
@@ -44,11 +49,8 @@ between two reports is excused, so a computer that is always late does not wait 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = f"the board reported no emergency-stop input for {SILENT_S:g} s, which counts as pressed"
 
-WORDS: dict[EstopState, str] = {"pressed": PRESSED, "silent": SILENT}
-"""Why the robot is stopped, in the states in which the input counts as pressed."""
-
-MENDS: dict[str, str] = {PRESSED: "release it there", SILENT: "check the board and its cable"}
-"""What to do before `clear`, for each of `WORDS`."""
+RELEASE, CHECK = "release it there", "check the board and its cable"
+"""What to do before `clear` if an input is pressed, and if the board is silent about it."""
 
 MISSING = (
     'safety.estop = "required", but the microcontroller has not reported an emergency-stop input: '
@@ -56,66 +58,119 @@ MISSING = (
 )
 """Why the robot does not become ready, in words."""
 
+DRIVER_FAULT = "the board reports a fault of a motor driver"
+DRIVER_MEND = "mend it, or switch the robot off and on"
+"""Reason of the fault that the board reports with `driver=fault`, and what to do before `clear`."""
 
-class EmergencyStop:
-    """The state of the input."""
+
+class BoardInput(ABC):
+    """The state of one input, or of several that the board always reports together."""
+
+    table = TABLE
+    silent: str
+    """Why the robot is stopped if the board is silent about the inputs, in words."""
+    events: tuple[EventName, EventName]
+    """The names of the events of a press and of a release."""
 
     def __init__(self, use: EstopUse) -> None:
-        self._use = use
+        self.use = use
         self.state: EstopState = ""
-        """The state of the input; "" if the board has never reported it."""
+        """The state of the inputs; "" if the board has never reported them."""
+        self.pressed: tuple[bool, ...] | None = None
+        """Whether each input counts as pressed, None if the board has never reported them."""
         self.pressed_now = ""
-        """Why the last `look` began to count the input as pressed, "" if it did not."""
+        """Why the last `look` began to count an input as pressed, "" if it did not."""
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
     @property
-    def held(self) -> str:
-        """Why the input counts as pressed, in words; "" while it does not."""
-        return WORDS.get(self.state, "")
+    def why(self) -> str:
+        """Why an input counts as pressed, in words; "" while none does."""
+        if self.state == "silent":
+            return self.silent
+        return self.words() if self.state == "pressed" else ""
+
+    @property
+    def mend(self) -> str:
+        """What to do before `clear` while an input counts as pressed."""
+        return CHECK if self.state == "silent" else RELEASE
 
     @property
     def missing(self) -> bool:
-        """Whether the robot needs the input, and the board has never reported it."""
-        return self._use == "required" and not self.state
+        """Whether the robot needs the inputs, and the board has never reported them."""
+        return self.use == "required" and not self.state
 
-    def look(self, reports: Iterable[tuple[int, bool | None]], now_ns: int) -> list[Event]:
-        """Take the reports since the last step, and return the events of the changes.
+    def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
+        """Take the status lines since the last step, and return the events of the changes.
 
         Args:
-            reports: For each status line its monotonic time of arrival, ns, and whether the input
-                is pressed, None if the line does not have the input.
+            reports: Each status line with its monotonic time of arrival, ns.
             now_ns: Monotonic time of this step, ns.
         """
         self.pressed_now = ""
-        if self._use == "off":
+        if self.use == "off":
             return []
         events: list[Event] = []
-        for at_ns, pressed in reports:
+        for at_ns, status in reports:
+            pressed = self.read(status)
             if pressed is not None:
                 self._reported_ns, self._excused = at_ns, False
-                events += self._take("pressed" if pressed else "ok")
+                events += self._take("pressed" if any(pressed) else "ok", pressed)
         late, self._looked_ns = now_ns - self._looked_ns > LATE_NS, now_ns
-        if now_ns - self._reported_ns > _SILENT_NS:
+        if self.pressed is not None and now_ns - self._reported_ns > _SILENT_NS:
             if late and not self._excused:
                 self._reported_ns, self._excused = now_ns - _SILENT_NS + EXCUSE_NS, True
             else:
-                events += self._take("silence")
+                events += self._take("silence", (True,) * len(self.pressed))
         return events
 
-    def _take(self, sign: Sign) -> list[Event]:
-        before = self.state
-        self.state = state = TABLE.get((before, sign), before)
-        if state == before:
+    @abstractmethod
+    def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
+        """Return which inputs a status line reports as pressed, None if it does not report them."""
+
+    @abstractmethod
+    def words(self) -> str:
+        """Return which inputs are pressed, as a reason."""
+
+    @abstractmethod
+    def released(self, first: bool) -> str:
+        """Return the text that logs a release or, if `first`, the first report of the inputs."""
+
+    def advice(self) -> str:
+        """Return what follows from a press, for the log."""
+        return f"{self.mend}, then call srv/clear"
+
+    def _take(self, sign: Sign, pressed: tuple[bool, ...]) -> list[Event]:
+        before, was = self.state, self.pressed or ()
+        self.state, self.pressed = self.table.get((before, sign), before), pressed
+        more = any(now and not then for now, then in zip_longest(pressed, was, fillvalue=False))
+        if self.state == before and not more:
             return []
-        why = WORDS.get(state, "")
+        why = self.why
         if why:
             self.pressed_now = why
-            return [Event("emergency_stop", f"{why}; {MENDS[why]}, then call srv/clear", "error")]
-        text = "released; the robot stays stopped until srv/clear"
-        if not before:
-            text = "the board reports an emergency-stop input, which is released"
-        return [Event("emergency_stop_released", text)]
+            return [Event(self.events[0], f"{why}; {self.advice()}", "error")]
+        return [Event(self.events[1], self.released(not before))]
+
+
+class EmergencyStop(BoardInput):
+    """The state of the emergency stop."""
+
+    silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
+
+    def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
+        """Return whether a status line reports a press, None if it does not have the input."""
+        return None if status.estop is None else (status.estop,)
+
+    def words(self) -> str:
+        """Return the reason of a press."""
+        return PRESSED
+
+    def released(self, first: bool) -> str:
+        """Return the text that logs a release or, if `first`, the first report."""
+        if first:
+            return "the board reports an emergency-stop input, which is released"
+        return "released; the robot stays stopped until srv/clear"
 
 
 _SILENT_NS = int(SILENT_S * NS_PER_S)

@@ -10,8 +10,9 @@ sender has not seen, however late the network delivers it:
   that persists latches again.
 - A request that arrived before the latch was set never releases it.
 
-The emergency stop at the robot and an empty battery latch a stop too. Nothing releases a latch
-while such a cause lasts. `emergency_stop.py` and `battery.py` decide how long it lasts.
+A pressed emergency stop at the robot, a pressed bumper and an empty battery latch a stop too, and a
+fault of a motor driver latches a fault. Nothing releases a latch while the board reports one of
+them. `emergency_stop.py`, `bumpers.py` and `battery.py` decide how long such a cause lasts.
 
 `modes.py` derives the mode. `core/robot.py` decides how the wheels follow it.
 """
@@ -59,7 +60,8 @@ class Lifecycle:
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off."""
         self._held = self._mend = ""
-        """The cause of a stop that still lasts, and what ends it, in words; "" without one."""
+        """Why the board lets nothing release a latch, in words, and what to do about it; "" while
+        it lets a clear release one."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, None before it."""
         self._derive()
@@ -89,7 +91,7 @@ class Lifecycle:
         self._latch(stop=self._made(now, "", why))
 
     def hold(self, why: str = "", mend: str = "") -> None:
-        """Note the cause of a stop that still lasts, and what ends it; "" when it has ended."""
+        """Note why the board lets nothing release a latch, and what to do about it."""
         self._held, self._mend = why, mend
 
     def leave(self) -> None:
@@ -197,18 +199,17 @@ class Lifecycle:
     def why(self) -> str:
         """Why the mode is `fault`, `stopped` or `inactive`, with the call that changes it."""
         latches, held = self.latches, self._held
-        before = f"{self._mend}, then " if held else ""
-        stop = "" if latches.stop is None else _said(latches.stop)
-        if held and latches.stop is not None and latches.stop.why != held:
-            # A client has stopped the robot since, or another cause has.
-            stop = f"{held}; also {stop}"
-        if latches.fault is not None:
-            fault = f"{latches.fault.why}, latched {_when(latches.fault)}"
-            if not stop:
-                return f"{fault}; call srv/clear"
-            return f"{fault}; also {stop}; {before}call srv/clear twice"
-        if stop:
-            return f"{stop}; {before}call srv/clear"
+        if latches.next is not None:
+            fault, stop = latches.fault, latches.stop
+            parts = [] if fault is None else [f"{fault.why}, latched {_when(fault)}"]
+            if held and held not in [latch.why for latch in (fault, stop) if latch]:
+                # A client has stopped the robot since an input was pressed, or another one was.
+                parts.append(held)
+            if stop is not None:
+                parts.append(_said(stop))
+            before = f"{self._mend}, then " if held else ""
+            twice = " twice" if fault and stop else ""
+            return f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
         if latches.inactive is not None:
             return f"{_said(latches.inactive)}; call srv/activate"
         return "switched off; call srv/activate"
@@ -279,24 +280,21 @@ def _not_in_force(number: int, still: str, call: str) -> str:
 
 def _stopped(latch: Latch) -> str:
     """Return the reason of a stop or of switching off as the end of "the robot is still"."""
-    return latch.why if _requested(latch) else f"stopped ({latch.why})"
-
-
-def _requested(latch: Latch) -> bool:
-    """Return whether a client asked for this stop or switched the robot off.
-
-    The reason of any other stop is a whole sentence.
-    """
-    return latch.why.endswith(f" by {latch.by or 'request'}")
+    return latch.why if _asked_for(latch) else f"stopped ({latch.why})"
 
 
 def _when(latch: Latch) -> str:
     return f"at {utc(latch.at_ns)}{', before the restart' if latch.kept else ''}"
 
 
+def _asked_for(latch: Latch) -> bool:
+    """Return whether a client asked for the latch. Otherwise its reason is a whole sentence."""
+    return latch.why.endswith(f" by {latch.by or 'request'}")
+
+
 def _said(latch: Latch) -> str:
     """Return the words for a stop or for switching off, with the time."""
-    if not _requested(latch):
+    if not _asked_for(latch):
         return f"{latch.why} (latched {_when(latch)})"
     return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"
 

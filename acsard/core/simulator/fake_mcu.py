@@ -95,9 +95,12 @@ class FakeMcu(Faults):
         self._watchdog_trips = 0
         self._checks = False
         """Whether the host has sent a checked line, so that status lines have a checksum too."""
-        self._inputs: tuple[tuple[int, int, str], ...] = ()
-        """The faults of the emergency-stop input, each with its begin and end, ns, and the word in
-        the status line, or `silent`. The last one that is on decides. Empty without an input."""
+        self._bumpers = "." * (len(config.safety.bumpers) or 4)
+        """The bumpers in a status line while none is pressed."""
+        self._inputs: tuple[tuple[int, int, str, str], ...] = ()
+        """The faults of the inputs, each with its begin and end, ns, the field of the status line
+        and its value, `silent` for none. The last one that is on decides, but several bumpers may
+        be pressed at once. A field is in the line if a fault names it."""
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
@@ -196,7 +199,7 @@ class FakeMcu(Faults):
             self._schedule(now_ns + STATUS_NS, "inputs", self._inputs_clock)
         if self._battery_clock:
             self._schedule(now_ns + STATUS_NS, "battery", self._battery_clock)
-        for begin_ns, end_ns, _ in self._inputs:
+        for begin_ns, end_ns, _, _ in self._inputs:
             self._schedule_changes(begin_ns, end_ns)
 
     def _schedule(self, due_ns: int, what: str, data: bytes) -> None:
@@ -326,14 +329,18 @@ class FakeMcu(Faults):
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
     def _tell_inputs(self, now_ns: int) -> None:
-        """Send a status line with the emergency-stop input, unless it is silent about it."""
-        now = [word for begin, end, word in self._inputs if begin <= now_ns < end]
-        word = now[-1] if now else "ok"
-        if not self._inputs or word == "silent":
-            return
-        self._tell(now_ns, f"estop={word}")
+        """Send a status line with the inputs, without those that it is silent about."""
+        fields: dict[str, str] = {}
+        for begin_ns, end_ns, name, value in self._inputs:
+            before = fields.setdefault(name, self._bumpers if name == "bumpers" else "ok")
+            if begin_ns <= now_ns < end_ns:
+                both = name == "bumpers" and "silent" not in (value, before)
+                fields[name] = "".join(map(max, value, before)) if both else value
+        fields = {name: value for name, value in fields.items() if value != "silent"}
+        if fields:
+            self._tell(now_ns, fields)
 
-    def _tell(self, now_ns: int, fields: str) -> None:
+    def _tell(self, now_ns: int, fields: dict[str, str]) -> None:
         if not self.muted and now_ns >= self._boot_until_ns:
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
@@ -348,10 +355,11 @@ class FakeMcu(Faults):
             amps += START_AMPS
         self._charge = max(0.0, self._charge - amps * seconds / self._capacity)
         volts = EMPTY_VOLTS + CHARGED_VOLTS * self._charge - RESISTANCE * amps
-        self._tell(now_ns, f"volts={volts:.2f} amps={-amps:.2f} charge={100 * self._charge:.0f}%")
+        charge = f"{100 * self._charge:.0f}%"
+        self._tell(now_ns, {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge})
 
     def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
-        """Send a status line at once when the input changes."""
+        """Send a status line at once when an input changes."""
         for change_ns in (begin_ns, end_ns):
             if self._now_ns <= change_ns < NEVER_NS:
                 self._schedule(change_ns, "status", b"")
@@ -360,18 +368,40 @@ class FakeMcu(Faults):
 
     def estop(self) -> Fault:
         """Report a released emergency stop, ten times a second and at once when it changes."""
-        return self._input("ok")
+        return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
         """Report an emergency stop that is pressed in `after_s` s, for `length_s` s (0: it stays).
 
         Before and after that it is released.
         """
-        return self._input("pressed", after_s, length_s)
+        return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
         """Report a released emergency stop, and nothing about it between these times."""
-        return self._input("silent", after_s, length_s)
+        return self._input("estop", "silent", after_s, length_s)
+
+    def bumpers(self) -> Fault:
+        """Report released bumpers: those of `safety.bumpers`, or four if it is empty."""
+        return self._input("bumpers", self._bumpers)
+
+    def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
+        """Report that bumper `number` is pressed in `after_s` s, for `length_s` s (0: it stays).
+
+        The first bumper of the board has the number 1.
+        """
+        marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
+        return self._input("bumpers", "".join(marks), after_s, length_s)
+
+    def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
+        """Report released bumpers, and nothing about them between these times."""
+        return self._input("bumpers", "silent", after_s, length_s)
+
+    def driver_fault(self, after_s: float, length_s: float) -> Fault:
+        """Report a fault of a motor driver between these times, and motor drivers without fault
+        before and after them.
+        """
+        return self._input("driver", "fault", after_s, length_s)
 
     @contextmanager
     def battery(self, percent: float, minutes: float) -> Iterator[None]:
@@ -391,7 +421,9 @@ class FakeMcu(Faults):
             yield
 
     @contextmanager
-    def _input(self, word: str, after_s: float = 0.0, length_s: float = 0.0) -> Iterator[None]:
+    def _input(
+        self, field: str, value: str, after_s: float = 0.0, length_s: float = 0.0
+    ) -> Iterator[None]:
         begin_ns = self._now_ns + int(after_s * NS_PER_S)
         end_ns = begin_ns + int(length_s * NS_PER_S) if length_s else NEVER_NS
         clock = self._inputs_clock
@@ -399,7 +431,7 @@ class FakeMcu(Faults):
             clock = b"inputs %d" % next(self._order)
             self._schedule(self._now_ns + STATUS_NS, "inputs", clock)
         self._schedule_changes(begin_ns, end_ns)
-        inputs = (*self._inputs, (begin_ns, end_ns, word))
+        inputs = (*self._inputs, (begin_ns, end_ns, field, value))
         with self._with(_inputs=inputs, _inputs_clock=clock):
             yield
         self._schedule(self._now_ns, "status", b"")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 from msgspec import Struct
@@ -126,9 +126,9 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
     return body + b"*%04X" % _crc(body, _crc_of_plain(text))
 
 
-def status(fields: str, check: bool) -> bytes:
-    """Return the status line with these fields, such as `estop=ok volts=24.31`."""
-    text = f"!status {fields}".encode()
+def status(fields: Mapping[str, str], check: bool) -> bytes:
+    """Return the status line with these fields, such as `{"estop": "ok"}`."""
+    text = "".join(["!status", *(f" {name}={value}" for name, value in fields.items())]).encode()
     return text + (b"*%04X" % _crc(text) if check else b"") + b"\r\n"
 
 

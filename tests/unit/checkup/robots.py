@@ -155,9 +155,18 @@ class Person(Nobody):
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self.presses = {"emergency stop": 0, **{f"bumper {i}": i for i in range(1, 5)}}
+        """The input that the person presses for each name; without an entry none."""
+        self._pressed = ExitStack()
 
     def doing(self, text: str) -> None:
         self._robot.turned.clear()
+        for name, number in self.presses.items():
+            if text.startswith(f"press the {name} and"):
+                mcu, times = self._robot.mcu, (2.0, 0.5)
+                self._pressed.enter_context(
+                    mcu.bumper_pressed(number, *times) if number else mcu.estop_pressed(*times)
+                )
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         assert not any(abs(v) > 0.5 for v in self._robot.mcu.vehicle.speeds), "asked at speed"
@@ -165,6 +174,8 @@ class Person(Nobody):
         seen = self._robot.turned
         if len(answers) == 1:
             return answers[0]
+        if "ready" in answers:
+            return "ready"
         if "forward" in answers:
             return "forward" if next(iter(seen.values())) else "back"
         names = list(SHORT)
@@ -174,9 +185,11 @@ class Person(Nobody):
 class Checked:
     """The findings of a check of one robot."""
 
-    def __init__(self, robot: Robot, person: bool = False) -> None:
+    def __init__(self, robot: Robot, person: bool | Person = False) -> None:
         self.findings: list[Finding] = []
-        operator = Person(robot) if person else Nobody()
+        operator = person or Nobody()
+        if operator is True:
+            operator = Person(robot)
         with robot.faulty():
             procedure.run(robot, operator, robot.config, self.findings.append)
             self.left_turning = any(robot.later())

@@ -406,6 +406,177 @@ def test_a_checked_link_takes_no_status_line_without_a_checksum() -> None:
     assert bench.robot.snapshot(bench.now_ns).estop == "released"
 
 
+# the bumpers
+
+FREE, FRONT, REAR = [b"!status bumpers=%b\r\n" % marks for marks in (b"..", b"X.", b".X")]
+AWAY = Config(safety=SafetyConfig(bumpers=("front", "rear"), bumper="away"))
+BACK = Twist(-0.5, 0.4)
+
+
+def test_a_bumper_stops_the_robot_at_once_until_a_clear_after_the_release() -> None:
+    bench = Button(FREE)
+    bench.driving()
+    out = bench.status(FRONT).step(GO)
+    assert (out.mode, out.line, out.speeds) == ("stopped", ZERO_LINE, STILL)
+    assert out.reason.startswith("bumper 1 pressed (latched at ")
+    assert out.reason.endswith("; release it there, then call srv/clear")
+    assert {"bumper_pressed", "mode"} <= set(names(out))
+    assert bench.counters()["bumper_presses"] == 1
+    snapshot = bench.robot.snapshot(bench.now_ns)
+    assert (snapshot.bumpers, snapshot.bumper) == ((True, False), "bumper 1 pressed")
+    answer = bench.answer("clear")
+    assert answer.message == "bumper 1 pressed: release it there, then call srv/clear again"
+    bench.status(FREE).step(GO)
+    assert bench.mode() == "stopped"
+    assert bench.answer("clear").success
+    assert bench.step(GO).mode == "ready"
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero() -> None:
+    bench = Button(FREE, AWAY)
+    bench.driving()
+    out = bench.status(FRONT).step(GO)
+    assert (out.mode, out.line, out.latches.in_force) == ("ready", ZERO_LINE, None)
+    assert out.reason.startswith("front bumper pressed: only straight backwards, at most 0.1 m/s; ")
+    for _ in range(50):
+        assert bench.step(BACK).line == ZERO_LINE
+    bench.step(REST)
+    for _ in range(50):
+        out = bench.step(BACK)
+        assert -0.1 <= out.applied.linear < 0.0
+        assert out.applied.angular == 0.0
+    assert (out.mode, out.applied.linear) == ("driving", -0.1)
+    assert out.reason == (
+        "driving: commanded by app; front bumper pressed: only straight backwards, at most 0.1 m/s"
+    )
+
+
+def test_a_tap_in_one_read_stops_a_robot_that_a_bumper_only_limits_and_latches_nothing() -> None:
+    bench = Button(FREE, AWAY)
+    bench.driving()
+    out = bench.status(FRONT + FREE).step(GO)
+    assert (out.mode, out.line, out.latches.in_force) == ("ready", ZERO_LINE, None)
+    bench.status(FREE)
+    assert bench.step(GO).line == ZERO_LINE
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+@each("wrong", [GO, Twist(0.0, 1.0), Twist(0.001, -0.5)])
+def test_a_command_against_a_pressed_bumper_makes_its_sender_unarmed(wrong: Twist) -> None:
+    bench = Button(FRONT, AWAY)
+    bench.linked().step(REST)
+    for _ in range(20):
+        out = bench.step(wrong)
+        assert (out.mode, out.line) == ("ready", ZERO_LINE)
+    assert out.reason.partition("; ")[2].startswith("send a zero first")
+    # The release lets nobody drive who pushed against the obstacle.
+    bench.status(FREE)
+    for _ in range(20):
+        assert bench.step(GO).line == ZERO_LINE
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_a_retreat_goes_on_after_the_release_without_its_limits() -> None:
+    bench = Button(FRONT, AWAY)
+    bench.linked().step(REST)
+    for _ in range(20):
+        bench.step(BACK)
+    bench.status(FREE)
+    for _ in range(100):
+        out = bench.step(BACK)
+    assert (out.mode, out.applied) == ("driving", BACK)
+    assert out.reason == "driving: commanded by app"
+
+
+def test_a_second_bumper_behind_a_retreating_robot_ends_the_retreat() -> None:
+    bench = Button(FRONT, AWAY)
+    bench.linked().step(REST)
+    for _ in range(20):
+        bench.step(BACK)
+    out = bench.status(b"!status bumpers=XX\r\n").step(BACK)
+    assert (out.mode, out.line) == ("ready", ZERO_LINE)
+    for twist in (REST, BACK, REST, GO):
+        assert bench.step(twist).line == ZERO_LINE
+    assert bench.status(REAR).step(REST).mode == "driving"
+    bench.step(GO)
+    assert bench.step(GO).applied.linear > 0.0
+
+
+def test_without_the_neutral_first_rule_a_command_against_a_bumper_still_does_not_count() -> None:
+    config = replace(AWAY, commands=CommandsConfig(neutral_first=False))
+    bench = Button(FREE, config)
+    bench.driving()
+    bench.status(FRONT)
+    for _ in range(20):
+        out = bench.step(GO)
+        assert (out.mode, out.line, out.command_ns) == ("ready", ZERO_LINE, None)
+    assert bench.step(BACK).mode == "driving"
+
+
+def test_silent_bumpers_latch_a_stop_also_if_a_press_would_only_limit() -> None:
+    bench = Button(FREE, AWAY)
+    bench.driving()
+    bench.status(b"")
+    for _ in range(51):
+        out = bench.step(GO)
+    assert out.mode == "stopped"
+    assert out.reason.startswith("the board reported no bumpers for 0.5 s, which counts as pressed")
+    assert bench.robot.snapshot(bench.now_ns).bumpers == (True, True)
+
+
+def test_bumpers_with_places_that_are_not_reported_keep_the_robot_from_ready() -> None:
+    config = Config(safety=SafetyConfig(estop="required", bumpers=("front", "rear")))
+    bench = Button(b"", config)
+    out = bench.linked().step(GO)
+    assert (out.mode, out.link, out.line) == ("waiting", "up", ZERO_LINE)
+    assert out.reason.startswith('safety.estop = "required"')
+    bench.status(OK_LINE).step()
+    assert bench.out.reason == (
+        "safety.bumpers has 2 places, but the microcontroller has not reported 2 bumpers: does its "
+        "firmware send status lines with `bumpers=..`?"
+    )
+    assert bench.status(OK_LINE + FREE).step().mode == "ready"
+
+
+def test_the_emergency_stop_is_named_before_a_bumper() -> None:
+    bench = Button(PRESSED_LINE + FRONT)
+    bench.linked()
+    assert bench.answer("clear").message.startswith("emergency stop pressed at the robot: ")
+    bench.status(OK_LINE + FRONT).step()
+    assert bench.answer("clear").message.startswith("bumper 1 pressed: ")
+
+
+# the motor drivers
+
+DRIVER_OK, DRIVER_FAULT = b"!status driver=ok\r\n", b"!status driver=fault\r\n"
+
+
+def test_a_motor_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
+    bench = Button(DRIVER_OK)
+    bench.driving()
+    out = bench.status(DRIVER_FAULT).step(GO)
+    assert out.mode == "fault"
+    assert out.reason.startswith("the board reports a fault of a motor driver, latched at ")
+    assert out.reason.endswith("; mend it, or switch the robot off and on, then call srv/clear")
+    assert not bench.answer("clear").success
+    bench.status(DRIVER_OK).step(GO)
+    assert bench.mode() == "fault"
+    assert bench.answer("clear").success
+    assert bench.step(GO).mode == "ready"
+
+
+def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
+    bench = Button(PRESSED_LINE + DRIVER_FAULT)
+    bench.linked()
+    assert bench.mode() == "stopped"
+    bench.status(OK_LINE + DRIVER_OK).step()
+    assert bench.answer("clear").success
+
+
 # the battery
 
 

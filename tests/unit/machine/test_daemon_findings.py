@@ -335,6 +335,33 @@ def test_a_required_emergency_stop_that_the_board_does_not_report_is_a_failure()
     assert finding.text.startswith('safety.estop = "required", but the microcontroller')
 
 
+@pytest.mark.parametrize(
+    ("bumpers", "level", "text"),
+    [
+        ([True, False], "warning", "front bumper pressed"),
+        ([True, True], "warning", "front and rear bumpers pressed"),
+        ([False, False], "ok", "the board reports 2 bumpers, and none is pressed"),
+        (None, "failure", "safety.bumpers has 2 places, but the microcontroller has not reported"),
+    ],
+)
+def test_the_bumpers_of_the_board_are_reported(
+    bumpers: list[bool] | None, level: str, text: str
+) -> None:
+    config = replace(CONFIG, safety=SafetyConfig(bumpers=("front", "rear")))
+    state = replace(STATE, bumpers=bumpers)
+    *_, finding = link(Running(INFO, config, state, state, 0))
+    assert (finding.subject, finding.level) == ("bumpers", level)
+    assert finding.text.startswith(text)
+    assert finding.mend.startswith("release it there; if none") == (level == "warning")
+
+
+def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() -> None:
+    config = replace(CONFIG, safety=SafetyConfig(bumpers=("front",), bumper="away"))
+    state = replace(STATE, bumpers=[True])
+    *_, finding = link(Running(INFO, config, state, state, 0))
+    assert finding.mend.startswith("drive straight away from it, or release it there; if none")
+
+
 CHECK = check(Running(INFO, CONFIG, STATE, STATE, 0))
 THRESHOLDS = BatteryConfig(warning_below=22.0, stop_below=21.0)
 

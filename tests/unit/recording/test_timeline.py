@@ -336,6 +336,13 @@ def test_a_pressed_emergency_stop_is_a_serious_incident_and_its_release_is_none(
     assert not is_serious("1 lost port")
 
 
+def test_a_pressed_bumper_is_a_serious_incident_and_its_release_is_none() -> None:
+    events = [TimelineEntry(1.0 + i, "bumper_pressed", "pressed", "error") for i in range(2)]
+    events.append(TimelineEntry(3.0, "bumper_released", "released"))
+    assert summary(events) == "2 bumper hits"
+    assert is_serious(summary(events))
+
+
 def test_a_stop_of_the_battery_is_a_serious_incident_and_another_level_is_none() -> None:
     events = [
         TimelineEntry(1.0, "battery", "21.50 V", "warning"),

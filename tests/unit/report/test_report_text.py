@@ -57,6 +57,22 @@ def test_a_pressed_emergency_stop_is_counted_and_listed_and_drawn_on_the_path() 
     assert "emergency stop" in {key.meaning for key in path_figure(report).keys}
 
 
+def test_a_pressed_bumper_is_counted_and_listed_and_drawn_on_the_path() -> None:
+    def pressed(world: World) -> None:
+        with world.mcu.bumpers():
+            world.drive(0.5, seconds=1.0)
+            with world.mcu.bumper_pressed(2, 0.0, 0.0):
+                world.run(0.5)
+            world.run(0.5)
+
+    report, _ = report_of(pressed)
+    assert summary(report).endswith("There were no faults, no stops, 1 bumper hit.")
+    origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
+    table = dict(rows(report, origin, lambda s, day: f"<{s:.0f}>"))
+    assert table["Bumper hits"].startswith("1: <1800000001> bumper 2 pressed")
+    assert "bumper pressed" in {key.meaning for key in path_figure(report).keys}
+
+
 def test_a_battery_stop_is_counted_and_listed_and_drawn_on_the_path() -> None:
     config = Config(battery=BatteryConfig(stop_below=21.0))
 

@@ -207,6 +207,21 @@ def test_an_ignored_emergency_stop_is_a_warning() -> None:
     )
 
 
+def test_ignored_bumpers_are_a_warning() -> None:
+    (warning,) = warnings(Config(safety=SafetyConfig(bumper="off")))
+    assert warning == 'safety.bumper = "off": the robot ignores bumpers that its board reports'
+
+
+def test_motion_away_from_a_bumper_needs_its_place() -> None:
+    away = Config(safety=SafetyConfig(bumper="away"))
+    assert contradictions(away) == [
+        'safety.bumper = "away" needs the place of each bumper, but safety.bumpers = []; write '
+        'safety.bumpers = ["front", "rear"] in the order of the board, or safety.bumper = "stop"'
+    ]
+    placed = Config(safety=SafetyConfig(bumpers=("rear",), bumper="away"))
+    assert contradictions(placed) == []
+
+
 @each(
     ("battery", "problem"),
     [
@@ -256,6 +271,10 @@ def test_a_required_emergency_stop_needs_room_on_a_slow_wire() -> None:
         'safety.estop = "required": status lines take 29% of the wire at 9600 baud, and replies at '
         "control.rate = 23 do not fit beside them; 14 Hz is comfortable"
     )
+    bumpers = SafetyConfig(bumpers=("front", "rear"))
+    (warning,) = warnings(replace(config, safety=bumpers))
+    assert warning.startswith('safety.bumpers = ["front", "rear"]: status lines take 29% of the')
+    assert len(warnings(replace(config, safety=replace(bumpers, bumper="off")))) == 1
     safe = SafetyConfig(estop="required")
     assert warnings(Config(mcu=slow, control=ControlConfig(rate=14.0), safety=safe)) == []
     assert warnings(Config(safety=safe)) == []

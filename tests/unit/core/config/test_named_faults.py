@@ -51,6 +51,9 @@ REFUSED = [
     ("stalls=0.2:0.2", "fewer seconds for each"),
     ("estop_pressed=-1:2", "give the seconds from the start until it begins"),
     ("estop_silent=1:-2", "give the seconds from the start until it begins"),
+    ("bumper_pressed=5:1:2", "the bumpers are 1 to 4, in the order of the board"),
+    ("bumper_pressed=1:-1:2", "give the seconds from the start until it begins"),
+    ("driver_fault=1:-2", "give the seconds from the start until it begins"),
     ("stalls=5:0", "both at least 0.001"),
     ("stalls=5:0.0009", "both at least 0.001"),
 ]

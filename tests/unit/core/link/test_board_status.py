@@ -5,13 +5,15 @@ from __future__ import annotations
 import binascii
 import random
 from collections import Counter
+from contextlib import suppress
 
 import pytest
 
-from acsard.core.config.settings import WheelMap
+from acsard.core.config.settings import Place, SafetyConfig, WheelMap
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged, shown
 from acsard.core.link.checksum import unseal
 from acsard.core.link.codec import Codec, FrameError
+from acsard.core.motion.bumpers import Bumpers
 from acsard.core.motion.emergency_stop import SILENT_S, EmergencyStop
 from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S
@@ -97,7 +99,7 @@ def test_a_checksum_must_be_right_and_a_checked_link_requires_it() -> None:
 @each("check", [False, True])
 @each("word", ["ok", "pressed"])
 def test_the_simulated_board_writes_the_same_line(word: str, check: bool) -> None:
-    line = protocol.status(f"estop={word}", check)
+    line = protocol.status({"estop": word}, check)
     assert line == (sealed(b"!status estop=" + word.encode()) if check else
                     b"!status estop=" + word.encode()) + b"\r\n"  # fmt: skip
 
@@ -206,6 +208,37 @@ def test_damage_makes_no_release_of_a_press(count: int, check: bool) -> None:
     assert taken["pressed"] == 0
 
 
+@each("check", [False, True])
+@pytest.mark.parametrize(
+    "count",
+    [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
+)
+@pytest.mark.parametrize("places", [("front", "rear", "left", "right"), ()])
+def test_damage_makes_no_release_of_a_pressed_bumper(
+    places: tuple[Place, ...], count: int, check: bool
+) -> None:
+    dice, extra = random.Random(34), (b"", b" volts=24.31", b" driver=ok temp=41.5")
+    # A release stays until the next line that counts, so each damaged line has bumpers of its own.
+    for number in range(count // 4):
+        bumpers, marks = Bumpers(SafetyConfig(bumpers=places)), bytearray(b"....")
+        for pressed in dice.sample(range(4), dice.randint(1, 4)):
+            marks[pressed] = b"X"[0]
+        line = STATUS + b" bumpers=" + marks + dice.choice(extra)
+        line = sealed(line) if check else line
+        whole = [(number, decode_status.__wrapped__(line, check))]
+        bumpers.look(whole, number)
+        for _ in range(4):
+            heard = damaged(line, (line, *REPLIES), dice)
+            if heard.startswith(STATUS):
+                with suppress(FrameError):
+                    status = decode_status.__wrapped__(heard, check)
+                    bumpers.look([(number, status)], number)
+            assert bumpers.state == "pressed", (number, line, heard)
+            if not places:
+                # Without places only a single damaged line is known by its number of bumpers.
+                bumpers.look(whole, number)
+
+
 def test_only_half_a_second_of_damage_is_a_false_press() -> None:
     """Of each two lines one is damaged: each false press is a run of five lines, and no other."""
     dice, estop = random.Random(5), EmergencyStop("auto")
@@ -213,7 +246,7 @@ def test_only_half_a_second_of_damage_is_a_false_press() -> None:
     for step in range(200_000):
         now_ns, reports = step * step_ns, []
         if step % 10 == 0 and (step == 0 or dice.random() < 0.5):
-            reports = [(now_ns, decode_status(OK, False).estop)]
+            reports = [(now_ns, decode_status(OK, False))]
             last_ns = now_ns
         estop.look(reports, now_ns)
         presses += bool(estop.pressed_now)

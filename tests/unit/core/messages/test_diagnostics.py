@@ -19,7 +19,9 @@ from acsard.core.config.settings import (
 from acsard.core.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.battery import MISSING as MISSING_BATTERY
-from acsard.core.motion.emergency_stop import MISSING, PRESSED, SILENT
+from acsard.core.motion.bumpers import SILENT as SILENT_BUMPERS
+from acsard.core.motion.bumpers import missing
+from acsard.core.motion.emergency_stop import DRIVER_FAULT, MISSING, PRESSED, SILENT
 from acsard.core.values import (
     BatteryLevel,
     BatteryStatus,
@@ -36,6 +38,7 @@ from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
 
 CONFIG = Config(robot=RobotConfig("r7"), mcu=McuConfig(port="/dev/x"))
+BUMPERS = replace(CONFIG, safety=SafetyConfig(bumpers=("front", "rear")))
 NO_CERTIFICATE = (0, "")
 
 
@@ -107,6 +110,35 @@ def test_a_required_input_has_its_row_before_the_board_reports_it() -> None:
     one = row("board", config)
     assert (one.level, one.message) == (ERROR, MISSING)
     assert row("board", config, snapshot=seen(estop="released")).level == OK
+
+
+@each(
+    ("bumpers", "why", "level", "message"),
+    [
+        (None, "", ERROR, missing(BUMPERS.safety)),
+        ((False, False), "", OK, "2 bumpers released"),
+        ((True, False), "front bumper pressed", WARN, "front bumper pressed"),
+        ((True, True), SILENT_BUMPERS, ERROR, SILENT_BUMPERS),
+    ],
+)
+def test_the_row_of_the_board_has_its_bumpers(
+    bumpers: Any, why: str, level: int, message: str
+) -> None:
+    counters = {"bumper_presses": 1, "lines": 9}
+    snapshot = seen(estop="released", bumpers=bumpers, bumper=why, counters=counters)
+    one = row("board", BUMPERS, snapshot=snapshot)
+    assert (one.level, one.message) == (level, f"emergency stop released; {message}")
+    assert values(one) == {"bumper_presses": "1"}
+
+
+def test_bumpers_that_are_ignored_need_no_row() -> None:
+    off = replace(BUMPERS, safety=replace(BUMPERS.safety, bumper="off"))
+    assert "acsard: board" not in [one.name for one in rows(off)]
+
+
+def test_a_motor_drivers_fault_is_an_error_of_the_board() -> None:
+    one = row("board", snapshot=seen(board={"motor_driver": "fault"}))
+    assert (one.level, one.message) == (ERROR, f"no emergency-stop input; {DRIVER_FAULT}")
 
 
 BATTERY = replace(CONFIG, battery=BatteryConfig(warning_below=22.0, stop_below=21.0))

@@ -8,12 +8,13 @@ from typing import get_args
 import pytest
 
 from acsard.core.config.settings import EstopUse
+from acsard.core.link.board_status import BoardStatus
 from acsard.core.motion.emergency_stop import (
-    MENDS,
+    CHECK,
     PRESSED,
+    RELEASE,
     SILENT,
     TABLE,
-    WORDS,
     EmergencyStop,
     Sign,
 )
@@ -43,7 +44,7 @@ class Input:
     def step(self, *reports: bool | None, ms: int = 10) -> str:
         """Take these reports `ms` after the step before, and return the state."""
         self.now_ms += ms
-        told = [(self.now_ms * MS, pressed) for pressed in reports]
+        told = [(self.now_ms * MS, BoardStatus(estop=pressed)) for pressed in reports]
         self.events += [event.name for event in self.estop.look(told, self.now_ms * MS)]
         return self.estop.state
 
@@ -64,25 +65,29 @@ def test_the_table_is_the_one_drawn_by_hand() -> None:
 
 
 def test_each_state_that_counts_as_pressed_has_words_and_a_remedy() -> None:
-    assert WORDS == {"pressed": PRESSED, "silent": SILENT}
-    assert set(MENDS) == {PRESSED, SILENT}
+    pin = Input()
+    pin.step(True)
+    assert (pin.estop.why, pin.estop.mend) == (PRESSED, RELEASE)
+    pin.step(False)
+    pin.quiet(510)
+    assert (pin.estop.why, pin.estop.mend) == (SILENT, CHECK)
 
 
 def test_an_input_that_is_never_reported_is_never_pressed() -> None:
     pin = Input()
     assert pin.quiet(2000) == pin.step(None) == ""
-    assert (pin.estop.held, pin.events) == ("", [])
+    assert (pin.estop.why, pin.events) == ("", [])
 
 
 def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
     pin = Input()
     pin.step(False)
     assert pin.step(True) == "pressed"
-    assert pin.estop.pressed_now == pin.estop.held == PRESSED
+    assert pin.estop.pressed_now == pin.estop.why == PRESSED
     assert pin.step(True) == "pressed"
-    assert (pin.estop.pressed_now, pin.estop.held) == ("", PRESSED)
+    assert (pin.estop.pressed_now, pin.estop.why) == ("", PRESSED)
     assert pin.step(False) == "released"
-    assert pin.estop.held == ""
+    assert (pin.estop.why, pin.estop.pressed) == ("", (False,))
     assert pin.events == ["emergency_stop_released", "emergency_stop", "emergency_stop_released"]
 
 
@@ -90,7 +95,7 @@ def test_a_press_and_its_release_in_one_read_still_count() -> None:
     pin = Input()
     pin.step(False)
     assert pin.step(True, False) == "released"
-    assert (pin.estop.pressed_now, pin.estop.held) == (PRESSED, "")
+    assert (pin.estop.pressed_now, pin.estop.why) == (PRESSED, "")
 
 
 def test_the_first_report_may_be_a_press() -> None:
@@ -104,7 +109,7 @@ def test_half_a_second_without_the_input_counts_as_pressed() -> None:
     pin.step(False)
     assert pin.quiet(500) == "released"
     assert pin.step(None) == "silent"
-    assert pin.estop.pressed_now == pin.estop.held == SILENT
+    assert pin.estop.pressed_now == pin.estop.why == SILENT
     assert pin.quiet(1000) == "silent"
     assert pin.estop.pressed_now == ""
     assert pin.step(True) == "pressed"

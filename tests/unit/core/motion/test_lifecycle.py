@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.emergency_stop import MENDS, PRESSED, SILENT
+from acsard.core.motion.emergency_stop import CHECK, PRESSED, RELEASE, SILENT
 from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
@@ -51,7 +51,7 @@ def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool
 
 def press(life: Lifecycle, seconds: float, why: str = PRESSED) -> None:
     life.press(why, at(seconds))
-    life.hold(why, MENDS[why])
+    life.hold(why, CHECK if why == SILENT else RELEASE)
 
 
 def number(life: Lifecycle) -> int:
@@ -432,7 +432,7 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, number(life))
     assert str(caught.value) == f"{PRESSED}: release it there, then call srv/clear again"
-    life.hold()
+    life.hold("", "")
     assert (mode(life), life.why) == (Mode.STOPPED, f"{latched}; call srv/clear")
     assert clear(life, 9.5, number(life)).startswith("cleared; ")
     assert mode(life) is Mode.READY
@@ -457,18 +457,43 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
         f"a wheel is dead, latched at {AT}:03 UTC; also {PRESSED}; also {stopped}; release it "
         "there, then call srv/clear twice"
     )
-    life.hold()
+    life.hold("", "")
     assert clear(life, 9.0).startswith("fault cleared; still stopped by joe: ")
     assert life.why == f"{stopped}; call srv/clear"
+
+
+def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
+    life = ready()
+    life.fault("a motor driver is hot", at(1.0))
+    life.hold("a motor driver is hot", "let it cool")
+    fault = f"a motor driver is hot, latched at {AT}:01 UTC"
+    assert life.why == f"{fault}; let it cool, then call srv/clear"
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 9.0, number(life))
+    assert str(caught.value) == "a motor driver is hot: let it cool, then call srv/clear again"
+    stop(life, 10.0, "joe")
+    assert life.why == (
+        f"{fault}; also stopped by joe at {AT}:10 UTC; let it cool, then call srv/clear twice"
+    )
+
+
+def test_a_fault_beside_one_that_the_board_reports_names_both() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(1.0))
+    life.hold("a motor driver is hot", "let it cool")
+    assert life.why == (
+        f"a wheel is dead, latched at {AT}:01 UTC; also a motor driver is hot; let it cool, then "
+        "call srv/clear"
+    )
 
 
 def test_a_press_after_a_release_is_a_new_latch() -> None:
     life = ready()
     press(life, 1.0)
     seen = number(life)
-    life.hold()
+    life.hold("", "")
     press(life, 5.0)
-    life.hold()
+    life.hold("", "")
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
@@ -480,7 +505,7 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
 def test_a_plain_clear_is_refused_right_after_a_press() -> None:
     life = ready()
     press(life, 1.0)
-    life.hold()
+    life.hold("", "")
     with pytest.raises(RefusedError) as caught:
         clear(life, 1.5)
     assert str(caught.value).startswith(f"the robot was stopped ({PRESSED}) 0.5 s ago: look at")
@@ -654,7 +679,7 @@ FACTS: dict[str, Do] = {
     "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
     "leave": lambda life, _: life.leave(),
     "press": lambda life, now: press(life, now),
-    "release": lambda life, _: life.hold(),
+    "release": lambda life, _: life.hold("", ""),
 }
 
 REQUESTS: dict[str, Do] = {

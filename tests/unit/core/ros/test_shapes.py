@@ -84,8 +84,8 @@ def test_state_is_the_same_field_by_field() -> None:
     # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
     # An exported recording does not contain the configuration file, and the robot that a replay
     # makes knows no speed limit, only the setting that it lowers. Diagnostics report the emergency
-    # stop, and `reason` says that it is pressed. The battery has a topic of its own.
+    # stop and the bumpers, and `reason` says which one is pressed. The battery has its own topic.
     assert left_out == {
         "stamp", "latencies", "encoder_counts", "latch", "latch_file_error", "settings_differ",
-        "speed_limit", "emergency_stop", "battery",
+        "speed_limit", "emergency_stop", "bumpers", "battery",
     }  # fmt: skip

@@ -1,0 +1,79 @@
+"""Asks the operator to press the emergency stop and each bumper, and compares the status lines.
+
+The board reports the inputs in status lines (`core/link/board_status.py`). The step comes last,
+because a pressed emergency stop cuts the motors, and some drivers must be enabled again after it.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from acsard.checkup import outcomes
+from acsard.checkup.board import Board, Operator
+from acsard.checkup.findings import Finding
+from acsard.core.config.settings import SafetyConfig
+
+PRESS_S = 20.0
+"""Time that the operator has to press an input and to release it, s."""
+
+NEWS_S = 0.5
+"""Time in which a board reports each of its inputs, s."""
+
+
+class Input(Struct, frozen=True):
+    """An input of the board."""
+
+    number: int
+    """0 for the emergency stop; the bumpers follow from 1 in the order of the board."""
+    name: str
+
+
+def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
+    """Let the operator press each input that the configuration names or the board reports."""
+    board.ask(NEWS_S)
+    estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
+    places = () if safety.bumper == "off" else safety.bumpers
+    names = [f"{place} bumper" for place in places]
+    # Two bumpers at one place are distinguished by their numbers.
+    same = [names.count(name) > 1 for name in names]
+    inputs = [Input(0, "emergency stop")] if estop else []
+    inputs += [
+        Input(i + 1, f"{name} ({i + 1})" if same[i] else name) for i, name in enumerate(names)
+    ]
+    if not inputs:
+        return outcomes.find("inputs: none")
+    listed = ", ".join(each.name for each in inputs)
+    counted = sum(number > 0 for number in board.inputs)
+    if (estop and 0 not in board.inputs) or (places and counted != len(places)):
+        fields = [*["estop=ok"] * estop, *["bumpers=" + "." * len(places)] * bool(places)]
+        return outcomes.find("inputs: missing", listed=listed, fields=" ".join(fields))
+    question = (
+        f"The inputs of the board: {listed}. You will press and release each of them once. Type "
+        '"ready" when you stand at the robot, or "skip":'
+    )
+    if operator.ask(question, ("ready", "skip")) != "ready":
+        return outcomes.find("inputs: not pressed", listed=listed)
+    wrong = [text for each in inputs if (text := _pressed(board, operator, each, inputs))]
+    if wrong:
+        right = f"{len(inputs) - len(wrong)} of {len(inputs)} right"
+        return outcomes.find("inputs: wrong", figure=right, wrong="; ".join(wrong))
+    return outcomes.find("inputs: right", listed=listed)
+
+
+def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
+    """Let the operator press one input; return what is wrong with it, or ""."""
+    operator.doing(f"press the {asked.name} and release it, within {PRESS_S:g} s")
+    end_s, seen = board.now_s + PRESS_S, set[int]()
+    while board.now_s < end_s:
+        board.ask()
+        now = {number for number, pressed in board.inputs.items() if pressed}
+        seen |= now
+        if seen and not now:
+            break
+    others = [each.name for each in inputs if each.number in seen - {asked.number}]
+    if asked.number not in seen:
+        instead = f" but of the {' and the '.join(others)}" if others else ""
+        return f"{asked.name}: no press was reported{instead}"
+    if others:
+        return f"{asked.name}: the {' and the '.join(others)} was reported with it"
+    return "" if not now else f"{asked.name}: no release was reported"

@@ -1,0 +1,134 @@
+"""Follows the bumpers that the board reports, and decides which motion they allow.
+
+A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"` it latches a stop,
+as the emergency stop does. With "away" it latches nothing: each sender must send a zero, and until
+the release the robot only drives straight away from the bumper, at most at `AWAY_SPEED`. No turn is
+allowed meanwhile, because a corner of the robot could sweep into the obstacle. A robot with four
+wheels cannot move sideways, so no motion leads away from the left or the right.
+
+A board that is silent about bumpers that it reported latches a stop in both cases. A bumper is not
+a safety function either: the status line may be lost or late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from acsard.core.config.settings import Place, SafetyConfig
+from acsard.core.formatting import many
+from acsard.core.link.board_status import BoardStatus
+from acsard.core.motion.emergency_stop import SILENT_S, TABLE, BoardInput
+from acsard.core.values import REST, Twist
+
+AWAY_SPEED = 0.1
+"""Highest speed away from a pressed bumper, m/s."""
+
+DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
+"""The sign of the speeds that lead away from a bumper, 0 if none does."""
+
+ALLOWED = {-1: "backwards", 1: "forwards"}
+
+SILENT = f"the board reported no bumpers for {SILENT_S:g} s, which counts as pressed"
+
+
+def missing(safety: SafetyConfig) -> str:
+    """Return why a robot whose board has not reported its bumpers does not become ready."""
+    count = len(safety.bumpers)
+    return (
+        f"safety.bumpers has {many(count, 'place')}, but the microcontroller has not reported "
+        f"{many(count, 'bumper')}: does its firmware send status lines with "
+        f"`bumpers={'.' * count}`?"
+    )
+
+
+def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
+    """Return which bumpers are pressed, by their places, or by their numbers without places."""
+    numbers = [i for i, on in enumerate(pressed) if on]
+    if not places:
+        joined = " and ".join(str(i + 1) for i in numbers)
+        return f"bumper{'s' * (len(numbers) > 1)} {joined} pressed"
+    named = dict.fromkeys(places[i] for i in numbers)
+    return f"{' and '.join(named)} bumper{'s' * (len(named) > 1)} pressed"
+
+
+class Bumpers(BoardInput):
+    """The state of all bumpers."""
+
+    # While a bumper is pressed, a silent board may not show another press.
+    table = TABLE | {("pressed", "silence"): "silent"}
+    silent, events = SILENT, ("bumper_pressed", "bumper_released")
+
+    def __init__(self, safety: SafetyConfig) -> None:
+        off = safety.bumper == "off"
+        super().__init__("off" if off else "required" if safety.bumpers else "auto")
+        self._places = safety.bumpers
+        self._away = safety.bumper == "away" and len(safety.bumpers) > 0
+        self._count = 0
+        """Number of bumpers in the last status line with bumpers."""
+
+    @property
+    def limiting(self) -> bool:
+        """Whether a pressed bumper allows only some motion, and latches nothing."""
+        return self._away and self.state == "pressed"
+
+    @property
+    def latching(self) -> bool:
+        """Whether a press latches a stop. Silence of the board always does."""
+        return not self._away or self.state == "silent"
+
+    @property
+    def held(self) -> str:
+        """Why a stop stays latched, in words; "" if the bumpers keep no latch."""
+        return self.why if self.latching else ""
+
+    def away(self, twist: Twist) -> Twist | None:
+        """Return the part of a twist that the pressed bumpers allow.
+
+        That is rest for rest, and the straight part within `AWAY_SPEED` for a twist that leads away
+        from every pressed bumper. It is None for every other twist.
+        """
+        if twist == REST:
+            return REST
+        speed = twist.linear * self._direction()
+        return Twist(self._direction() * min(speed, AWAY_SPEED)) if speed > 0.0 else None
+
+    def note(self) -> str:
+        """Return which motion the pressed bumpers allow, in words."""
+        allowed = ALLOWED.get(self._direction())
+        if allowed is None:
+            return f"{self.why}: no motion leads away, so the robot stands until the release"
+        return f"{self.why}: only straight {allowed}, at most {AWAY_SPEED:g} m/s"
+
+    def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
+        """Return which bumpers a status line reports as pressed, None if it does not report them.
+
+        A line with the wrong number of bumpers may have lost a pressed one, so it releases none.
+        """
+        bumpers = status.bumpers
+        if bumpers is None:
+            return None
+        expected = len(self._places) or self._count
+        self._count = len(bumpers)
+        if len(bumpers) == expected or (any(bumpers) and not self._places):
+            return bumpers
+        return None
+
+    def words(self) -> str:
+        """Return which bumpers are pressed, as a reason."""
+        return pressed_words(self._places, self.pressed or ())
+
+    def advice(self) -> str:
+        """Return what follows from a press, for the log."""
+        return self.note().partition(": ")[2] if self.limiting else super().advice()
+
+    def released(self, first: bool) -> str:
+        """Return the text that logs a release or, if `first`, the first report."""
+        if first:
+            count = len(self.pressed or ())
+            return f"the board reports {many(count, 'bumper')}, and none is pressed"
+        return "released; a stop stays latched until srv/clear"
+
+    def _direction(self) -> int:
+        pressed = zip(self._places, self.pressed or (), strict=True)
+        signs = {DIRECTIONS[place] for place, on in pressed if on}
+        return signs.pop() if len(signs) == 1 else 0

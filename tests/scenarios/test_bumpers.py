@@ -1,0 +1,194 @@
+"""The bumpers and the motor drivers, as the board reports them, in the whole daemon."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from acsard.core.config.settings import Config, Place, SafetyConfig, SimConfig
+from acsard.core.values import Outputs
+from tests.scenarios.taped import Tape, replayed
+from tests.scenarios.test_emergency_stop import MOST, Watch, out_of
+from tests.scenarios.world import World
+
+PLACES: tuple[Place, ...] = ("front", "rear", "left", "right")
+STOP = Config(safety=SafetyConfig(bumpers=PLACES))
+AWAY = Config(safety=SafetyConfig(bumpers=PLACES, bumper="away"))
+COMMANDS = ((0.8, 0.5), (-0.8, 0.5), (0.8, 0.0), (-0.8, 0.0), (0.0, 2.0), (0.05, -1.0))
+
+
+class Lines:
+    """Follows a world, and notes the first line of the period in which a bumper was pressed."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.pressed_ns, self._before, self._lines, self._first = 0, False, 0, 0
+        self.applied: list[tuple[float, float]] = []
+        world.watch = self.look
+
+    def begin(self) -> None:
+        """Forget the lines and the speeds so far."""
+        self.world.port.sent.clear()
+        self.applied.clear()
+        self._lines = 0
+
+    def look(self, outputs: Outputs) -> None:
+        """Note the step in which the daemon learns of the press."""
+        pressed = any(self.world.loop.robot.snapshot(outputs.now.mono_ns).bumpers or ())
+        if pressed > self._before:
+            self.pressed_ns, self._first = outputs.now.mono_ns, self._lines
+            self.applied.clear()
+        self._before, self._lines = pressed, len(self.world.port.sent)
+        self.applied.append((outputs.applied.linear, outputs.applied.angular))
+
+    @property
+    def first(self) -> tuple[int, bytes]:
+        """Time from the press to the first line that left after it, ns, and that line."""
+        at_ns, line = self.world.port.sent[self._first]
+        return at_ns - self.pressed_ns, line
+
+
+@pytest.mark.parametrize("count", MOST)
+@pytest.mark.parametrize("config", [STOP, Config()], ids=["places", "no places"])
+def test_each_press_stops_the_robot_within_a_period_until_a_clear(
+    config: Config, count: int
+) -> None:
+    world, dice = World(config), random.Random(count)
+    watch, slowest_ns = Watch(world), 0
+    with world.mcu.bumpers():
+        world.run(0.5)
+        for _ in range(count):
+            number = dice.randint(1, 4)
+            watch.begin()
+            world.drive(*dice.choice(COMMANDS), seconds=0.5)
+            world.run(dice.uniform(0.0, 0.03))
+            with world.mcu.bumper_pressed(number, 0.0, 0.0):
+                world.run(0.05)
+                assert world.state.bumpers == [i == number for i in range(1, 5)]
+                name = PLACES[number - 1] + " bumper" if config is STOP else f"bumper {number}"
+                assert f"{name} pressed (latched at " in world.state.reason
+                slowest_ns = max(slowest_ns, watch.waited_ns)
+                assert not world.call("clear").success
+                world.hold(0.8, 0.5, seconds=0.1)
+            world.hold(-0.8, 0.5, seconds=0.3)
+            assert not watch.moved
+            assert (world.state.mode, world.state.bumpers) == ("stopped", [False] * 4)
+            out_of(world)
+    assert slowest_ns <= world.period_ns
+
+
+@pytest.mark.parametrize("count", MOST)
+@pytest.mark.parametrize(("place", "sign"), [*zip(PLACES, (-1, 1, 0, 0), strict=True)])
+def test_a_bumper_that_limits_stands_within_a_period_and_then_lets_it_only_away(
+    place: Place, sign: int, count: int
+) -> None:
+    world, dice = World(AWAY), random.Random(count)
+    lines, slowest_ns, retreats = Lines(world), 0, 0
+    number = PLACES.index(place) + 1
+    with world.mcu.bumpers():
+        world.run(0.5)
+        for _ in range(count):
+            lines.begin()
+            world.drive(*dice.choice(COMMANDS), seconds=0.5)
+            world.run(dice.uniform(0.0, 0.03))
+            with world.mcu.bumper_pressed(number, 0.0, 0.0):
+                world.hold(*dice.choice(COMMANDS), seconds=0.1)
+                waited_ns, line = lines.first
+                assert line.startswith(b"ap00.00,bp00.00,cp00.00,dp00.00")
+                slowest_ns = max(slowest_ns, waited_ns)
+                assert world.state.reason.startswith(f"{place} bumper pressed: ")
+                # Each sender must send a zero first.
+                assert {*lines.applied} == {(0.0, 0.0)}
+                for command in dice.sample(COMMANDS, 3):
+                    world.drive(*command, seconds=0.4)
+                    assert world.state.mode == ("driving" if command[0] * sign > 0 else "ready")
+                assert all(0.0 <= v * sign <= 0.1 and w == 0.0 for v, w in lines.applied)
+                assert sign or {*lines.applied} == {(0.0, 0.0)}
+                retreats += any(v for v, _ in lines.applied)
+                world.hold(-0.8 * (sign or 1), seconds=0.2)
+                lines.applied.clear()
+            # A sender that pushed against the obstacle at the release does not drive on.
+            world.hold(-0.8 * (sign or 1), seconds=0.3)
+            assert {*lines.applied} == {(0.0, 0.0)}
+            assert world.state.latch == 0
+    assert slowest_ns <= world.period_ns
+    assert (retreats > 0) == (sign != 0)
+
+
+def test_the_virtual_robot_moves_away_from_the_obstacle() -> None:
+    world = World(AWAY)
+    with world.mcu.bumpers():
+        world.drive(0.5, seconds=2.0)
+        with world.mcu.bumper_pressed(1, 0.0, 0.0):
+            world.hold(0.5, seconds=0.5)
+            x = world.state.x
+            world.hold(0.5, seconds=1.0)
+            assert world.state.x == pytest.approx(x, abs=0.001)
+            world.drive(-0.8, 0.5, seconds=2.0)
+            assert world.state.x == pytest.approx(x - 0.2, abs=0.03)
+            assert world.state.yaw == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_board_that_falls_silent_about_its_bumpers_stops_the_robot() -> None:
+    world = World(Config(safety=AWAY.safety, sim=SimConfig(faults=("bumpers_silent=2:3",))))
+    world.run(0.2)
+    world.drive(0.5, seconds=1.7)
+    assert world.state.mode == "driving"
+    world.hold(0.5, seconds=0.7)
+    assert (world.state.mode, world.state.bumpers) == ("stopped", [True] * 4)
+    assert not world.call("clear").success
+    world.run(3.0)
+    assert (world.state.mode, world.state.bumpers) == ("stopped", [False] * 4)
+    assert world.call("clear").success
+
+
+def test_the_simulator_presses_two_bumpers_and_a_driver_fails_as_configured() -> None:
+    faults = ("bumper_pressed=1:2:2", "bumper_pressed=3:3:2", "bumpers", "driver_fault=6:0")
+    world = World(Config(sim=SimConfig(faults=faults)))
+    marks = []
+    world.run(0.05)
+    for _ in range(11):
+        world.run(0.5)
+        assert world.state.bumpers is not None
+        marks.append("".join("X" if pressed else "." for pressed in world.state.bumpers))
+    assert marks == ["...."] * 3 + ["X..."] * 2 + ["X.X."] * 2 + ["..X."] * 2 + ["...."] * 2
+    assert world.state.mode == "stopped"
+    assert world.state.counters["bumper_presses"] == 2
+    world.run(1.0)
+    assert world.state.mode == "fault"
+    assert world.state.reason.startswith("the board reports a fault of a motor driver, latched at ")
+    assert not world.call("clear").success
+
+
+def test_a_robot_with_places_waits_for_its_bumpers_and_then_becomes_ready() -> None:
+    world = World(STOP)
+    world.run(1.0)
+    assert (world.state.mode, world.state.link, world.state.bumpers) == ("waiting", "up", None)
+    assert world.state.reason.startswith("safety.bumpers has 4 places, but the microcontroller")
+    with world.mcu.bumpers():
+        world.run(0.2)
+        assert world.state.mode == "ready"
+
+
+@pytest.mark.parametrize("config", [STOP, AWAY], ids=["stop", "away"])
+def test_a_recording_replays_presses_and_releases(config: Config) -> None:
+    config = Config(
+        safety=config.safety,
+        sim=SimConfig(faults=("bumper_pressed=1:2:1", "bumper_pressed=4:3.5:1", "bumpers")),
+    )
+    tape = Tape()
+    world = World(config, recorder=tape)
+    world.drive(0.5, seconds=2.5)
+    assert world.state.bumpers == [True, False, False, False]
+    middle, tape.cut = len(tape.taken) + 1, True
+    world.drive(-0.5, seconds=1.5)
+    while world.state.latch and not world.call("clear").success:
+        world.run(0.2)
+    world.drive(0.5, seconds=1.0)
+    names = {event.name for taken in tape.taken for event in taken.outputs.events}
+    assert {"bumper_pressed", "bumper_released"} <= names
+    for first in (0, middle):
+        comparison = replayed(tape, config, first).comparison
+        assert comparison.first is None
+        assert comparison.steps == len(tape.taken) - first

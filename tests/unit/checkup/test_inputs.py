@@ -1,0 +1,113 @@
+"""Tests of the inputs in the check: the operator presses each of them, and the board reports it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+
+from acsard.checkup import inputs
+from acsard.checkup.findings import Finding
+from acsard.core.config.settings import Config, Place, SafetyConfig
+from tests.unit.checkup.robots import Nobody, Person, Robot
+
+TWO: tuple[Place, ...] = ("front", "rear")
+
+
+def checked(
+    *faults: str,
+    presses: Mapping[str, int] | None = None,
+    safety: SafetyConfig = SafetyConfig(),  # noqa: B008
+    reports: int = 2,
+) -> tuple[Finding, list[str]]:
+    """Return the finding for a board that reports this number of bumpers, and the texts shown.
+
+    `presses` has the input that the person presses for each name: 0 is the emergency stop.
+    """
+    front: Place = "front"
+    places = (front,) * reports
+    robot = Robot(*faults, config=Config(safety=SafetyConfig(bumpers=places)))
+    shown: list[str] = []
+
+    class Watched(Person):
+        def doing(self, text: str) -> None:
+            shown.append(text)
+            super().doing(text)
+
+    operator = Nobody() if presses is None else Watched(robot)
+    if presses is not None and isinstance(operator, Person):
+        operator.presses = dict(presses)
+    with robot.board() as board:
+        board.listen(0.5)
+        return inputs.finding(board, operator, safety), shown
+
+
+ALL = {"emergency stop": 0, "front bumper": 1, "rear bumper": 2}
+SAFETY = SafetyConfig(estop="required", bumpers=TWO)
+
+
+def test_a_board_without_inputs_has_nothing_to_press() -> None:
+    found, _ = checked(presses={})
+    assert (found.verdict, found.text) == (
+        "SKIPPED", "no emergency stop and no bumpers are reported or configured",
+    )  # fmt: skip
+
+
+def test_each_input_is_pressed_in_turn_and_passes() -> None:
+    found, shown = checked("estop", "bumpers", presses=ALL, safety=SAFETY)
+    assert (found.verdict, found.figure) == ("PASS", "emergency stop, front bumper, rear bumper")
+    assert shown == [f"press the {name} and release it, within 20 s" for name in ALL]
+
+
+def test_an_emergency_stop_that_is_only_reported_is_pressed_too() -> None:
+    assert checked("estop", presses=ALL)[0].figure == "emergency stop"
+    off = SafetyConfig(estop="off", bumpers=TWO, bumper="off")
+    assert checked("estop", "bumpers", presses=ALL, safety=off)[0].verdict == "SKIPPED"
+
+
+def test_without_a_person_the_check_names_what_it_did_not_check() -> None:
+    found, _ = checked("estop", "bumpers", safety=SAFETY)
+    assert (found.verdict, found.figure) == ("SKIPPED", "not checked")
+    assert found.text.endswith(": emergency stop, front bumper, rear bumper")
+
+
+@pytest.mark.parametrize(
+    ("faults", "reports"), [(("estop",), 2), (("bumpers",), 2), (("estop", "bumpers"), 3)]
+)
+def test_a_configured_input_that_is_not_reported_fails(
+    faults: tuple[str, ...], reports: int
+) -> None:
+    found, shown = checked(*faults, presses=ALL, safety=SAFETY, reports=reports)
+    assert (found.verdict, found.figure, shown) == ("FAIL", "not reported", [])
+    assert "`!status estop=ok bumpers=..`" in found.mend
+
+
+@pytest.mark.parametrize(
+    ("presses", "text"),
+    [
+        ({"front bumper": 2, "rear bumper": 1},
+         "front bumper: no press was reported but of the rear bumper; "
+         "rear bumper: no press was reported but of the front bumper"),
+        ({"front bumper": 1}, "rear bumper: no press was reported"),
+    ],
+)  # fmt: skip
+def test_swapped_and_dead_inputs_are_named(presses: Mapping[str, int], text: str) -> None:
+    safety = SafetyConfig(bumpers=TWO)
+    found, _ = checked("bumpers", presses=presses, safety=safety)
+    assert (found.verdict, found.text) == ("FAIL", text)
+
+
+def test_an_input_that_stays_pressed_or_comes_with_another_one_is_named() -> None:
+    safety, presses = SafetyConfig(bumpers=TWO), {"front bumper": 1, "rear bumper": 2}
+    found, _ = checked("bumper_pressed=2:0:0", presses=presses, safety=safety)
+    assert found.text == (
+        "front bumper: the rear bumper was reported with it; rear bumper: no release was reported"
+    )
+    assert found.figure == "0 of 2 right"
+
+
+def test_two_bumpers_at_one_place_have_numbers() -> None:
+    safety = SafetyConfig(bumpers=("front", "front"))
+    presses = {"front bumper (1)": 1, "front bumper (2)": 2}
+    found, _ = checked("bumpers", presses=presses, safety=safety)
+    assert (found.verdict, found.figure) == ("PASS", "front bumper (1), front bumper (2)")

@@ -1,0 +1,225 @@
+"""Tests of the bumpers: their states, their words, and the motion that each of them allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import get_args
+
+import pytest
+
+from acsard.core.config.settings import Place, SafetyConfig
+from acsard.core.link.board_status import BoardStatus
+from acsard.core.motion.bumpers import DIRECTIONS, SILENT, Bumpers, missing, pressed_words
+from acsard.core.motion.emergency_stop import CHECK, RELEASE
+from acsard.core.values import REST, Event, Twist
+
+MS = 1_000_000
+FOUR: tuple[Place, ...] = ("front", "rear", "left", "right")
+
+
+class Pins:
+    """Bumpers with their time. The first step is at 10 s."""
+
+    def __init__(self, safety: SafetyConfig) -> None:
+        self.bumpers = Bumpers(safety)
+        self.now_ms = 10_000
+        self.events: list[Event] = []
+
+    def step(self, *reports: str, ms: int = 10) -> str:
+        """Take status lines with these bumpers ("" for none) after `ms`, and return the state."""
+        self.now_ms += ms
+        statuses = [
+            (self.now_ms * MS, BoardStatus(bumpers=tuple(mark == "X" for mark in marks) or None))
+            for marks in reports
+        ]
+        self.events += self.bumpers.look(statuses, self.now_ms * MS)
+        return self.bumpers.state
+
+    def quiet(self, ms: int) -> str:
+        """Take steps without a report for this time."""
+        for _ in range(ms // 10):
+            self.step()
+        return self.bumpers.state
+
+
+def stop(*places: Place) -> Pins:
+    return Pins(SafetyConfig(bumpers=places))
+
+
+def away(*places: Place) -> Pins:
+    return Pins(SafetyConfig(bumpers=places, bumper="away"))
+
+
+TWISTS = [Twist(v, w) for v, w in product((-0.8, -0.1, -0.04, 0.0, 0.04, 0.1, 0.8), (-2, 0, 2))]
+
+
+@pytest.mark.parametrize(
+    ("pressed", "sign"),
+    [
+        ("X...", -1), (".X..", 1), ("..X.", 0), ("...X", 0), ("XX..", 0), ("X.X.", 0),
+        (".X.X", 0), ("..XX", 0), ("XXXX", 0),
+    ],
+)  # fmt: skip
+def test_each_place_allows_only_the_straight_motion_that_leads_away(
+    pressed: str, sign: int
+) -> None:
+    pins = away(*FOUR)
+    pins.step(pressed)
+    for twist in TWISTS:
+        allowed = pins.bumpers.away(twist)
+        if twist == REST:
+            assert allowed == REST
+        elif twist.linear * sign <= 0:
+            assert allowed is None
+        else:
+            assert allowed == Twist(sign * min(0.1, abs(twist.linear)), 0.0)
+
+
+def test_two_bumpers_at_one_place_allow_what_one_allows() -> None:
+    pins = away("front", "front", "rear")
+    for pressed in ("X..", ".X.", "XX."):
+        pins.step(pressed)
+        assert pins.bumpers.away(Twist(-0.5, 1.0)) == Twist(-0.1, 0.0)
+        assert pins.bumpers.note() == (
+            "front bumper pressed: only straight backwards, at most 0.1 m/s"
+        )
+
+
+def test_every_place_has_a_direction() -> None:
+    assert set(DIRECTIONS) == set(get_args(Place))
+
+
+@pytest.mark.parametrize(
+    ("pressed", "note"),
+    [
+        ("X...", "front bumper pressed: only straight backwards, at most 0.1 m/s"),
+        (".X..", "rear bumper pressed: only straight forwards, at most 0.1 m/s"),
+        ("..X.", "left bumper pressed: no motion leads away, so the robot stands until the "
+         "release"),
+        ("XX..", "front and rear bumpers pressed: no motion leads away, so the robot stands until "
+         "the release"),
+    ],
+)  # fmt: skip
+def test_a_pressed_bumper_that_limits_says_which_motion_it_allows(pressed: str, note: str) -> None:
+    pins = away(*FOUR)
+    pins.step("....")
+    pins.step(pressed)
+    assert pins.bumpers.limiting
+    assert pins.bumpers.held == ""
+    assert pins.bumpers.note() == note
+    why, _, rest = note.partition(": ")
+    assert pins.events[-1] == Event("bumper_pressed", f"{why}; {rest}", "error")
+
+
+def test_words_name_the_place_or_the_number() -> None:
+    assert pressed_words(FOUR, (True, False, True, False)) == "front and left bumpers pressed"
+    assert pressed_words((), (False, True)) == "bumper 2 pressed"
+    assert pressed_words((), (True, False, True)) == "bumpers 1 and 3 pressed"
+
+
+def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
+    pins = stop("front", "rear")
+    pins.step("..")
+    assert pins.step("X.") == "pressed"
+    assert pins.bumpers.pressed == (True, False)
+    assert pins.bumpers.pressed_now == pins.bumpers.held == "front bumper pressed"
+    assert pins.bumpers.mend == RELEASE
+    assert not pins.bumpers.limiting
+    pins.step("X.")
+    assert (pins.bumpers.pressed_now, pins.bumpers.held) == ("", "front bumper pressed")
+    assert pins.step("..") == "released"
+    assert (pins.bumpers.held, pins.bumpers.pressed) == ("", (False, False))
+    assert pins.events == [
+        Event("bumper_released", "the board reports 2 bumpers, and none is pressed"),
+        Event("bumper_pressed", "front bumper pressed; release it there, then call srv/clear",
+              "error"),
+        Event("bumper_released", "released; a stop stays latched until srv/clear"),
+    ]  # fmt: skip
+
+
+def test_a_second_bumper_is_a_new_press_and_the_release_of_one_is_none() -> None:
+    pins = stop("front", "rear")
+    pins.step("X.")
+    pins.step("XX")
+    assert pins.bumpers.pressed_now == "front and rear bumpers pressed"
+    pins.step(".X")
+    assert (pins.bumpers.pressed_now, pins.bumpers.held) == ("", "rear bumper pressed")
+    assert len(pins.events) == 2
+    pins.step("XX", ".X", "..")
+    assert (pins.bumpers.pressed_now, pins.bumpers.state) == (
+        "front and rear bumpers pressed", "released",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("choice", [stop, away])
+@pytest.mark.parametrize("pressed", ["..", "X."])
+def test_half_a_second_of_silence_latches_with_both_choices(
+    choice: Callable[..., Pins], pressed: str
+) -> None:
+    pins = choice("front", "rear")
+    pins.step(pressed)
+    assert pins.quiet(500) != "silent"
+    assert pins.step("") == "silent"
+    assert pins.bumpers.pressed == (True, True)
+    assert pins.bumpers.pressed_now == pins.bumpers.held == SILENT
+    assert pins.bumpers.mend == CHECK
+    assert not pins.bumpers.limiting
+    assert pins.events[-1].text == f"{SILENT}; {CHECK}, then call srv/clear"
+    assert pins.step("..") == "released"
+
+
+def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() -> None:
+    pins = stop("front", "rear")
+    assert pins.bumpers.missing
+    for wrong in (".", "...", "XXX", ""):
+        assert pins.step(wrong) == ""
+    assert (pins.bumpers.missing, pins.bumpers.pressed, pins.events) == (True, None, [])
+    pins.step("..")
+    assert not pins.bumpers.missing
+
+
+def test_the_missing_bumpers_are_named_with_the_field_of_the_line() -> None:
+    assert missing(SafetyConfig(bumpers=("front",))) == (
+        "safety.bumpers has 1 place, but the microcontroller has not reported 1 bumper: does its "
+        "firmware send status lines with `bumpers=.`?"
+    )
+
+
+def test_a_line_with_the_wrong_number_is_as_good_as_none() -> None:
+    pins = stop("front", "rear")
+    pins.step("X.")
+    for _ in range(6):
+        state = pins.step("...", ms=100)
+    assert state == "silent"
+
+
+def test_without_places_every_bumper_counts_wherever_it_is() -> None:
+    pins = stop()
+    assert not pins.bumpers.missing
+    assert pins.step("....") == ""
+    assert pins.step("....") == "released"
+    assert pins.step("..X.") == "pressed"
+    assert pins.bumpers.held == "bumper 3 pressed"
+
+
+def test_without_places_a_number_that_changed_releases_nothing_at_first() -> None:
+    pins = stop()
+    assert pins.step("X...") == "pressed"
+    assert pins.step("...") == "pressed"
+    assert pins.step("....") == "pressed"
+    assert pins.step("....") == "released"
+    assert pins.step("X") == "pressed"
+    assert pins.bumpers.pressed_now == "bumper 1 pressed"
+
+
+def test_without_places_no_motion_leads_away_so_a_press_latches() -> None:
+    pins = away()
+    pins.step("X")
+    assert (pins.bumpers.limiting, pins.bumpers.held) == (False, "bumper 1 pressed")
+
+
+def test_bumpers_that_are_off_are_ignored() -> None:
+    pins = Pins(SafetyConfig(bumpers=("front",), bumper="off"))
+    assert pins.step("X") == pins.quiet(1000) == ""
+    assert (pins.bumpers.missing, pins.bumpers.pressed, pins.events) == (False, None, [])
