@@ -445,7 +445,7 @@ def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
         "/speed_limit",
         "/imu/data",
     }
-    assert len(wanted["subscribers"]) == 7
+    assert len(wanted["subscribers"]) == 8
     assert len(services) == 11
 
 
@@ -474,7 +474,7 @@ def row_names() -> list[str]:
 def test_each_row_of_diagnostics_falls_into_exactly_one_group_of_the_aggregator() -> None:
     """The aggregator's rule: a name begins with one of `startswith`, to the letter."""
     names = row_names()
-    assert len(set(names)) == 11
+    assert len(set(names)) == 12
     for name in names:
         found = [
             group

@@ -27,6 +27,7 @@ from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
+from acsard.core.motion.battery import Battery
 from acsard.core.motion.bumpers import Bumpers, missing
 from acsard.core.motion.emergency_stop import DRIVER_FAULT, DRIVER_MEND, MISSING, EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
@@ -111,6 +112,8 @@ class Robot:
         """State of the limiter and its time, at the last line made and at the last line that left.
         A line that did not leave does not count."""
         self._status = ("", "", "", "")
+        self._battery_level = ""
+        """The level of the battery in the step before, "" before its first report."""
         self.counters: Counter[str] = Counter()
         """Totals since the start: `commands`, `commands_of_new_senders` of new senders whose delays
         were not proved yet, and `command_<reason>` for each reason to refuse. The control loop adds
@@ -120,6 +123,7 @@ class Robot:
         self._sanity = Sanity(config.feedback)
         self._estop = EmergencyStop(config.safety.estop)
         self._bumpers = Bumpers(config.safety)
+        self._battery = Battery(config.battery)
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -156,6 +160,7 @@ class Robot:
             estop=self._estop.state,
             bumpers=self._bumpers.pressed,
             bumper=self._bumpers.why,
+            battery=self._battery.status,
             board=self._board(now_ns),
         )
 
@@ -199,7 +204,10 @@ class Robot:
         if self._bumpers.limiting:
             reason = self._with_bumper(reason)
         status = (self._life.mode._value_, reason, link, self._choice.source)
-        another, self._status = status != self._status, status
+        battery = self._battery.status
+        level = battery.level if battery else ""
+        another = status != self._status or level != self._battery_level
+        self._status, self._battery_level = status, level
         # Otherwise neither the mode nor the commander has changed.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
@@ -256,7 +264,7 @@ class Robot:
             # No sender drives before the first link, so a zero sent during the start counts.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
-        if session.statuses or self._estop.state or self._bumpers.state:
+        if session.statuses or self._estop.state or self._bumpers.state or self._battery.status:
             self._watch_inputs(inputs.now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, and the command before the loss is old.
@@ -300,14 +308,20 @@ class Robot:
         # A driver without power reports a fault too, and the emergency stop cuts its power.
         if not estop.why and any(status.driver_fault for _, status in statuses):
             self._fault(DRIVER_FAULT, now, events)
+        battery = self._battery
+        events += battery.look(statuses, now.mono_ns)
+        if battery.stopped_now:
+            self._life.press(battery.why, now)
         if estop.why:
             self._life.hold(estop.why, estop.mend)
         elif bumpers.held:
             self._life.hold(bumpers.held, bumpers.mend)
         elif self.session.status.driver_fault:
             self._life.hold(DRIVER_FAULT, DRIVER_MEND)
+        elif battery.held:
+            self._life.hold(battery.why, battery.mend)
         else:
-            self._life.hold("", "")
+            self._life.hold()
 
     def _keep_away(self, now_ns: int) -> None:
         """Follow the choice only away from the pressed bumpers.

@@ -175,6 +175,7 @@ EventName = Literal[
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
     "lines_rejected", "lines_implausible", "lines_lost", "uncommanded_motion", "wheel_fault",
     "emergency_stop", "emergency_stop_released", "bumper_pressed", "bumper_released",
+    "battery", "battery_stop",
     "gyro", "learned_track", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "not_a_router",
     "missed_periods", "recording", "latch_file",
@@ -324,6 +325,26 @@ EstopState = Literal["", "released", "pressed", "silent"]
 the board no longer reports it, which counts as pressed."""
 
 
+BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
+"""The level of the battery by the thresholds in `[battery]`; "ok" if none is set. `unknown` means
+that the board no longer reports the battery, or does not report what the thresholds compare."""
+
+
+class BatteryStatus(Struct, frozen=True, gc=False):
+    """The battery as the board reports it. None stands for a value that it does not report now."""
+
+    level: BatteryLevel
+    reported_ns: int | None = None
+    """Monotonic time of the last report, ns."""
+    volts: float | None = None
+    percent: float | None = None
+    """State of charge, 0 to 100."""
+    amps: float | None = None
+    """Current, A. It is negative while the battery discharges."""
+    mean: float | None = None
+    """The mean that the thresholds are compared with, V or %."""
+
+
 class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
@@ -427,7 +448,8 @@ class Outputs(Struct, frozen=True):
     command_ns: int | None
     """Monotonic arrival of the command that is followed, None without one."""
     status_changed: bool
-    """Whether `mode`, `reason`, `link` or `source` differs from the step before."""
+    """Whether `mode`, `reason`, `link`, `source` or the battery's level differs from the step
+    before."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
@@ -487,6 +509,8 @@ class Snapshot(Struct, frozen=True):
     """Whether each bumper counts as pressed, in the order of the board, None if never reported."""
     bumper: str = ""
     """Why a bumper counts as pressed, in words; "" while none does."""
+    battery: BatteryStatus | None = None
+    """The battery, None if the board has never reported it."""
     board: dict[str, str] = {}
     """The fields of the board's last status line, by name, as text."""
     check: str = "plain"

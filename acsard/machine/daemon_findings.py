@@ -9,6 +9,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
+from typing import cast
 
 import msgspec
 from msgspec import Struct
@@ -17,17 +18,25 @@ from msgspec.structs import replace
 from acsard.client import Client, connect
 from acsard.core.config.live import Difference, differences, live
 from acsard.core.config.parsing import from_builtins
-from acsard.core.config.settings import SIMULATOR, Config
+from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config
 from acsard.core.config.validation import write
 from acsard.core.formatting import listed, many
 from acsard.core.link.link_diagnosis import BUSY, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
-from acsard.core.messages.schema import DiagnosticStatus, Info, LogEvent, RobotState
+from acsard.core.messages.schema import (
+    BatterySummary,
+    DiagnosticStatus,
+    Info,
+    LogEvent,
+    RobotState,
+)
 from acsard.core.motion import bumpers
+from acsard.core.motion.battery import MISSING as NO_BATTERY
+from acsard.core.motion.battery import words as battery_words
 from acsard.core.motion.emergency_stop import CHECK, MISSING, PRESSED, RELEASE, SILENT
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.lifecycle import utc
-from acsard.core.values import NS_PER_S, AcsardError
+from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.daemon.late_causes import cause_in
@@ -200,6 +209,7 @@ def link(running: Running) -> Iterator[Finding]:
         yield Finding("wheels", "warning", state.wheel_fault, mend)
     yield from _emergency_stop(config, state, mend)
     yield from _bumpers(config, state, mend)
+    yield from _battery(config.battery, state.battery, mend)
 
 
 def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
@@ -228,6 +238,25 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
         yield Finding("bumpers", "ok", text)
     elif safety.bumpers and safety.bumper != "off":
         yield Finding("bumpers", "failure", bumpers.missing(safety), mend)
+
+
+def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -> Iterator[Finding]:
+    """Yield a finding about the battery that the board reports or should report."""
+    if battery is None:
+        if config.bounds:
+            yield Finding("battery", "warning", NO_BATTERY, mend)
+        return
+    level = cast(BatteryLevel, battery.level)
+    status = BatteryStatus(level, None, battery.volts, battery.percent, battery.amps)
+    text = battery_words(config, status)
+    if level == "ok":
+        yield Finding("battery", "ok", text)
+    elif level == "unknown":
+        yield Finding("battery", "warning", text, mend)
+    elif level == "stop":
+        yield Finding("battery", "failure", text, "charge it, then `acsard call clear`")
+    else:
+        yield Finding("battery", "warning", text, "charge it")
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:

@@ -48,7 +48,8 @@ MAX_FILE_NS = 3600 * NS_PER_S
 """Longest time that one file may cover."""
 
 INCIDENTS = frozenset({
-    "fault", "stop", "emergency_stop", "bumper_pressed", "link_down", "link_stale", "port_lost",
+    "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
+    "port_lost",
 })  # fmt: skip
 """Events because of which the files within a minute of the event are retained."""
 

@@ -411,6 +411,7 @@ INCIDENTS = {
     "stop": "stop",
     "emergency_stop": "emergency stop",
     "bumper_pressed": "bumper hit",
+    "battery_stop": "battery stop",
     "link_down": "lost port",
     "link_stale": "board silence",
     "link_late": "computer stall",
@@ -426,7 +427,7 @@ INCIDENTS = {
 """
 
 
-SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|stop|fault)s?\b")
+SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
 """A stop, a bumper hit or a fault in a summary."""
 
 

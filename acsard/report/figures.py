@@ -174,6 +174,7 @@ NOTED = {
     "stop": ("◆", "diamond", COLOURS["warning"]),
     "emergency_stop": ("⬢", "hexagon", COLOURS["error"]),
     "bumper_pressed": ("■", "square", COLOURS["warning"]),
+    "battery_stop": ("⬒", "square-open", COLOURS["error"]),
     "link_down": ("▼", "triangle-down", "#b04fc4"),
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),

@@ -55,8 +55,12 @@ class Setting(NamedTuple):
     default: str
 
 
-PRESSES = {"emergency_stop": "emergency stop", "bumper_pressed": "bumper hit"}
-"""Words for the presses of the inputs that the board reports, by event."""
+OF_THE_BOARD = {
+    "emergency_stop": "emergency stop",
+    "bumper_pressed": "bumper hit",
+    "battery_stop": "battery stop",
+}
+"""The events of stops that the board caused, in words."""
 
 
 def differences(config: Config) -> list[Setting]:
@@ -93,7 +97,7 @@ def summary(data: ReportData) -> str:
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
     faults = many(counts["fault"], "fault")
-    for name, word in PRESSES.items():
+    for name, word in OF_THE_BOARD.items():
         by += f", {many(counts[name], word)}" if counts[name] else ""
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
@@ -189,12 +193,12 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         for name, driven in data.driven.items()
     ]
     yield "Driven by", ", ".join(drivers) or "no source"
-    titles = {name: f"{word.capitalize()}s" for name, word in PRESSES.items()}
+    titles = {name: f"{word.capitalize()}s" for name, word in OF_THE_BOARD.items()}
     for name, title in {"fault": "Faults", "stop": "Stops", **titles}.items():
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        # Few boards report these inputs, so only a press has a row.
-        if count or name not in PRESSES:
+        # Few boards report what these stops need, so they have a row only if they happened.
+        if count or name not in OF_THE_BOARD:
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial
     told = (

@@ -32,7 +32,7 @@ WITH_ARGUMENTS: dict[str, tuple[float, ...]] = {
     "stuck_encoder": (0,), "frozen_encoder": (1,), "dead_motor": (2,), "reversed_motor": (3,),
     "reversed_encoder": (0,), "reversed_wheel": (1,), "swapped_motors": (0, 1),
     "swapped_encoders": (2, 3), "swapped_wheels": (1, 2), "bias": (0, 1.2), "wrong_baud": (57600,),
-    "pushed": (0.2,), "stalls": (0.5, 0.12),
+    "pushed": (0.2,), "stalls": (0.5, 0.12), "battery": (90.0, 60.0),
 }  # fmt: skip
 """An instance of every fault that needs arguments."""
 

@@ -15,14 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, SimConfig
 from acsard.core.messages.schema import (
+    Battery,
     DiagnosticArray,
     Events,
     Header,
@@ -51,8 +53,11 @@ from tests.scenarios.taped import (
 )
 from tests.scenarios.world import EVERY_KEY, World
 
+PLAIN = Config(sim=SimConfig(faults=("battery=90:60",)))
+"""A robot whose board reports its battery, so that each topic has messages."""
+
 CHECKED = replace(
-    Config(),
+    PLAIN,
     mcu=replace(Config().mcu, link_check="auto", encoder_counts=3200),
     odometry=replace(Config().odometry, gyro=True),
 )
@@ -90,7 +95,7 @@ def exported(recording: Recording) -> Said:
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param(Config(), id="plain"),
+        pytest.param(PLAIN, id="plain"),
         pytest.param(CHECKED, id="checked", marks=pytest.mark.slow),
     ],
 )
@@ -125,7 +130,7 @@ def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
     assert len(then) == len(now) > 0
 
 
-@each("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out"])
+@each("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "battery"])
 def test_every_message_is_the_one_that_was_published(key: str, both: Any) -> None:
     world, _, said = both
     assert_same(world.bus.published[key], said[key])
@@ -234,7 +239,17 @@ def _as_told(message: Message) -> Any:
         left_out = MEASURED | {"acsard: recording"}
         rows = [row for row in message.status if row.name not in left_out]
         return DiagnosticArray(message.header, rows)
+    if isinstance(message, Battery):
+        return replace(message, **{name: _float32(getattr(message, name)) for name in MEASURES})
     return state(message) if isinstance(message, RobotState) else message
+
+
+MEASURES = ("voltage", "current", "percentage")
+"""The fields of the battery with a value."""
+
+
+def _float32(value: float) -> float:
+    return float(np.float32(value))
 
 
 def name_of(data: bytes) -> str:
@@ -297,7 +312,7 @@ def same(told: Any, ours: Any) -> bool:
         return all(same(getattr(told, name), getattr(ours, name)) for name in fields(type(ours)))
     if isinstance(ours, (list, tuple)):
         return len(told) == len(ours) and all(map(same, told, ours))
-    if isinstance(ours, float) and math.isnan(ours):
+    if ours is None:
         return math.isnan(told)
     return bool(told == ours)
 

@@ -25,12 +25,22 @@ import zenoh
 import zenoh.ext
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.system.harness import ROOT, Bus, Daemon, Program, client_config, environment, until
+from tests.system.harness import (
+    ROOT,
+    Bus,
+    Daemon,
+    Program,
+    Tables,
+    client_config,
+    environment,
+    until,
+)
 from tests.system.strangers import words
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ODOMETRY, TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 JOINTS, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
+BATTERY = "sensor_msgs/msg/BatteryState"
 TRIGGER = "std_srvs/srv/Trigger"
 STRING = "std_msgs/msg/String"
 SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
@@ -45,6 +55,7 @@ HASHES = {
     STRING: "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     JOINTS: "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    BATTERY: "4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
     TRIGGER: "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
     LIST: "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
     GET: "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
@@ -68,6 +79,7 @@ PUBLISHED = {
     "tf_static": (TF, 1, True),
     "joint_states": (JOINTS, 10, False),
     "diagnostics": (DIAGNOSTICS, 10, False),
+    "battery_state": (BATTERY, 10, False),
     "cmd_vel_out": (STAMPED, 10, False),
 }
 """The robot's publications: type, depth, transient local."""
@@ -104,14 +116,15 @@ ROUTE_S = 5.0
 The bridge reads the nodes of its domain ten times a second.
 """
 
-QUICK = {
+QUICK: Tables = {
     "limits": {
         "linear_acceleration": 5.0,
         "linear_deceleration": 5.0,
         "linear_stop_deceleration": 5.0,
-    }
+    },
+    "sim": {"faults": ["battery=80:600"]},
 }
-"""Limits under which a driving test is short."""
+"""Limits under which a driving test is short, and a board that reports its battery."""
 
 
 # messages, by rosbags

@@ -225,6 +225,7 @@ class Robot:
         bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
         rates = {"state": 100.0, "diagnostics": 100.0}
         tables: dict[str, dict[str, object]] = {"bus": dict(bus), "rates": dict(rates)}
+        tables["sim"] = {"faults": ["battery=80:600"]}
         self.daemon = Daemon(where, config=tables, endpoint=self.plain)
         self._fooled = threading.Event()
         self._outcomes: dict[tuple[str, str], Outcome] = {}

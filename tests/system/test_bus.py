@@ -24,6 +24,7 @@ from tests.system.harness import (
     Daemon,
     Following,
     Program,
+    Tables,
     alive_at,
     client_config,
     kept_waiting,
@@ -41,6 +42,7 @@ PUBLISHED = {
     "cmd_vel_out": "TwistStamped",
     "state": "RobotState",
     "diagnostics": "DiagnosticArray",
+    "battery": "Battery",
     "events": "Events",
     "sim/pose": "PoseStamped",
 }
@@ -55,10 +57,15 @@ FIELDS = {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate_expiry", "latencies",
         "gyro", "effective_track", "encoder_counts", "wheel_fault", "sender", "recording_error",
-        "latch", "latch_file_error", "feedback_age", "emergency_stop", "bumpers",
+        "latch", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
         "speed_limit", "settings_differ",
     },
     "diagnostics": {"header", "status"},
+    "battery": {
+        "header", "voltage", "temperature", "current", "charge", "capacity", "design_capacity",
+        "percentage", "power_supply_status", "power_supply_health", "power_supply_technology",
+        "present", "cell_voltage", "cell_temperature", "location", "serial_number",
+    },
     "events": {"stamp", "total", "events"},
     "sim/pose": {"header", "pose"},
 }  # fmt: skip
@@ -68,6 +75,14 @@ class Late(Following):
     """A plain client that subscribed to `tf_static` late, and when it did."""
 
     since = 0.0
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """A daemon whose board reports its battery, so that each published key has messages."""
+    config: Tables = {"sim": {"faults": ["battery=80:600"]}}
+    with Daemon(tmp_path_factory.mktemp("shared"), config=config) as daemon:
+        yield daemon
 
 
 @pytest.fixture(scope="module", autouse=True)

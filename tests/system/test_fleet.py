@@ -251,6 +251,7 @@ class Fleet:
         tables["robot"]["id"] = robot_id
         tables["bus"] |= {"connect": [self.endpoint], "tls": str(self.where / robot_id)}
         tables["rates"] = {"state": 100.0, "diagnostics": 100.0}
+        tables["sim"] = {"faults": ["battery=80:600"]}
         tables["limits"] = {"linear_acceleration": 5.0, "linear_stop_deceleration": 5.0}
         tables.setdefault("ros", {})["urdf"] = str(ROBOT_FILE.parents[2] / URDF)
         return Daemon(self.where, config=tables, name=name or robot_id, ready=ready)
@@ -383,8 +384,9 @@ class Visitor:
 
         subscribers = [self._subscribed(row, on_sample) for row in rows]
         self._behind()
-        if any(row.key.endswith("events") for row in rows):
-            for verb in ("deactivate", "activate"):  # these calls are events
+        if any(row.key.endswith(("events", "battery")) for row in rows):
+            # These calls are events, and with a new mode the battery is published at once.
+            for verb in ("deactivate", "activate"):
                 assert self._fleet.robots[0].get(f"srv/{verb}")["success"]
         # Last values are sent again every 5 s, for clients that cannot ask for them.
         mine = [row for row in rows if self._name in row.who]

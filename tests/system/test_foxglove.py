@@ -49,6 +49,7 @@ TOPICS = {
     "/joint_states": ("sensor_msgs/msg/JointState", "wheel_states"),
     "/cmd_vel_out": ("geometry_msgs/msg/TwistStamped", "cmd_vel_out"),
     "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", "diagnostics"),
+    "/battery_state": ("sensor_msgs/msg/BatteryState", "battery"),
     "/state": ("acsard/msg/RobotState", "state"),
     "/log": ("rcl_interfaces/msg/Log", "events"),
 } | {

@@ -287,10 +287,10 @@ def test_every_token_has_the_form_the_graph_is_read_by(bus: Bus, ros: RmwClient)
 def test_samples_carry_the_gid_of_their_publisher_s_token_and_count_without_gaps(
     tmp_path: Path,
 ) -> None:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
+    with Daemon(tmp_path, config=QUICK) as daemon, Bus(daemon.endpoint) as bus:
         ros = RmwClient(bus.session)
         with ros.tokens() as tokens:
-            until(lambda: len(tokens) >= 23, 5.0, "all tokens")
+            until(lambda: len(tokens) >= 24, 5.0, "all tokens")
             by_topic = {t.split("/")[9]: t for t in tokens if "/MP/" in t}
         with ExitStack() as stack:
             following = {

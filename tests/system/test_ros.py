@@ -20,6 +20,7 @@ from acsard.core.motion.lifecycle import LOOK_FIRST_S
 from tests.system.builds import BUILD_S
 from tests.system.harness import Bus, Daemon, until
 from tests.system.ros_clients import (
+    BATTERY,
     EMPTY_REQUEST,
     JOINTS,
     ODOMETRY,
@@ -114,6 +115,29 @@ def test_every_topic_arrives(ros: Client) -> None:
         }
         for name, samples in following.items():
             decode(PUBLISHED[name][0], samples.first(name).payload)
+
+
+def test_the_battery_arrives_with_every_field(bus: Bus, ros: Client) -> None:
+    begun = time.time()
+    with ros.follow("battery_state", BATTERY) as samples:
+        message = decode(BATTERY, samples.first("the battery").payload)
+    now = bus.get("battery")
+    assert (now["charge"], now["percentage"], now["voltage"]) == (
+        None, 0.8, pytest.approx(24.3, abs=0.1),
+    )  # fmt: skip
+    stamp = message.header.stamp
+    assert begun - 1.0 < stamp.sec + stamp.nanosec / 1e9 < time.time()
+    assert message.header.frame_id == ""
+    assert message.voltage == pytest.approx(now["voltage"], abs=0.05)
+    assert message.current == pytest.approx(-0.5)
+    assert message.percentage == pytest.approx(0.8)
+    for name in ("temperature", "charge", "capacity", "design_capacity"):
+        assert np.isnan(getattr(message, name)), name
+    assert message.power_supply_status == message.POWER_SUPPLY_STATUS_DISCHARGING
+    assert (message.power_supply_health, message.power_supply_technology) == (0, 0)
+    assert message.present
+    assert [*message.cell_voltage, *message.cell_temperature] == []
+    assert (message.location, message.serial_number) == ("", "")
 
 
 def test_a_late_subscriber_gets_the_static_transforms_at_once(ros: Client) -> None:

@@ -128,6 +128,7 @@ def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_sa
     config: dict[str, dict[str, object]] = {
         "odometry": {"gyro": True},
         "ros": {"urdf": str(tmp_path / "robot.urdf")},
+        "sim": {"faults": ["battery=80:600"]},
     }
     with (
         Daemon(tmp_path, config=config) as daemon,

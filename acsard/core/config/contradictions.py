@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import math
+from itertools import pairwise
 
 from acsard.core.config import motion_rules, named_faults
 from acsard.core.config.partial import Rule, mistakes
@@ -31,6 +32,9 @@ LEAST_WRAP_PERIODS = 2
 
 With two periods, one lost feedback line does no harm.
 """
+
+MOST_VOLTS = 99.99
+"""Highest voltage that a status line can express, V."""
 
 
 def warnings(config: Config) -> list[str]:
@@ -191,6 +195,25 @@ def _gyro_problems(config: Config) -> list[str]:
     ]
 
 
+def _battery_problems(config: Config) -> list[str]:
+    """Find thresholds in the wrong order, and one that the battery could never rise above."""
+    battery, found = config.battery, []
+    rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
+    for (name, below), (worse, lower) in pairwise(rows):
+        if lower >= below:
+            found.append(
+                f"{worse} = {lower:g}: not lower than {name} = {below:g}; write a lower {worse}"
+            )
+    most = 100.0 if battery.measure == "percent" else MOST_VOLTS
+    for name, below in rows:
+        if below + battery.hysteresis > most:
+            found.append(
+                f"{name} = {below:g}: with battery.hysteresis = {battery.hysteresis:g} this level "
+                f"would end above {most:g}, which no board reports; write lower values"
+            )
+    return found
+
+
 def _repeated(noun: str, names: dict[str, str]) -> list[str]:
     first: dict[str, str] = {}
     found = []
@@ -325,6 +348,7 @@ RULES: tuple[Rule, ...] = (
     _source_name_problems,
     _frame_problems,
     _gyro_problems,
+    _battery_problems,
     *motion_rules.RULES,
     _source_problems,
     _bumper_problems,

@@ -31,6 +31,7 @@ ARGUMENTS = {
     "swapped_wheels": "mm", "bias": "mn", "wrong_baud": "n",
     "pushed": "n", "stalls": "nn", "estop_pressed": "nn", "estop_silent": "nn",
     "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
+    "battery": "nn",
 }  # fmt: skip
 """Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
 
@@ -93,6 +94,10 @@ def named(text: str) -> NamedFault:
     if name in INPUTS and not min(fault.values) >= 0:
         raise ValueError(
             "give the seconds from the start until it begins, then its seconds (0: it stays)"
+        )
+    if name == "battery" and not (0 <= fault.values[0] <= 100 and fault.values[1] > 0):
+        raise ValueError(
+            "give the charge at the start, 0 to 100 %, then the minutes that a full one lasts"
         )
     if name == "wrong_baud" and fault.values[0] not in get_args(Baud):
         raise ValueError(f"rates are {', '.join(map(str, get_args(Baud)))}")

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.core.values import Role
+from acsard.core.values import BatteryLevel, Role
 
 Name = Annotated[
     str,
@@ -216,6 +216,27 @@ class SafetyConfig(Struct, frozen=True):
     bumper: BumperUse = "stop"
 
 
+Threshold = Annotated[float, Meta(ge=0.0, le=100.0, extra={"unit": "V or % (0 = off)"})]
+
+
+class BatteryConfig(Struct, frozen=True):
+    measure: Literal["volts", "percent"] = "volts"
+    warning_below: Threshold = 0.0
+    return_below: Threshold = 0.0
+    stop_below: Threshold = 0.0
+    hysteresis: Annotated[float, Meta(ge=0.1, le=50.0, extra={"unit": "V or %"})] = 0.5
+
+    @property
+    def bounds(self) -> dict[BatteryLevel, float]:
+        """The thresholds that are set, by level, the worst level last."""
+        found: dict[BatteryLevel, float] = {
+            "warning": self.warning_below,
+            "return": self.return_below,
+            "stop": self.stop_below,
+        }
+        return {level: below for level, below in found.items() if below}
+
+
 class LimitsConfig(Struct, frozen=True):
     linear_speed: LinearSpeed = 1.0
     angular_speed: AngularSpeed = 4.0
@@ -394,6 +415,7 @@ class Config(Struct, frozen=True):
     limits: LimitsConfig = LimitsConfig()
     feedback: FeedbackConfig = FeedbackConfig()
     safety: SafetyConfig = SafetyConfig()
+    battery: BatteryConfig = BatteryConfig()
     commands: CommandsConfig = CommandsConfig()
     odometry: OdometryConfig = OdometryConfig()
     lidar: LidarConfig = LidarConfig()

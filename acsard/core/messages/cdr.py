@@ -11,6 +11,7 @@ types.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from functools import cache, lru_cache
@@ -25,6 +26,7 @@ from acsard.core.messages.cdr_types import (
     builder,
     leaves,
     limit,
+    nullable,
     number_code,
     plain,
     struct_info,
@@ -168,11 +170,15 @@ class _Numbers:
         self._packs = _packs(self._codes)
         bounds = [(index, limit(kind)) for index, (_, kind) in enumerate(run)]
         self._limits = [(index, *bound) for index, bound in bounds if bound is not None]
+        self._nullable = [index for index, (_, kind) in enumerate(run) if nullable(kind)]
         get = attrgetter(*[path for path, _ in run])
         self._get: Get = get if len(run) > 1 else lambda message: (get(message),)
 
     def write(self, out: bytearray, message: object) -> None:
-        out += self._packs[(len(out) - len(HEADER)) & 7](*self._get(message))
+        values = self._get(message)
+        if self._nullable:
+            values = [math.nan if value is None else value for value in values]
+        out += self._packs[(len(out) - len(HEADER)) & 7](*values)
 
     def read(self, source: _Source, found: list[object]) -> None:
         values = source.take(self._codes)
@@ -180,6 +186,9 @@ class _Numbers:
             if not low <= values[index] <= high:
                 raise CdrError(f"{values[index]} is outside the range from {low:g} to {high:g}")
         found += values
+        for index in self._nullable:
+            if math.isnan(values[index]):
+                found[index - len(values)] = None
 
 
 class _Text:

@@ -1,7 +1,8 @@
 """Reads from a struct type the fields in the order of CDR, and a function that builds an instance.
 
-A `float` is a float64. An `int` declares its width with `Meta(extra={"cdr": code})`, where the code
-is one of the struct module (`B i I q Q`). A list whose `Meta` fixes its length is an array.
+A number declares its width with `Meta(extra={"cdr": code})`, where the code is one of the struct
+module (`B i I q Q`, and `f` for a float32). Without it a `float` is a float64. Null stands for NaN
+in a `float | None`. A list whose `Meta` fixes its length is an array.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any
 
 from msgspec import inspect
 
-SIZES = {"d": 8, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
+SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
 """Size of a number in bytes by its code. A number is aligned to its size."""
 
 Build = Callable[[Iterator[object]], object]
@@ -53,17 +54,29 @@ def plain(kind: inspect.Type) -> inspect.Type:
 
 def number_code(kind: inspect.Type) -> str:
     """Return the code of a number in the struct module, or "" for any other type."""
+    extra = kind.extra if isinstance(kind, inspect.Metadata) else None
+    code = str((extra or {}).get("cdr", ""))
     match plain(kind):
         case inspect.FloatType():
-            return "d"
+            return code or "d"
+        case inspect.UnionType(types=(number, inspect.NoneType())) if _is_float(number):
+            return number_code(number)
         case inspect.BoolType():
             return "?"
         case inspect.IntType():
-            extra = kind.extra if isinstance(kind, inspect.Metadata) else None
-            if not extra or "cdr" not in extra:
+            if not code:
                 raise TypeError('an int needs its width: Meta(extra={"cdr": code})')
-            return str(extra["cdr"])
+            return code
     return ""
+
+
+def _is_float(kind: inspect.Type) -> bool:
+    return isinstance(plain(kind), inspect.FloatType)
+
+
+def nullable(kind: inspect.Type) -> bool:
+    """Return whether a number may be null, for which CDR has NaN."""
+    return isinstance(plain(kind), inspect.UnionType)
 
 
 def limit(kind: inspect.Type) -> Limit | None:

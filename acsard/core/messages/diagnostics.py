@@ -7,8 +7,8 @@ The levels have these meanings:
 - ERROR: it keeps the robot from driving.
 
 As long as the daemon runs, each message has the same rows. If a row were missing from a message,
-rqt_robot_monitor would show the row as stale. The row of the board appears with its first status
-line, and stays.
+rqt_robot_monitor would show the row as stale. The rows of the board and of its battery appear with
+the first status line that has something for them, and stay.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
+from acsard.core.motion import battery
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.bumpers import SILENT as SILENT_BUMPERS
 from acsard.core.motion.bumpers import missing
@@ -50,6 +51,9 @@ BOARD = {
     "silent": (ERROR, SILENT),
 }
 """Level and text of each state of the emergency-stop input."""
+
+OF_LEVEL = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
+"""Level of the row for each level of the battery."""
 
 REFUSED_S = 2.0
 """Time for which a refused command is shown, s. These are two messages at the default rate."""
@@ -94,6 +98,7 @@ def diagnostics(
         _commands(outputs, snapshot, speed_limit),
         _wheels(snapshot.doubt, snapshot.counters),
         *_board(config, snapshot),
+        *_battery(config, snapshot),
         *_gyro(config, snapshot.gyro),
         *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
@@ -201,6 +206,23 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
         counted |= _counted(snapshot.counters, kind)
     level, message = max(level for level, _ in found), "; ".join(text for _, text in found)
     return [Row("board", level, message, snapshot.board | counted)]
+
+
+def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
+    """Return the row of the battery, or nothing if the board has none and no threshold is set."""
+    status, bounds = snapshot.battery, config.battery.bounds
+    if status is None:
+        return [Row("battery", WARN, battery.MISSING, {})] if bounds else []
+    shown: dict[str, str] = {"level": status.level}
+    numbers = {
+        "volts": status.volts,
+        "percent": status.percent,
+        "amperes": status.amps,
+        "mean": status.mean if bounds else None,
+    }
+    shown |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
+    shown |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
+    return [Row("battery", OF_LEVEL[status.level], battery.words(config.battery, status), shown)]
 
 
 def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:

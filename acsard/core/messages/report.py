@@ -16,6 +16,8 @@ from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.messages.expiry import expiry
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
+    Battery,
+    BatterySummary,
     DiagnosticArray,
     Header,
     JointState,
@@ -43,6 +45,7 @@ from acsard.core.motion.learned_track import tracks
 from acsard.core.values import (
     NS_PER_S,
     REST,
+    BatteryStatus,
     Estimate,
     Instant,
     Outputs,
@@ -52,6 +55,12 @@ from acsard.core.values import Spread as Measurements
 from acsard.core.values import Twist as BodyTwist
 
 Look = Callable[[], Snapshot]
+
+BATTERY_HZ = 1.0
+"""Rate of the key `battery`."""
+
+UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
+"""Values of `Battery.power_supply_status`."""
 
 
 class _Rate:
@@ -98,7 +107,8 @@ class Report:
     def use(self, config: Config) -> None:
         """Use this configuration from now on."""
         self._config = config
-        self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
+        rates = asdict(config.rates) | {"battery": BATTERY_HZ}
+        self._rates = {key: _Rate(hz) for key, hz in rates.items()}
         self._covariances = Covariances(config.odometry)
 
     def due(
@@ -122,6 +132,7 @@ class Report:
             (outputs.estimates and wanted)
             or "state" in wanted
             or "diagnostics" in wanted
+            or "battery" in wanted
             or (outputs.due and "cmd_vel_out" in wanted)
             or (outputs.events and "events" in wanted)
         ):
@@ -147,9 +158,15 @@ class Report:
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
         if outputs.events and "events" in wanted and (told := self._happened.told()):
             yield "events", told
-        for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
+        for key, build in (
+            ("state", self._state),
+            ("diagnostics", self._diagnostics),
+            ("battery", self._battery),
+        ):
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
-                yield key, build(outputs, look())
+                message = build(outputs, look())
+                if message is not None:
+                    yield key, message
 
     def current(self, key: str, look: Look) -> Message | None:
         """Return the present value of a published key, or None if it has no value yet."""
@@ -171,6 +188,8 @@ class Report:
                 return self._state(outputs, look()) if outputs else None
             case "diagnostics":
                 return self._diagnostics(outputs, look()) if outputs else None
+            case "battery":
+                return self._battery(outputs, look()) if outputs else None
             case "events":
                 return self._happened.told()
             case _:
@@ -265,8 +284,28 @@ class Report:
             feedback_age=snapshot.feedback_age_s,
             emergency_stop=snapshot.estop,
             bumpers=None if snapshot.bumpers is None else list(snapshot.bumpers),
+            battery=_summary(snapshot.battery),
             settings_differ=self.settings_differ,
             speed_limit=self.speed_limit,
+        )
+
+    def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
+        """Return the message with the stamp of the last report, None if the board has none."""
+        battery, now = snapshot.battery, outputs.now
+        if battery is None:
+            return None
+        age_ns = 0 if battery.reported_ns is None else now.mono_ns - battery.reported_ns
+        amps, percent = battery.amps, battery.percent
+        status = UNKNOWN_STATUS
+        if amps is not None:
+            status = CHARGING if amps > 0 else DISCHARGING if amps < 0 else NOT_CHARGING
+        return Battery(
+            Header(Time.from_ns(now.wall_ns - age_ns)),
+            voltage=battery.volts,
+            current=amps,
+            percentage=None if percent is None else percent / 100,
+            power_supply_status=status,
+            present=battery.reported_ns is not None,
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
@@ -281,6 +320,12 @@ class Report:
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         certificate = self._certificate(outputs.now)
         return diagnostics(self._config, outputs, snapshot, certificate, self.speed_limit)
+
+
+def _summary(battery: BatteryStatus | None) -> BatterySummary | None:
+    if battery is None:
+        return None
+    return BatterySummary(battery.volts, battery.percent, battery.amps, battery.level)
 
 
 def _spread(spread: Measurements) -> Spread:

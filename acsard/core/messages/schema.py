@@ -15,12 +15,22 @@ from msgspec import Meta, Struct
 from acsard.core.link.link_state import State
 from acsard.core.messages.topics import Direction
 from acsard.core.motion.modes import Mode
-from acsard.core.values import NS_PER_S, ROLES, EstopState, EventName, GyroDoes, Level, Plain
+from acsard.core.values import (
+    NS_PER_S,
+    ROLES,
+    BatteryLevel,
+    EstopState,
+    EventName,
+    GyroDoes,
+    Level,
+    Plain,
+)
 
-# These annotations tell `cdr.py` the width of an int and the fixed length of an array.
+# These annotations tell `cdr.py` the width of a number and the fixed length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
 Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
+Float32 = Annotated[float, Meta(extra={"cdr": "f"})]
 Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
 Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
@@ -191,6 +201,59 @@ class SpeedLimit(Message, frozen=True):
     speed_limit: float
 
 
+class Battery(Message, frozen=True):
+    """The battery as the board reports it, with the fields of sensor_msgs/BatteryState.
+
+    A value that is not measured is null, and NaN in CDR.
+    """
+
+    header: Header
+    voltage: Float32 | None = None
+    """V."""
+    temperature: Float32 | None = None
+    """Temperature of the battery, degrees Celsius. The daemon never measures it."""
+    current: Float32 | None = None
+    """A. It is negative while the battery discharges."""
+    charge: Float32 | None = None
+    """Ah. The daemon never measures it."""
+    capacity: Float32 | None = None
+    """Ah. The daemon never measures it."""
+    design_capacity: Float32 | None = None
+    """Ah. The daemon does not know it."""
+    percentage: Float32 | None = None
+    """State of charge, 0 to 1."""
+    power_supply_status: Annotated[Byte, one_of(range(5))] = 0
+    """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full. It follows from `current`."""
+    power_supply_health: Annotated[Byte, one_of(range(9))] = 0
+    """Always 0, unknown."""
+    power_supply_technology: Annotated[Byte, one_of(range(9))] = 0
+    """Always 0, unknown."""
+    present: bool = False
+    """Whether the board reports a battery at present."""
+    cell_voltage: Annotated[list[Float32], FEW] = []
+    """V of each cell; always empty."""
+    cell_temperature: Annotated[list[Float32], FEW] = []
+    """Degrees Celsius of each cell; always empty."""
+    location: str = ""
+    serial_number: str = ""
+
+
+class BatterySummary(Message, frozen=True):
+    """The battery in short. A value that the board does not report now is null."""
+
+    volts: float | None
+    percent: float | None
+    """State of charge, 0 to 100."""
+    amps: float | None
+    """It is negative while the battery discharges."""
+    level: Annotated[str, one_of(get_args(BatteryLevel))]
+    """Level by the thresholds in `[battery]`; `ok` if none is set.
+
+    `unknown` means that the board no longer reports the battery, or not the measure of the
+    thresholds.
+    """
+
+
 class SourceState(Message, frozen=True):
     """A source of commands."""
 
@@ -287,6 +350,8 @@ class RobotState(Message, frozen=True):
     Null if the board has never reported its bumpers. If it no longer reports them, each value is
     true.
     """
+    battery: BatterySummary | None = None
+    """The battery; null if the board has never reported its voltage or its charge."""
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
@@ -473,6 +538,7 @@ MESSAGES: dict[str, type[Message]] = {
         JointState,
         PoseStamped,
         Imu,
+        Battery,
         SpeedLimit,
         String,
         Twist,

@@ -10,9 +10,9 @@ sender has not seen, however late the network delivers it:
   that persists latches again.
 - A request that arrived before the latch was set never releases it.
 
-A pressed emergency stop at the robot and a pressed bumper latch a stop too, and a fault of a motor
-driver latches a fault. Nothing releases a latch while the board reports one of them.
-`emergency_stop.py` and `bumpers.py` decide when an input counts as pressed.
+A pressed emergency stop at the robot, a pressed bumper and an empty battery latch a stop too, and a
+fault of a motor driver latches a fault. Nothing releases a latch while the board reports one of
+them. `emergency_stop.py`, `bumpers.py` and `battery.py` decide how long such a cause lasts.
 
 `modes.py` derives the mode. `core/robot.py` decides how the wheels follow it.
 """
@@ -86,12 +86,12 @@ class Lifecycle:
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop under a new number, because an input of the board was pressed."""
+        """Latch a stop under a new number that no client asked for. `why` is a whole sentence."""
         self._stopped_ns = self._stop_asked_ns = now.mono_ns
         self._latch(stop=self._made(now, "", why))
 
-    def hold(self, why: str, mend: str) -> None:
-        """Note why the board lets nothing release a latch, and what to do about it, or "" twice."""
+    def hold(self, why: str = "", mend: str = "") -> None:
+        """Note why the board lets nothing release a latch, and what to do about it."""
         self._held, self._mend = why, mend
 
     def leave(self) -> None:

@@ -52,6 +52,25 @@ tf2_msgs/msg/TFMessage: geometry_msgs/msg/TransformStamped[] transforms
 sensor_msgs/msg/JointState: \
     std_msgs/msg/Header header, string[] name, \
     float64[] position, float64[] velocity, float64[] effort
+sensor_msgs/msg/BatteryState: \
+    uint8 POWER_SUPPLY_STATUS_UNKNOWN=0, uint8 POWER_SUPPLY_STATUS_CHARGING=1, \
+    uint8 POWER_SUPPLY_STATUS_DISCHARGING=2, uint8 POWER_SUPPLY_STATUS_NOT_CHARGING=3, \
+    uint8 POWER_SUPPLY_STATUS_FULL=4, \
+    uint8 POWER_SUPPLY_HEALTH_UNKNOWN=0, uint8 POWER_SUPPLY_HEALTH_GOOD=1, \
+    uint8 POWER_SUPPLY_HEALTH_OVERHEAT=2, uint8 POWER_SUPPLY_HEALTH_DEAD=3, \
+    uint8 POWER_SUPPLY_HEALTH_OVERVOLTAGE=4, uint8 POWER_SUPPLY_HEALTH_UNSPEC_FAILURE=5, \
+    uint8 POWER_SUPPLY_HEALTH_COLD=6, uint8 POWER_SUPPLY_HEALTH_WATCHDOG_TIMER_EXPIRE=7, \
+    uint8 POWER_SUPPLY_HEALTH_SAFETY_TIMER_EXPIRE=8, \
+    uint8 POWER_SUPPLY_TECHNOLOGY_UNKNOWN=0, uint8 POWER_SUPPLY_TECHNOLOGY_NIMH=1, \
+    uint8 POWER_SUPPLY_TECHNOLOGY_LION=2, uint8 POWER_SUPPLY_TECHNOLOGY_LIPO=3, \
+    uint8 POWER_SUPPLY_TECHNOLOGY_LIFE=4, uint8 POWER_SUPPLY_TECHNOLOGY_NICD=5, \
+    uint8 POWER_SUPPLY_TECHNOLOGY_LIMN=6, uint8 POWER_SUPPLY_TECHNOLOGY_TERNARY=7, \
+    uint8 POWER_SUPPLY_TECHNOLOGY_VRLA=8, \
+    std_msgs/msg/Header header, float32 voltage, float32 temperature, float32 current, \
+    float32 charge, float32 capacity, float32 design_capacity, float32 percentage, \
+    uint8 power_supply_status, uint8 power_supply_health, uint8 power_supply_technology, \
+    bool present, float32[] cell_voltage, float32[] cell_temperature, \
+    string location, string serial_number
 diagnostic_msgs/msg/KeyValue: string key, string value
 diagnostic_msgs/msg/DiagnosticStatus: \
     byte OK=0, byte WARN=1, byte ERROR=2, byte STALE=3, \

@@ -28,6 +28,8 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     "sensor_msgs/msg/JointState":
         "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    "sensor_msgs/msg/BatteryState":
+        "RIHS01_4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
     "sensor_msgs/msg/Imu":
         "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
     "nav2_msgs/msg/SpeedLimit":

@@ -1,11 +1,10 @@
 """Converts the messages whose fields in ROS differ from the native ones: log messages and `state`.
 
-CDR has neither maps nor null. The counters are therefore a list, and NaN stands for null.
+CDR has no maps, so the counters are a list. NaN stands for null (`cdr_types.py`).
 """
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Annotated
 
@@ -77,16 +76,16 @@ class Counter(Struct, frozen=True):
 
 
 class Source(Struct, frozen=True):
-    """A source of commands. `age` is in s, or NaN before the first command."""
+    """A source of commands. `age` is in s, or null before the first command."""
 
     name: str
     priority: Whole
-    age: float
+    age: float | None
     waits_for: str
 
 
 class State(Struct, frozen=True):
-    """`RobotState` as acsard/msg/RobotState, without the latencies. NaN stands for null."""
+    """`RobotState` as acsard/msg/RobotState, without the latencies."""
 
     header: Header
     mode: str
@@ -94,10 +93,10 @@ class State(Struct, frozen=True):
     x: float
     y: float
     yaw: float
-    linear: float
-    angular: float
+    linear: float | None
+    angular: float | None
     wheels: list[float]
-    feedback_age: float
+    feedback_age: float | None
     link: str
     source: str
     sender: str
@@ -120,14 +119,14 @@ def state(message: RobotState) -> State:
         x=message.x,
         y=message.y,
         yaw=message.yaw,
-        linear=_known(message.linear),
-        angular=_known(message.angular),
+        linear=message.linear,
+        angular=message.angular,
         wheels=message.wheels,
-        feedback_age=_known(message.feedback_age),
+        feedback_age=message.feedback_age,
         link=message.link,
         source=message.source,
         sender=message.sender,
-        sources=[Source(s.name, s.priority, _known(s.age), s.waits_for) for s in message.sources],
+        sources=[Source(s.name, s.priority, s.age, s.waits_for) for s in message.sources],
         refused=message.refused,
         gyro=message.gyro,
         effective_track=message.effective_track,
@@ -136,7 +135,3 @@ def state(message: RobotState) -> State:
         certificate_expiry=message.certificate_expiry,
         counters=[Counter(name, count) for name, count in message.counters.items()],
     )
-
-
-def _known(value: float | None) -> float:
-    return math.nan if value is None else value

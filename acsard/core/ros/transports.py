@@ -101,6 +101,7 @@ PUBLISHED = (
     RosName("tf_static", "tf_static", "out", "tf2_msgs/msg/TFMessage", Qos(1, transient=True)),
     RosName("joint_states", "wheel_states", "out", "sensor_msgs/msg/JointState"),
     RosName("diagnostics", "diagnostics", "out", "diagnostic_msgs/msg/DiagnosticArray"),
+    RosName("battery_state", "battery", "out", "sensor_msgs/msg/BatteryState"),
     RosName("cmd_vel_out", "cmd_vel_out", "out", "geometry_msgs/msg/TwistStamped"),
 )
 

@@ -41,6 +41,16 @@ A reply within this time repeats the last speeds.
 STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
+EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
+"""Battery of six cells: its voltage when empty, the rise to a full one, V, and its resistance, ohm.
+"""
+
+REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
+"""Current at rest, A, and the current for each rad/s of each wheel, A."""
+
+START_AMPS, START_NS = 10.0, 300 * MS
+"""Additional current while the motors start, A, and its duration, ns. The voltage drops by 2 V."""
+
 NEVER_NS = 2**62
 """Monotonic time after every other one."""
 
@@ -92,6 +102,11 @@ class FakeMcu(Faults):
         and its value, `silent` for none. The last one that is on decides, but several bumpers may
         be pressed at once. A field is in the line if a fault names it."""
         self._inputs_clock = b""
+        self._battery_clock = b""
+        self._charge = self._capacity = 1.0
+        """Charge of the battery, 0 to 1, and its capacity, As."""
+        self._drained_ns = self._rested_ns = now_ns
+        """Times at which the charge was last computed, and at which no motor was commanded."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -156,6 +171,9 @@ class FakeMcu(Faults):
             elif what == "inputs" and data == self._inputs_clock:
                 self._tell_inputs(due_ns)
                 self._schedule(due_ns + STATUS_NS, "inputs", data)
+            elif what == "battery" and data == self._battery_clock:
+                self._tell_battery(due_ns)
+                self._schedule(due_ns + STATUS_NS, "battery", data)
         self._now_ns = now_ns
         return out
 
@@ -179,6 +197,8 @@ class FakeMcu(Faults):
             self._schedule(now_ns + self.unprompted_ns, "report", self._clock)
         if self._inputs:
             self._schedule(now_ns + STATUS_NS, "inputs", self._inputs_clock)
+        if self._battery_clock:
+            self._schedule(now_ns + STATUS_NS, "battery", self._battery_clock)
         for begin_ns, end_ns, _, _ in self._inputs:
             self._schedule_changes(begin_ns, end_ns)
 
@@ -317,8 +337,26 @@ class FakeMcu(Faults):
                 both = name == "bumpers" and "silent" not in (value, before)
                 fields[name] = "".join(map(max, value, before)) if both else value
         fields = {name: value for name, value in fields.items() if value != "silent"}
-        if fields and not self.muted and now_ns >= self._boot_until_ns:
+        if fields:
+            self._tell(now_ns, fields)
+
+    def _tell(self, now_ns: int, fields: dict[str, str]) -> None:
+        if not self.muted and now_ns >= self._boot_until_ns:
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
+
+    def _tell_battery(self, now_ns: int) -> None:
+        """Send a status line with the battery, after it was drained since the last one."""
+        seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
+        turning = sum(map(abs, self.vehicle.set_points))
+        if not turning:
+            self._rested_ns = now_ns
+        amps = REST_AMPS + AMPS_PER_SPEED * turning
+        if turning and now_ns - self._rested_ns <= START_NS:
+            amps += START_AMPS
+        self._charge = max(0.0, self._charge - amps * seconds / self._capacity)
+        volts = EMPTY_VOLTS + CHARGED_VOLTS * self._charge - RESISTANCE * amps
+        charge = f"{100 * self._charge:.0f}%"
+        self._tell(now_ns, {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge})
 
     def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
         """Send a status line at once when an input changes."""
@@ -364,6 +402,23 @@ class FakeMcu(Faults):
         before and after them.
         """
         return self._input("driver", "fault", after_s, length_s)
+
+    @contextmanager
+    def battery(self, percent: float, minutes: float) -> Iterator[None]:
+        """Report a battery ten times a second. It begins with this charge, %, and is drained.
+
+        A full one lasts `minutes` while the robot stands, and shorter while it drives.
+        """
+        clock = b"battery %d" % next(self._order)
+        self._schedule(self._now_ns + STATUS_NS, "battery", clock)
+        with self._with(
+            _battery_clock=clock,
+            _charge=percent / 100,
+            _capacity=REST_AMPS * 60 * minutes,
+            _drained_ns=self._now_ns,
+            _rested_ns=self._now_ns,
+        ):
+            yield
 
     @contextmanager
     def _input(

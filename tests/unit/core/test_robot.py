@@ -11,6 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import (
+    BatteryConfig,
     CommandsConfig,
     Config,
     ControlConfig,
@@ -29,6 +30,7 @@ from acsard.core.values import (
     REST,
     STILL,
     Answer,
+    BatteryStatus,
     Command,
     Event,
     GyroSample,
@@ -573,6 +575,101 @@ def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
     assert bench.mode() == "stopped"
     bench.status(OK_LINE + DRIVER_OK).step()
     assert bench.answer("clear").success
+
+
+# the battery
+
+
+FULL_LINE, EMPTY_LINE = b"!status volts=24.00\r\n", b"!status volts=19.00\r\n"
+GUARDED = Config(battery=BatteryConfig(warning_below=22.0, stop_below=21.0))
+
+
+def test_an_empty_battery_ramps_to_rest_and_is_latched() -> None:
+    bench = Button(FULL_LINE, GUARDED)
+    bench.driving(steps=500)
+    assert bench.robot.snapshot(bench.now_ns).battery == BatteryStatus(
+        "ok", bench.now_ns, 24.0, mean=24.0
+    )
+    bench.status(EMPTY_LINE)
+    while bench.step(GO).mode == "driving":
+        before = bench.out.applied.linear
+    speeds = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(30))]
+    drop = GUARDED.limits.linear_stop_deceleration / 100
+    assert before - speeds[0] == pytest.approx(drop)
+    assert all(a - b <= drop + 1e-9 for a, b in pairwise(speeds))
+    assert speeds[-1] == 0.0
+    assert bench.out.reason.startswith("battery below battery.stop_below = 21 V (latched at ")
+    assert bench.out.reason.endswith("; charge it to 21.5 V, then call srv/clear")
+
+
+def test_each_new_level_is_an_event_and_a_change_of_the_status() -> None:
+    bench = Button(FULL_LINE, GUARDED)
+    bench.linked()
+    told, changed = [], []
+    for step in range(1500):
+        if step == 500:
+            bench.status(EMPTY_LINE)
+        out = bench.step()
+        told += [(event.name, event.level) for event in out.events if "battery" in event.name]
+        battery = bench.robot.snapshot(bench.now_ns).battery
+        assert battery is not None
+        if out.status_changed:
+            changed.append(battery.level)
+    assert told == [("battery", "info"), ("battery", "warning"), ("battery_stop", "error")]
+    assert changed == ["ok", "warning", "stop"]
+
+
+def test_clear_is_refused_while_the_battery_is_low_and_works_above_the_hysteresis() -> None:
+    bench = Button(EMPTY_LINE, GUARDED)
+    for _ in range(400):
+        bench.step()
+    assert bench.mode() == "stopped"
+    answer = bench.answer("clear")
+    assert (answer.success, answer.message) == (
+        False,
+        "battery below battery.stop_below = 21 V: charge it to 21.5 V, then call srv/clear again",
+    )
+    bench.status(FULL_LINE)
+    for _ in range(1000):
+        bench.step(GO)
+    assert bench.mode() == "stopped"
+    assert bench.answer("clear").success
+    for _ in range(10):
+        assert bench.step(GO).mode == "ready"
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_a_pressed_button_is_named_before_an_empty_battery() -> None:
+    bench = Button(b"!status estop=pressed volts=19.00\r\n", GUARDED)
+    for _ in range(400):
+        bench.step()
+    assert bench.answer("clear").message.startswith("emergency stop pressed at the robot: ")
+    bench.status(b"!status estop=ok volts=19.00\r\n").step()
+    assert bench.answer("clear").message.startswith("battery below battery.stop_below = 21 V: ")
+
+
+def test_a_silent_battery_does_not_stop_a_driving_robot() -> None:
+    bench = Button(FULL_LINE, GUARDED)
+    bench.driving(steps=500)
+    bench.status(b"")
+    for _ in range(700):
+        assert bench.step(GO).mode == "driving"
+    battery = bench.robot.snapshot(bench.now_ns).battery
+    assert battery == BatteryStatus("unknown")
+
+
+def test_a_restarted_daemon_keeps_the_stop_and_judges_the_battery_anew() -> None:
+    bench = Button(EMPTY_LINE, GUARDED)
+    for _ in range(400):
+        bench.step()
+    latches = bench.out.latches.after_restart()
+    after = Bench(GUARDED, latches=latches).linked()
+    assert after.mode() == "stopped"
+    assert after.out.reason.startswith("battery below battery.stop_below = 21 V (latched at ")
+    # Without a report nothing holds the stop.
+    after.step(ms=2500)
+    assert after.answer("clear").success
 
 
 # the link

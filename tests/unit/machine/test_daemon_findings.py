@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import (
+    BatteryConfig,
     BusConfig,
     Config,
     DriveConfig,
@@ -18,11 +19,19 @@ from acsard.core.config.settings import (
     RobotConfig,
     SafetyConfig,
 )
-from acsard.core.messages.schema import DiagnosticStatus, Info, LogEvent, RobotState, Time
+from acsard.core.messages.schema import (
+    BatterySummary,
+    DiagnosticStatus,
+    Info,
+    LogEvent,
+    RobotState,
+    Time,
+)
 from acsard.machine.daemon_findings import (
     SHOWN,
     Running,
     certificate,
+    check,
     clocks,
     compared,
     daemon,
@@ -351,6 +360,38 @@ def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() ->
     state = replace(STATE, bumpers=[True])
     *_, finding = link(Running(INFO, config, state, state, 0))
     assert finding.mend.startswith("drive straight away from it, or release it there; if none")
+
+
+CHECK = check(Running(INFO, CONFIG, STATE, STATE, 0))
+THRESHOLDS = BatteryConfig(warning_below=22.0, stop_below=21.0)
+
+
+@pytest.mark.parametrize(
+    ("battery", "level", "text", "mend"),
+    [
+        (BatterySummary(24.0, 80.0, -1.0, "ok"), "ok", "24.00 V, 80 %, -1.00 A", ""),
+        (BatterySummary(21.5, None, None, "warning"), "warning",
+         "21.50 V; the mean is below battery.warning_below = 22 V", "charge it"),
+        (BatterySummary(20.5, None, None, "stop"), "failure",
+         "20.50 V; the mean is below battery.stop_below = 21 V",
+         "charge it, then `acsard call clear`"),
+        (BatterySummary(None, None, None, "unknown"), "warning",
+         "the board has not reported its battery for 5 s", CHECK),
+        (None, "warning", "the board has not reported its battery, but [battery] has thresholds",
+         CHECK),
+    ],
+)  # fmt: skip
+def test_the_battery_of_the_board_is_reported(
+    battery: BatterySummary | None, level: str, text: str, mend: str
+) -> None:
+    state = replace(STATE, battery=battery)
+    config = replace(CONFIG, battery=THRESHOLDS)
+    *_, finding = link(Running(INFO, config, state, state, 0))
+    assert finding == Finding("battery", level, text, mend)  # type: ignore[arg-type]
+
+
+def test_a_board_without_a_battery_has_no_finding_unless_thresholds_need_it() -> None:
+    assert [one.subject for one in found({}, {})] == ["link"]
 
 
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}

@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from acsard.calibration.log_table import read
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, SimConfig
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import CHANNELS
 from acsard.core.ros.names import Qos
@@ -54,25 +54,28 @@ from tests.scenarios.world import START
 
 SECONDS = 2.0
 
+CONFIG = Config(sim=SimConfig(faults=("battery=90:60",)))
+"""A robot whose board reports its battery, so that each topic has messages."""
+
 KINDS: tuple[Kind, ...] = ("mcap", "csv", "rosbag2")
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a drive with two sources."""
-    tape, world = recorded_world()
+    tape, world = recorded_world(CONFIG)
     world.drive(0.5, 0.3, 0.4)
     world.drive(0.3, 0.0, 0.3, source="teleop")
     world.call("stop")
     world.run(SECONDS - (world.now_ns - START.mono_ns) / 1e9)
     path = tmp_path_factory.mktemp("recorded") / "drive.mcap"
-    tape.write(path, Config())
+    tape.write(path, CONFIG)
     return path
 
 
 TOPICS = {
     "/odom", "/tf", "/tf_static", "/joint_states", "/cmd_vel_out", "/diagnostics", "/state", "/log",
-    "/cmd_vel_in/app", "/cmd_vel_in/teleop",
+    "/battery_state", "/cmd_vel_in/app", "/cmd_vel_in/teleop",
 }  # fmt: skip
 
 

@@ -343,6 +343,15 @@ def test_a_pressed_bumper_is_a_serious_incident_and_its_release_is_none() -> Non
     assert is_serious(summary(events))
 
 
+def test_a_stop_of_the_battery_is_a_serious_incident_and_another_level_is_none() -> None:
+    events = [
+        TimelineEntry(1.0, "battery", "21.50 V", "warning"),
+        TimelineEntry(2.0, "battery_stop", "20.90 V", "error"),
+    ]
+    assert summary(events) == "1 battery stop"
+    assert is_serious(summary(events))
+
+
 def test_a_summary_names_who_stopped_the_robot_and_counts_the_incidents() -> None:
     events = [
         TimelineEntry(1.0, "stop", "stopped", by="joe"),

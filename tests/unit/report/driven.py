@@ -19,9 +19,10 @@ def report_of(
     begin: float | None = None,
     end: float | None = None,
     late_watch: LateWatch | None = None,
+    config: Config | None = None,
 ) -> tuple[ReportData, list[Step]]:
     """Return the report's data of a drive, and the steps of the drive."""
-    config, tape = Config(), Tape()
+    config, tape = config or Config(), Tape()
     world = World(config, recorder=tape, late_watch=late_watch)
     drive(world)
     steps = tape.steps()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, Source
+from acsard.core.config.settings import BatteryConfig, Config, Source
 from acsard.report.figures import path_figure
 from acsard.report.report_text import Origin, Setting, differences, reasons, rows, summary
 from tests.scenarios.instant_watch import InstantWatch
@@ -71,6 +71,22 @@ def test_a_pressed_bumper_is_counted_and_listed_and_drawn_on_the_path() -> None:
     table = dict(rows(report, origin, lambda s, day: f"<{s:.0f}>"))
     assert table["Bumper hits"].startswith("1: <1800000001> bumper 2 pressed")
     assert "bumper pressed" in {key.meaning for key in path_figure(report).keys}
+
+
+def test_a_battery_stop_is_counted_and_listed_and_drawn_on_the_path() -> None:
+    config = Config(battery=BatteryConfig(stop_below=21.0))
+
+    def empty(world: World) -> None:
+        with world.mcu.battery(0.0, 60.0):
+            world.drive(0.5, seconds=5.0)
+
+    report, _ = report_of(empty, config=config)
+    assert summary(report).endswith("There were no faults, no stops, 1 battery stop.")
+    origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
+    table = dict(rows(report, origin, lambda s, day: f"<{s:.0f}>"))
+    assert table["Battery stops"].startswith("1: <1800000003> ")
+    assert "the mean is below battery.stop_below = 21 V" in table["Battery stops"]
+    assert "battery stop" in {key.meaning for key in path_figure(report).keys}
 
 
 def test_a_host_stall_does_not_count_as_a_loss_of_the_link() -> None:

@@ -9,6 +9,7 @@ from acsard.core.config.contradictions import contradictions, warnings
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import (
     AccessConfig,
+    BatteryConfig,
     BusConfig,
     Config,
     ControlConfig,
@@ -219,6 +220,46 @@ def test_motion_away_from_a_bumper_needs_its_place() -> None:
     ]
     placed = Config(safety=SafetyConfig(bumpers=("rear",), bumper="away"))
     assert contradictions(placed) == []
+
+
+@each(
+    ("battery", "problem"),
+    [
+        (
+            BatteryConfig(warning_below=22.0, return_below=22.0),
+            "battery.return_below = 22: not lower than battery.warning_below = 22; write a lower "
+            "battery.return_below",
+        ),
+        (
+            BatteryConfig(warning_below=22.0, stop_below=23.0),
+            "battery.stop_below = 23: not lower than battery.warning_below = 22; write a lower "
+            "battery.stop_below",
+        ),
+        (
+            BatteryConfig("percent", warning_below=99.8),
+            "battery.warning_below = 99.8: with battery.hysteresis = 0.5 this level would end "
+            "above 100, which no board reports; write lower values",
+        ),
+        (
+            BatteryConfig(stop_below=60.0, hysteresis=40.0),
+            "battery.stop_below = 60: with battery.hysteresis = 40 this level would end above "
+            "99.99, which no board reports; write lower values",
+        ),
+    ],
+)
+def test_thresholds_of_the_battery_are_in_order_and_can_end(
+    battery: BatteryConfig, problem: str
+) -> None:
+    assert contradictions(Config(battery=battery)) == [problem]
+
+
+def test_thresholds_in_order_are_no_problem() -> None:
+    for battery in (
+        BatteryConfig(),
+        BatteryConfig(warning_below=22.0, return_below=21.5, stop_below=21.0),
+        BatteryConfig("percent", warning_below=99.5, stop_below=10.0),
+    ):
+        assert contradictions(Config(battery=battery)) == []
 
 
 def test_a_required_emergency_stop_needs_room_on_a_slow_wire() -> None:

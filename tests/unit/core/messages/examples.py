@@ -7,6 +7,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from acsard.core.values import (
+    BatteryStatus,
     Estimate,
     Event,
     Instant,
@@ -62,6 +63,7 @@ SNAPSHOT = Snapshot(
     ),
     counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
     refused="source nav: held up",
+    battery=BatteryStatus("ok", 103_900_000_000, 22.5, 40.0, -1.5, 21.75),
     figures={
         "period_lateness": Measured(Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0))
     },

@@ -8,6 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import (
+    BatteryConfig,
     BusConfig,
     Config,
     ControlConfig,
@@ -17,10 +18,13 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
+from acsard.core.motion.battery import MISSING as MISSING_BATTERY
 from acsard.core.motion.bumpers import SILENT as SILENT_BUMPERS
 from acsard.core.motion.bumpers import missing
 from acsard.core.motion.emergency_stop import DRIVER_FAULT, MISSING, PRESSED, SILENT
 from acsard.core.values import (
+    BatteryLevel,
+    BatteryStatus,
     GyroStatus,
     Measured,
     Outputs,
@@ -135,6 +139,38 @@ def test_bumpers_that_are_ignored_need_no_row() -> None:
 def test_a_motor_drivers_fault_is_an_error_of_the_board() -> None:
     one = row("board", snapshot=seen(board={"motor_driver": "fault"}))
     assert (one.level, one.message) == (ERROR, f"no emergency-stop input; {DRIVER_FAULT}")
+
+
+BATTERY = replace(CONFIG, battery=BatteryConfig(warning_below=22.0, stop_below=21.0))
+
+
+@each(
+    ("level", "number", "message"),
+    [
+        ("ok", OK, "22.50 V, 40 %, -1.50 A"),
+        ("warning", WARN, "22.50 V, 40 %, -1.50 A; the mean is below battery.warning_below = 22 V"),
+        ("stop", ERROR, "22.50 V, 40 %, -1.50 A; the mean is below battery.stop_below = 21 V"),
+        ("unknown", WARN, "22.50 V, 40 %, -1.50 A; the level is known after 3 s of reports"),
+    ],
+)
+def test_a_battery_that_the_board_reports_has_a_row(
+    level: BatteryLevel, number: int, message: str
+) -> None:
+    status = BatteryStatus(level, 0, 22.5, 40.0, -1.5, 21.756)
+    one = row("battery", BATTERY, snapshot=seen(battery=status))
+    assert (one.level, one.message) == (number, message)
+    assert values(one) == {
+        "level": level, "volts": "22.50", "percent": "40.00", "amperes": "-1.50", "mean": "21.76",
+        "warning_below": "22", "stop_below": "21",
+    }  # fmt: skip
+
+
+def test_a_battery_has_a_row_once_it_is_reported_or_has_thresholds() -> None:
+    assert "acsard: battery" not in {one.name for one in rows(snapshot=seen(battery=None))}
+    one = row("battery", BATTERY, snapshot=seen(battery=None))
+    assert (one.level, one.message) == (WARN, MISSING_BATTERY)
+    one = row("battery", snapshot=seen(battery=BatteryStatus("ok", 0, 24.0, mean=24.0)))
+    assert values(one) == {"level": "ok", "volts": "24.00"}
 
 
 def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() -> None:

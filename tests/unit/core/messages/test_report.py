@@ -25,9 +25,12 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.report import Report, from_rpy, from_yaw
 from acsard.core.messages.schema import (
+    Battery,
+    BatterySummary,
     DiagnosticArray,
     DiagnosticStatus,
     Events,
+    Header,
     JointState,
     Latency,
     LogEvent,
@@ -47,6 +50,7 @@ from acsard.core.messages.topics import PUBLISHED
 from acsard.core.motion.arbiter_text import missed
 from acsard.core.motion.gyro import WORDS
 from acsard.core.values import (
+    BatteryStatus,
     Estimate,
     Event,
     GyroDoes,
@@ -356,6 +360,7 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
                 Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0)
             )
         },
+        battery=BatterySummary(22.5, 40.0, -1.5, "ok"),
     )
 
 
@@ -427,7 +432,7 @@ def test_feedback_is_out_before_the_summary_is_built() -> None:
 
 
 def test_nobody_looks_at_the_robot_for_a_summary_that_nobody_wants() -> None:
-    wanted = ALL - {"state", "diagnostics"}
+    wanted = ALL - {"state", "diagnostics", "battery"}
     assert len(list(Report(CONFIG, START).due(OUTPUTS, wanted, never))) == 5
 
 
@@ -472,7 +477,7 @@ def test_every_sample_of_a_step_is_published_in_order() -> None:
 
 
 def test_a_step_without_feedback_publishes_no_odometry() -> None:
-    left = {"cmd_vel_out", "events", "state", "diagnostics"}
+    left = {"cmd_vel_out", "events", "state", "diagnostics", "battery"}
     assert set(published(replace(OUTPUTS, estimates=()))) == left
 
 
@@ -530,7 +535,7 @@ def test_state_comes_at_ten_and_diagnostics_at_one_hertz_by_default() -> None:
     assert abs(len(times_of("diagnostics", CONFIG)) - 10) <= 1
 
 
-@pytest.mark.parametrize("key", ["state", "diagnostics"])
+@pytest.mark.parametrize("key", ["state", "diagnostics", "battery"])
 def test_a_change_is_published_at_once(key: str) -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), {key}, look))
@@ -610,6 +615,47 @@ def test_at_ten_hertz_the_gaps_are_even_too() -> None:
         if list(report.due(at(later(1.0 + step / 100 + late)), {"state"}, look)):
             found.append(step)
     assert {b - a for a, b in pairwise(found[2:])} == {10}
+
+
+# the battery
+
+
+def with_battery(battery: BatteryStatus | None) -> dict[str, Any]:
+    return dict(Report(CONFIG, START).due(OUTPUTS, ALL, lambda: replace(SNAPSHOT, battery=battery)))
+
+
+def test_the_battery_has_the_time_of_its_report_and_null_for_what_is_not_measured() -> None:
+    messages = published()
+    assert messages["battery"] == Battery(
+        Header(Time.from_ns(OUTPUTS.now.wall_ns - 104_000_000)),
+        voltage=22.5,
+        current=-1.5,
+        percentage=0.4,
+        power_supply_status=2,
+        present=True,
+    )
+
+
+@each(("amps", "status"), [(None, 0), (2.0, 1), (-0.01, 2), (0.0, 3)])
+def test_the_current_shows_whether_the_battery_is_charged(amps: float | None, status: int) -> None:
+    battery = with_battery(BatteryStatus("ok", 0, 24.0, amps=amps))["battery"]
+    assert battery.power_supply_status == status
+
+
+def test_a_board_that_fell_silent_has_no_battery_any_more() -> None:
+    messages = with_battery(BatteryStatus("unknown"))
+    assert messages["battery"] == Battery(Header(Time.from_ns(OUTPUTS.now.wall_ns)))
+    assert messages["state"].battery == BatterySummary(None, None, None, "unknown")
+
+
+def test_a_board_that_never_reported_a_battery_has_no_message_and_null_in_state() -> None:
+    messages = with_battery(None)
+    assert "battery" not in messages
+    assert messages["state"].battery is None
+
+
+def test_the_battery_comes_once_a_second() -> None:
+    assert abs(len(times_of("battery", CONFIG)) - 10) <= 1
 
 
 # the gyro

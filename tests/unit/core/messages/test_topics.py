@@ -29,6 +29,7 @@ PROMISED = [
     ("tf_static", "out", "TFMessage"),
     ("robot_description", "out", "String"),
     ("wheel_states", "out", "JointState"),
+    ("battery", "out", "Battery"),
     ("cmd_vel_out", "out", "TwistStamped"),
     ("state", "out", "RobotState"),
     ("diagnostics", "out", "DiagnosticArray"),

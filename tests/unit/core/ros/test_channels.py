@@ -49,6 +49,10 @@ def filled(cls: type[Struct]) -> Any:
                 return inner(*[value(field.type) for field in info.fields])
             case inspect.ListType(item_type=item, min_length=least):
                 return [value(item) for _ in range(least or 2)]
+            case inspect.UnionType(types=(number, _)):
+                return value(number)
+            case inspect.BoolType():
+                return True
             case inspect.FloatType():
                 return next(counted) / 8
             case inspect.StrType():

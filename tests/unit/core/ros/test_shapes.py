@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import LogEvent, RobotState, SourceState, Time
-from acsard.core.ros.shapes import Counter, Log, Source, log, state
+from acsard.core.ros.channels import STATE as CHANNEL
+from acsard.core.ros.shapes import Counter, Log, Source, State, log, state
 from acsard.core.values import Event
+
+STORE = get_typestore(Stores.EMPTY)
+STORE.register(get_types_from_msg(CHANNEL.schema, CHANNEL.schema_name))
 
 STATE = RobotState(
     stamp=Time(5, 6),
@@ -53,15 +60,18 @@ def test_who_did_it_and_how_often_stand_there_only_if_there_is_something_to_say(
 
 
 def test_a_source_never_heard_has_no_age() -> None:
-    heard, never = state(STATE).sources
-    assert heard == Source("app", 50, 0.1, "")
-    assert math.isnan(never.age)
+    assert state(STATE).sources == [
+        Source("app", 50, 0.1, ""), Source("nav", 10, None, "a command")
+    ]  # fmt: skip
 
 
 def test_what_is_null_in_state_is_not_a_number_in_ros() -> None:
-    told = state(replace(STATE, linear=None, angular=None, wheels=[], feedback_age=None))
+    unknown = state(replace(STATE, linear=None, angular=None, wheels=[], feedback_age=None))
+    told: Any = STORE.deserialize_cdr(Cdr(State).encode(unknown), CHANNEL.schema_name)
     assert all(map(math.isnan, (told.linear, told.angular, told.feedback_age)))
-    assert told.wheels == []
+    assert math.isnan(told.sources[1].age)
+    assert (len(told.wheels), told.x) == (0, 1.0)
+    assert Cdr(State).decode(Cdr(State).encode(unknown)) == unknown
 
 
 def test_state_is_the_same_field_by_field() -> None:
@@ -74,8 +84,8 @@ def test_state_is_the_same_field_by_field() -> None:
     # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
     # An exported recording does not contain the configuration file, and the robot that a replay
     # makes knows no speed limit, only the setting that it lowers. Diagnostics report the emergency
-    # stop and the bumpers, and `reason` says which one is pressed.
+    # stop and the bumpers, and `reason` says which one is pressed. The battery has its own topic.
     assert left_out == {
         "stamp", "latencies", "encoder_counts", "latch", "latch_file_error", "settings_differ",
-        "speed_limit", "emergency_stop", "bumpers",
+        "speed_limit", "emergency_stop", "bumpers", "battery",
     }  # fmt: skip

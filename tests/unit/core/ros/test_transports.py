@@ -52,6 +52,7 @@ def test_the_bridge_s_keys_are_the_bare_names() -> None:
         "robot_description": "robot_description",
         "wheel_states": "joint_states",
         "diagnostics": "diagnostics",
+        "battery": "battery_state",
         "cmd_vel_out": "cmd_vel_out",
         "cmd/nav": "cmd_vel",
         "cmd/dock": "cmd_vel_dock",

@@ -1,0 +1,187 @@
+"""Follows the battery that the board reports, and decides when it stops the robot.
+
+The thresholds in `[battery]` are compared with a mean, because the current of starting motors makes
+the voltage drop for some tenths of a second. `lifecycle.py` keeps the latch of a stop. Nothing
+releases it until the mean has risen above the threshold by `battery.hysteresis`.
+
+A board that falls silent about its battery does not stop the robot: a robot that stands still in
+the way is the greater danger, and the voltage falls slowly. The level is then "unknown".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import get_args
+
+from acsard.core.config.settings import BatteryConfig
+from acsard.core.link.board_status import BoardStatus
+from acsard.core.values import NS_PER_S, BatteryLevel, BatteryStatus, Event
+
+TIME_CONSTANT_S = 10.0
+"""Time constant of the mean, s. A drop of 2 V for 0.3 s, as when motors start, lowers it by 0.06 V.
+A battery takes minutes from one level to the next, so the robot reacts soon enough."""
+
+SETTLE_S = 3.0
+"""Time of reports, s, after which the mean counts. It begins again after a silence. A motor start
+within this time lowers the mean by up to a tenth of the drop."""
+
+SILENT_S = 5.0
+"""Age, s, at which a value no longer counts. A board that reports its battery once a second may
+lose four reports."""
+
+LONGEST_NS = NS_PER_S
+"""Longest time for which one report may stand in the mean, ns. After a gap, a single report from
+the moment of a motor start would otherwise weigh too much."""
+
+ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
+"""The levels that a value can have, the best first."""
+
+MISSING = "the board has not reported its battery, but [battery] has thresholds"
+"""What is wrong if a battery with thresholds is never reported, in words."""
+
+SILENT = f"the board has not reported its battery for {SILENT_S:g} s"
+
+
+def words(config: BatteryConfig, status: BatteryStatus) -> str:
+    """Return the values and the level of a battery as text."""
+    forms = ((status.volts, "{:.2f} V"), (status.percent, "{:g} %"), (status.amps, "{:.2f} A"))
+    values = [form.format(value) for value, form in forms if value is not None]
+    if status.volts is None and status.percent is None:
+        return SILENT
+    shown, level = ", ".join(values), status.level
+    if level == "ok":
+        return shown
+    if level != "unknown":
+        return f"{shown}; the mean is below {_threshold(config, level)}"
+    if getattr(status, config.measure) is None:
+        lacks = "voltage" if config.measure == "volts" else "charge"
+        return f'{shown}; battery.measure = "{config.measure}", but the board reports no {lacks}'
+    return f"{shown}; the level is known after {SETTLE_S:g} s of reports"
+
+
+def _threshold(config: BatteryConfig, level: BatteryLevel) -> str:
+    name = f"{level}_below"
+    return f"battery.{name} = {_with_unit(config, getattr(config, name))}"
+
+
+def _with_unit(config: BatteryConfig, value: float) -> str:
+    return f"{value:g} {'V' if config.measure == 'volts' else '%'}"
+
+
+class Battery:
+    """The battery of one robot."""
+
+    def __init__(self, config: BatteryConfig) -> None:
+        self._config = config
+        self._bounds = config.bounds
+        self.status: BatteryStatus | None = None
+        """The battery, None if the board has never reported its voltage or its charge."""
+        self.stopped_now = False
+        """Whether the level fell to "stop" in the last `look`."""
+        self._values: dict[str, tuple[float, int]] = {}
+        """The last values by name, not older than `SILENT_S`, each with its time, ns."""
+        self._known: BatteryLevel = "ok"
+        """The last level that was not "unknown". A silence does not end a stop."""
+        self._told: BatteryLevel | None = None
+        """The level of the last event."""
+        self._mean: float | None = None
+        self._since_ns = self._mean_ns = 0
+        """Monotonic times of the first and the last report since a silence, ns."""
+
+    @property
+    def held(self) -> bool:
+        """Whether the battery keeps a stopped robot from being cleared."""
+        return self._known == "stop"
+
+    @property
+    def why(self) -> str:
+        """Why the robot stops at the level "stop", in words that do not change."""
+        return f"battery below {_threshold(self._config, 'stop')}"
+
+    @property
+    def mend(self) -> str:
+        """What ends the level "stop", in words that do not change."""
+        config = self._config
+        return f"charge it to {_with_unit(config, config.stop_below + config.hysteresis)}"
+
+    def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
+        """Take the status lines since the last step, and return the event of a new level.
+
+        Args:
+            reports: The status lines, each with its monotonic time of arrival, ns.
+            now_ns: Monotonic time of this step, ns.
+        """
+        self.stopped_now = False
+        news = False
+        for at_ns, line in reports:
+            percent = None if line.charge is None else float(round(100 * line.charge))
+            values = {"volts": line.volts, "percent": percent, "amps": line.amps}
+            for name, value in values.items():
+                if value is not None:
+                    self._take(name, value, at_ns)
+                    news = True
+        if self.status is None and not ("volts" in self._values or "percent" in self._values):
+            return []
+        for name, (_, at_ns) in [*self._values.items()]:
+            if now_ns - at_ns > SILENT_S * NS_PER_S:
+                del self._values[name]
+                news = True
+        level = self._level(now_ns)
+        if not news and self.status is not None and self.status.level == (level or "unknown"):
+            return []
+        self.status = self._summed(level or "unknown")
+        if level is None or level == self._told:
+            return []
+        before, self._told = self._told, level
+        return [self._event(level, before)]
+
+    def _take(self, name: str, value: float, at_ns: int) -> None:
+        first = not self._values
+        self._values[name] = value, at_ns
+        if name != self._config.measure:
+            self._since_ns = at_ns if first else self._since_ns
+        elif self._mean is None:
+            self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
+        elif at_ns > self._mean_ns:
+            # At first it is the plain mean of all reports.
+            span_ns = min(TIME_CONSTANT_S * NS_PER_S, at_ns - self._since_ns)
+            stood_ns = min(at_ns - self._mean_ns, LONGEST_NS)
+            self._mean += (value - self._mean) * stood_ns / span_ns
+            self._mean_ns = at_ns
+
+    def _level(self, now_ns: int) -> BatteryLevel | None:
+        """Return the level, or None while it is not known yet."""
+        measure, values = self._config.measure, self._values
+        if measure not in values:
+            self._mean = None
+        if not ("volts" in values or "percent" in values):
+            return "unknown"
+        if not self._bounds:
+            return "ok"
+        if now_ns - self._since_ns < SETTLE_S * NS_PER_S:
+            return None
+        if self._mean is None:
+            return "unknown"
+        reached = ORDER.index(self._known)
+        found: BatteryLevel = "ok"
+        for level, below in self._bounds.items():
+            rise = self._config.hysteresis if reached >= ORDER.index(level) else 0.0
+            if self._mean < below + rise:
+                found = level
+        self.stopped_now = found == "stop" != self._known
+        self._known = found
+        return found
+
+    def _summed(self, level: BatteryLevel) -> BatteryStatus:
+        values = {name: value for name, (value, _) in self._values.items()}
+        times = [at_ns for _, at_ns in self._values.values()]
+        return BatteryStatus(level, max(times, default=None), **values, mean=self._mean)
+
+    def _event(self, level: BatteryLevel, before: BatteryLevel | None) -> Event:
+        assert self.status is not None
+        text = words(self._config, self.status)
+        if level == "stop":
+            return Event("battery_stop", f"{text}; {self.mend}, then call srv/clear", "error")
+        if before == "stop" and level != "unknown":
+            text = f"{text}; the robot stays stopped until srv/clear"
+        return Event("battery", text, "info" if level == "ok" else "warning", kind=level)

@@ -1,0 +1,303 @@
+"""Tests of the battery: its levels, their hysteresis, the mean, and a board that falls silent."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import BatteryConfig
+from acsard.core.link.board_status import BoardStatus
+from acsard.core.motion.battery import SILENT, SILENT_S, TIME_CONSTANT_S, Battery, words
+from acsard.core.values import BatteryLevel, BatteryStatus
+from tests.each import each
+
+MS = 1_000_000
+
+CONFIG = BatteryConfig(warning_below=22.0, return_below=21.5, stop_below=21.0, hysteresis=0.4)
+
+ORDER = ("ok", "warning", "return", "stop")
+
+
+class Pack:
+    """A battery with its time. The first step is at 10 s."""
+
+    def __init__(self, config: BatteryConfig = CONFIG) -> None:
+        self.battery = Battery(config)
+        self.now_ms = 10_000
+        self.events: list[tuple[str, str]] = []
+        self.stops = 0
+
+    def step(self, *lines: BoardStatus, ms: int = 100) -> BatteryLevel | None:
+        """Take these status lines `ms` after the step before, and return the level."""
+        self.now_ms += ms
+        told = [(self.now_ms * MS, line) for line in lines]
+        found = self.battery.look(told, self.now_ms * MS)
+        self.events += [(event.name, event.text) for event in found]
+        self.stops += self.battery.stopped_now
+        return None if self.battery.status is None else self.battery.status.level
+
+    def at(self, volts: float, seconds: float, ms: int = 100) -> BatteryLevel | None:
+        """Report this voltage for so long, once in `ms`."""
+        count = round(seconds * 1000 / ms)
+        return [self.step(BoardStatus(volts=volts), ms=ms) for _ in range(count)][-1]
+
+    def quiet(self, seconds: float) -> BatteryLevel | None:
+        """Take steps without a report for so long."""
+        return [self.step() for _ in range(round(seconds * 10))][-1]
+
+    @property
+    def status(self) -> BatteryStatus:
+        assert self.battery.status is not None
+        return self.battery.status
+
+
+# levels
+
+
+def test_a_battery_that_is_never_reported_has_no_status() -> None:
+    pack = Pack()
+    assert pack.quiet(20.0) is pack.step(BoardStatus(estop=False, amps=-1.0)) is None
+    assert (pack.events, pack.stops, pack.battery.held) == ([], 0, False)
+
+
+def test_without_thresholds_a_reported_battery_is_ok_at_once() -> None:
+    pack = Pack(BatteryConfig())
+    assert pack.step(BoardStatus(volts=3.0, amps=-1.25, charge=0.29)) == "ok"
+    assert pack.status == BatteryStatus("ok", pack.now_ms * MS, 3.0, 29.0, -1.25, 3.0)
+    assert pack.events == [("battery", "3.00 V, 29 %, -1.25 A")]
+
+
+@each(
+    ("volts", "level"),
+    [
+        (25.0, "ok"), (22.0, "ok"), (21.99, "warning"), (21.5, "warning"), (21.49, "return"),
+        (21.0, "return"), (20.99, "stop"), (0.0, "stop"),
+    ],
+)  # fmt: skip
+def test_a_steady_voltage_has_its_level_after_three_seconds(
+    volts: float, level: BatteryLevel
+) -> None:
+    pack = Pack()
+    assert pack.at(volts, 3.0) == "unknown"
+    assert pack.events == []
+    assert pack.at(volts, 0.1) == level
+    assert pack.at(volts, 60.0) == level
+    assert [name for name, _ in pack.events] == ["battery_stop" if level == "stop" else "battery"]
+
+
+@each(
+    ("charge", "level"),
+    [(0.3, "ok"), (0.29, "warning"), (0.2, "warning"), (0.19, "return"), (0.0, "return")],
+)
+def test_thresholds_in_per_cent_compare_the_charge(charge: float, level: BatteryLevel) -> None:
+    pack = Pack(BatteryConfig("percent", warning_below=30.0, return_below=20.0))
+    for _ in range(100):
+        pack.step(BoardStatus(charge=charge))
+    assert pack.status.level == level
+    assert not pack.stops
+
+
+def test_a_level_ends_above_its_threshold_by_the_hysteresis() -> None:
+    pack = Pack()
+    found = [
+        pack.at(volts, 60.0)
+        for volts in (21.9, 22.39, 22.41, 21.4, 21.89, 21.91, 20.9, 21.39, 21.41, 21.8, 22.5)
+    ]
+    assert found == [
+        "warning", "warning", "ok", "return", "return", "warning", "stop", "stop", "return",
+        "return", "ok",
+    ]  # fmt: skip
+    assert pack.stops == 1
+
+
+@given(st.lists(st.sampled_from([21.01, 20.99]), max_size=200))
+def test_noise_around_a_threshold_changes_the_level_once(noise: list[float]) -> None:
+    pack = Pack()
+    pack.at(21.2, 10.0)
+    levels = [pack.at(volts, 0.5) for volts in noise]
+    assert sum(a != b for a, b in pairwise(["return", *levels])) <= 1
+
+
+@given(st.lists(st.floats(15.0, 30.0), min_size=40, max_size=120))
+def test_while_the_mean_falls_the_level_never_gets_better(volts: list[float]) -> None:
+    pack = Pack()
+    before: tuple[float, str] | None = None
+    for value in volts:
+        pack.step(BoardStatus(volts=value))
+        level, mean = pack.status.level, pack.status.mean
+        assert mean is not None
+        assert min(volts) - 1e-9 <= mean <= max(volts) + 1e-9
+        if level == "unknown":
+            continue
+        if before and mean <= before[0]:
+            assert ORDER.index(level) >= ORDER.index(before[1])
+        before = mean, level
+
+
+# the stop
+
+
+def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
+    pack = Pack()
+    pack.at(20.9, 5.0)
+    assert (pack.stops, pack.battery.held) == (1, True)
+    assert pack.battery.why == "battery below battery.stop_below = 21 V"
+    assert pack.battery.mend == "charge it to 21.4 V"
+    pack.at(21.3, 60.0)
+    assert pack.battery.held
+    pack.at(24.0, 10.0)
+    assert (pack.stops, pack.battery.held) == (1, False)
+    pack.at(20.0, 60.0)
+    assert pack.stops == 2
+    # The mean rises through each of the levels.
+    first, *_, last = pack.events
+    assert first == (
+        "battery_stop",
+        "20.90 V; the mean is below battery.stop_below = 21 V; charge it to 21.4 V, then call "
+        "srv/clear",
+    )
+    assert [text for _, text in pack.events if text.endswith("stays stopped until srv/clear")] == [
+        "24.00 V; the mean is below battery.return_below = 21.5 V; the robot stays stopped until "
+        "srv/clear"
+    ]
+    assert last[0] == "battery_stop"
+
+
+def test_an_exchanged_battery_ends_the_stop_within_seconds() -> None:
+    pack = Pack()
+    pack.at(20.5, 30.0)
+    pack.quiet(SILENT_S + 0.1)
+    assert pack.battery.held
+    assert pack.at(25.0, 3.2) == "ok"
+    assert not pack.battery.held
+
+
+# motor starts
+
+
+@each("start_ms", range(0, 1000, 50))
+@each("ms", [20, 100, 250])
+def test_a_motor_start_is_not_a_level(start_ms: int, ms: int) -> None:
+    """The start takes 0.3 s and lowers the voltage by 2 V. The battery is 0.1 V above the stop."""
+    pack = Pack()
+    pack.at(21.1, 30.0, ms=ms)
+    assert pack.status.level == "return"
+    for at_ms in range(0, 5000, ms):
+        sags = start_ms <= at_ms < start_ms + 300
+        pack.step(BoardStatus(volts=19.1 if sags else 21.1), ms=ms)
+        assert pack.status.level == "return"
+        assert pack.status.mean is not None
+        # A board that reports every 250 ms may show the drop for 0.5 s.
+        assert pack.status.mean > 21.1 - (0.1 if ms == 250 else 0.07)
+    assert pack.stops == 0
+
+
+def test_motors_that_start_every_two_seconds_count_by_their_mean() -> None:
+    pack = Pack()
+    pack.at(21.6, 30.0)
+    for _ in range(30):
+        pack.at(19.6, 0.3)
+        pack.at(21.6, 1.7)
+    assert pack.status.level == "return"
+    assert pack.status.mean == pytest.approx(21.6 - 0.3, abs=0.06)
+    assert pack.stops == 0
+
+
+def test_a_lasting_drop_counts_after_a_time_constant() -> None:
+    pack = Pack()
+    pack.at(24.0, 30.0)
+    pack.at(20.0, TIME_CONSTANT_S)
+    assert pack.status.mean == pytest.approx(20.0 + 4.0 / 2.718, abs=0.02)
+    assert pack.status.level == "return"
+    assert pack.at(20.0, TIME_CONSTANT_S) == "stop"
+
+
+def test_one_line_after_a_gap_counts_for_a_second_at_most() -> None:
+    pack = Pack()
+    pack.at(24.0, 30.0)
+    pack.quiet(4.0)
+    pack.at(22.0, 0.1)
+    assert pack.status.mean == pytest.approx(23.8)
+
+
+def test_several_lines_of_one_read_count_once() -> None:
+    pack = Pack()
+    pack.step(BoardStatus(volts=24.0), BoardStatus(volts=20.0))
+    assert pack.status.mean == 24.0
+    pack.at(24.0, 30.0)
+    pack.step(*[BoardStatus(volts=20.0)] * 50)
+    assert pack.status.mean == pytest.approx(23.96)
+
+
+# silence
+
+
+def test_a_board_that_falls_silent_is_unknown_and_stops_nothing() -> None:
+    pack = Pack()
+    pack.at(24.0, 10.0)
+    assert pack.quiet(SILENT_S) == "ok"
+    assert pack.quiet(0.2) == "unknown"
+    assert pack.status == BatteryStatus("unknown")
+    assert pack.quiet(600.0) == "unknown"
+    assert pack.events == [("battery", "24.00 V"), ("battery", SILENT)]
+    assert (pack.stops, pack.battery.held) == (0, False)
+    assert pack.at(24.0, 3.0) == "unknown"
+    assert pack.at(24.0, 0.1) == "ok"
+    assert pack.events[2:] == [("battery", "24.00 V")]
+
+
+def test_lines_without_the_battery_do_not_count_as_its_reports() -> None:
+    pack = Pack()
+    pack.at(24.0, 10.0)
+    for _ in range(60):
+        pack.step(BoardStatus(estop=False, temperature=20.0))
+    assert pack.status.level == "unknown"
+
+
+def test_a_silence_does_not_release_a_stop() -> None:
+    pack = Pack()
+    pack.at(20.0, 10.0)
+    assert pack.quiet(600.0) == "unknown"
+    assert pack.battery.held
+    # A clear would be refused, so the event does not advise it.
+    assert pack.events[-1] == ("battery", SILENT)
+    assert pack.at(20.0, 10.0) == "stop"
+    assert pack.stops == 1
+
+
+@each(
+    ("measure", "line", "text"),
+    [
+        ("volts", BoardStatus(charge=0.5), '50 %; battery.measure = "volts", but the board reports '
+         "no voltage"),
+        ("percent", BoardStatus(volts=24.5), '24.50 V; battery.measure = "percent", but the board '
+         "reports no charge"),
+    ],
+)  # fmt: skip
+def test_a_board_that_does_not_report_the_measure_is_named(
+    measure: str, line: BoardStatus, text: str
+) -> None:
+    pack = Pack(BatteryConfig(measure, stop_below=20.0))  # type: ignore[arg-type]
+    for _ in range(100):
+        assert pack.step(line) == "unknown"
+    assert pack.events == [("battery", text)]
+    assert words(pack.battery._config, pack.status) == text
+
+
+def test_a_measure_that_falls_silent_alone_is_named_too() -> None:
+    pack = Pack()
+    for _ in range(50):
+        pack.step(BoardStatus(volts=24.0, charge=0.5))
+    for _ in range(60):
+        pack.step(BoardStatus(charge=0.5))
+    assert pack.status == BatteryStatus("unknown", pack.now_ms * MS, None, 50.0)
+    assert pack.events[-1][1].endswith("but the board reports no voltage")
+
+
+def test_the_words_before_the_level_is_known_say_so() -> None:
+    pack = Pack()
+    pack.at(24.0, 1.0)
+    assert words(CONFIG, pack.status) == "24.00 V; the level is known after 3 s of reports"
