@@ -128,7 +128,7 @@ _Static_assert(REVERSE_TICKS * PWM_HZ >= CONTROL_HZ,
                "a duty of zero must have been taken over before the direction changes");
 _Static_assert(F_CPU / (2UL * PWM_HZ) <= 32767, "the PWM period must fit its timer");
 _Static_assert((BUMPER_INPUTS) >= 0 && (BUMPER_INPUTS) <= 4, "at most four bumpers");
-_Static_assert((BATTERY_TOP_OHM) + (BATTERY_BOTTOM_OHM) <= 99990L * (BATTERY_BOTTOM_OHM) / (REFERENCE_MV),
+_Static_assert((BATTERY_TOP_OHM) + (BATTERY_BOTTOM_OHM) <= 99990LL * (BATTERY_BOTTOM_OHM) / (REFERENCE_MV),
                "the status line reports at most 99.99 V");
 #if COMMAND_WATCHDOG_MS > 500
 #error "the motors must stop within 500 ms of silence"

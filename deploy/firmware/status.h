@@ -9,7 +9,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#define STATUS_MAX 64 /* bytes of the longest line with CR LF: 54 */
+#define STATUS_MAX 64 /* bytes of the longest line with CR LF: 52 */
 #define CONTACTS 6    /* bits of their port: 0 emergency stop, 1 to 4 bumpers, 5 driver fault */
 #define ANALOGS 2     /* 0 battery, 1 current */
 

@@ -61,7 +61,7 @@ class Inputs:
             return None
         line = self._out.raw[:length]
         assert line.endswith(b"\r\n")
-        assert length <= 54
+        assert length <= 52
         return decode_status(line[:-2], True)
 
     def lines(self, levels: int, length_ms: int, readings: Sequence[int] = ()) -> list[BoardStatus]:
