@@ -60,11 +60,6 @@ def passes(board: Board, ms: float) -> Status:
     return until(lambda: s if (s := board.status()).virtual_ns >= end else None, 10.0, f"{ms} ms")
 
 
-def replies(host: Host) -> list[Reply]:
-    """Return the replies that have come, and nothing else but status lines."""
-    return [read_reply(line, at) for at, line in host.lines() if not line.startswith(STATUS)]
-
-
 def asks(board: Board, host: Host, speeds: Speeds, ms: float) -> None:
     """Send these speeds every 20 ms for that time of the board."""
     end = board.status().virtual_ns + ms * MS
@@ -267,19 +262,20 @@ def test_each_line_has_its_reply_and_no_status_line_is_within_one(
         assert values >= 2
 
 
-def test_a_host_that_never_pauses_gets_whole_lines(board: Board, host: Host) -> None:
-    """No status line takes the place of a reply, so a flood may leave none room."""
-    line = checked(speeds_line((0, 0, 0, 0)), 0, "S") + b"\r\n"
+def test_no_status_line_takes_the_place_of_a_reply(board: Board, host: Host) -> None:
+    """Lines back to back are more than the board can answer, so no room is left for a second."""
     host.send(STOP)
-    began = board.status()
-    got = 0
-    while (status := board.status()).virtual_ns < began.virtual_ns + 1000 * MS:
-        ahead = (status.virtual_ns - began.virtual_ns) * 11520 // 1_000_000_000 + 300
-        if status.to_board.bytes - began.to_board.bytes < ahead:
-            host.write(line * 4)
-        got += len(replies(host))
-    assert got > 150
+    host.write((checked(STOP, 0, "S") + b"\r\n") * 250)
+    passes(board, 1200)
     board.command(f"contact {ESTOP} open")
+    came = [line for _, line in host.lines()]
+    answers = [place for place, line in enumerate(came) if not line.startswith(STATUS)]
+    lengths = {len(read_reply(came[place]).line) for place in answers}
+    print(f"{len(answers)} replies to 251 lines in a second, "
+          f"{answers[-1] + 1 - len(answers)} status lines between them")  # fmt: skip
+    assert lengths == {31, 60}
+    assert len(answers) > 150
+    assert answers[-1] + 1 - len(answers) <= 2
     awaited(host, BoardStatus(estop=True, bumpers=(False,) * 4))
 
 
