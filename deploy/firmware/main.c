@@ -230,8 +230,8 @@ static void on_command(const struct command *command)
     stop_seen = true;
     checked_seen |= command->checked;
     record.lines++;
-    if (HAS_INPUTS && is_stop(command) && !status_stopped(&status))
-        halted = false;
+    if (HAS_INPUTS && is_stop(command))
+        halted = false; /* for a millisecond, while it is still pressed */
     for (i = 0; i < MOTORS; i++)
         targets[i] = astray || halted ? 0 : command->hundredths[i];
     watchdog_feed(&watchdog, latest.milliseconds);
