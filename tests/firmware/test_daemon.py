@@ -416,17 +416,22 @@ def test_a_board_that_hangs_moves_nothing_before_neutral(
 
 @pytest.mark.parametrize(
     ("mcu", "rate"),
-    [(COUNTS, 100), ({"baud_rate": 9600}, 10), ({"baud_rate": 9600}, "auto")],
+    [
+        (COUNTS, 100),
+        ({"baud_rate": 9600}, 10),
+        pytest.param({"baud_rate": 9600}, "auto", marks=pytest.mark.nightly),
+    ],
     ids=["115200 baud", "9600 baud", "9600 baud, full"],
 )
 def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
     runner: Path, wired: dict[int, Path], tmp_path: Path, mcu: Mcu, rate: object
 ) -> None:
+    """At 9600 baud the replies of `rate = "auto"` leave a fifth of the wire for status lines."""
     baud = 9600 if "baud_rate" in mcu else 115200
-    tables = {"safety": {"estop": "required"}, "control": {"rate": rate}}
+    safety, control = {"estop": "required"}, {"rate": rate}
     with (
         wired_board(runner, wired, baud) as board,
-        running(board, tmp_path, mcu, **tables) as (_, _, bus),
+        running(board, tmp_path, mcu, safety=safety, control=control) as (_, _, bus),
         bus.commanding(0.5) as commander,
     ):
         drives(board)
@@ -460,8 +465,7 @@ def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
         assert float(values["volts"]) == pytest.approx(24.0, abs=0.1)
         assert float(values["amperes"]) == pytest.approx(0.0, abs=0.2)
         assert counters["emergency_stops"] == 1
-        # The daemon may have opened the port in the middle of a line.
-        assert sum(rejects(bus).values()) <= 1, counters
+        assert not any(name.startswith("line_status") for name in counters), counters
 
 
 # the wire

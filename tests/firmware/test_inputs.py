@@ -185,7 +185,8 @@ def test_a_press_takes_the_voltage_and_only_a_zero_after_the_release_gives_it_ba
     board.command(f"contact {ESTOP} closed")
     asks(board, host, DRIVE, 500)
     assert board.status().on_ns == status.on_ns, "nor is the release"
-    assert b"trips=0 runaways=0" in (host.send(b"?") or host.says(b"!acsard"))
+    host.send(b"?")
+    assert b"trips=0 runaways=0" in host.says(b"!acsard")
     host.send(STOP)
     asks(board, host, DRIVE, 300)
     assert board.status().running
@@ -250,7 +251,8 @@ def test_each_line_has_its_reply_and_no_status_line_is_within_one(
                 board.command(f"contact {BUMPERS[0]} {'open' if pressed else 'closed'}")
             while board.status().virtual_ns < due:
                 take(0.002)
-        until(lambda: take(0.05) or len(got) >= sent, 5.0, "every line is answered")
+        passes(board, 500)
+        take(0)
         seconds = (board.status().virtual_ns - start) / 1e9
         contacts = sum(one.estop is not None for one in told)
         values = sum(one.volts is not None for one in told)
