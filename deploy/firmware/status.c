@@ -10,6 +10,7 @@
 #define BUMPER_BITS (((1 << (BUMPER_INPUTS)) - 1) << 1)
 #define DRIVER_BIT (DRIVER_INPUT ? 0x20 : 0)
 #define SENT_BITS (ESTOP_BIT | BUMPER_BITS)
+#define HAS_VALUES (DRIVER_INPUT || HAS_ANALOGS)
 
 /* The pin of a pressed contact is high, but for these. */
 #define LOW_BITS ((BUMPERS_CLOSE ? BUMPER_BITS : 0) | (DRIVER_FAULT_HIGH ? 0 : DRIVER_BIT))
@@ -59,12 +60,11 @@ bool status_stopped(const struct status *status)
     return status->pressed & ESTOP_BIT;
 }
 
-/* Has one of these contacts changed since it was sent, or is it time again? They must all be known. */
-static bool contacts_due(const struct status *status, uint32_t now_ms)
+/* Has a contact changed since it was sent? The first line waits until all of them are known. */
+static bool contacts_changed(const struct status *status)
 {
-    if (!SENT_BITS || (status->known & SENT_BITS) != SENT_BITS)
-        return false;
-    return (status->pressed & SENT_BITS) != status->sent || now_ms - status->contacts_ms >= CONTACTS_MS;
+    return SENT_BITS && (status->known & SENT_BITS) == SENT_BITS &&
+           (status->pressed & SENT_BITS) != status->sent;
 }
 
 /* The mean of the readings in mV at the pin; the next mean is of later ones. In the second between two
@@ -121,12 +121,14 @@ static char *put_values(char *at, struct status *status)
 uint8_t status_line(struct status *status, uint32_t now_ms, char *out)
 {
     char *at = put_text(out, "!status");
+    bool changed = contacts_changed(status);
 
-    /* The values first: on a wire that replies fill, the contacts would leave them no room. */
-    if ((DRIVER_INPUT || HAS_ANALOGS) && now_ms - status->values_ms >= VALUES_MS) {
+    /* A change is first, so that a press is known before the fault of a driver that lost its supply.
+     * Else the values are: on a wire that replies fill, the contacts would leave them no room. */
+    if (!changed && HAS_VALUES && now_ms - status->values_ms >= VALUES_MS) {
         status->values_ms = now_ms;
         at = put_values(at, status);
-    } else if (contacts_due(status, now_ms)) {
+    } else if (changed || (status->sent >= 0 && now_ms - status->contacts_ms >= CONTACTS_MS)) {
         status->contacts_ms = now_ms;
         status->sent = status->pressed & SENT_BITS;
         at = put_contacts(at, status->pressed);

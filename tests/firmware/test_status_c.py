@@ -113,6 +113,16 @@ def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs
     assert [one for one in told if one.estop is None] == [values] * 10
 
 
+def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply(
+    inputs: Inputs,
+) -> None:
+    inputs.boot()
+    inputs.lines(CLOSED, 997, (0, 0))
+    told = inputs.lines(1, 4, (0, 0))  # at 1000 ms both lines are due
+    assert [one.estop for one in told] == [True, None]
+    assert told[1].driver_fault
+
+
 def test_nothing_is_reported_before_it_is_known(inputs: Inputs) -> None:
     """A false press at a boot would stop the robot until `clear`."""
     inputs.boot()
