@@ -434,17 +434,12 @@ def drives_in_the_end(board: Board, bus: Bus, commander: Commander) -> None:
 
 @pytest.mark.parametrize(
     ("mcu", "rate"),
-    [
-        (COUNTS, 100),
-        ({"baud_rate": 9600}, 10),
-        pytest.param({"baud_rate": 9600}, "auto", marks=pytest.mark.nightly),
-    ],
-    ids=["115200 baud", "9600 baud", "9600 baud, full"],
+    [(COUNTS, 100), ({"baud_rate": 9600}, 10)],
+    ids=["115200 baud", "9600 baud"],
 )
 def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
-    runner: Path, wired: dict[int, Path], tmp_path: Path, mcu: Mcu, rate: object
+    runner: Path, wired: dict[int, Path], tmp_path: Path, mcu: Mcu, rate: int
 ) -> None:
-    """At 9600 baud the replies of `rate = "auto"` leave a fifth of the wire for status lines."""
     baud = 9600 if "baud_rate" in mcu else 115200
     safety, control = {"estop": "required"}, {"rate": rate}
     with (
