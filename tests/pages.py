@@ -254,6 +254,7 @@ COMMANDS: dict[str, How] = {
         "tests/simulate/test_planted.py",
         "test_a_row_whose_seed_finds_nothing_any_more_is_listed",
     ),
+    ".venv/bin/python -m tests.firmware.unchanged '842df6e9^'": Shown("needs the history"),
     ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
     ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
@@ -308,6 +309,7 @@ COMMANDS: dict[str, How] = {
         "test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port",
         "make only says what it would do",
     ),
+    "stty -F /dev/ttyACM0 115200 raw -echo && cat /dev/ttyACM0": Shown("needs a board"),
     "sudo systemctl stop acsard": Elsewhere(
         UNIT, "test_stop_ramps_down_ends_with_stop_and_exits_0"
     ),

@@ -51,6 +51,34 @@
 #define RUNAWAY_MS 150         /* ... without getting slower for this long */
 #define STUCK_MS 1000          /* or it stands at full voltage for this long; above `fault_time` */
 
+/* Inputs. The board reports those that are wired in its status line; README.md, "Wire the inputs". */
+
+#ifndef ESTOP_INPUT
+#define ESTOP_INPUT 0          /* 1: a normally-closed contact of the emergency stop is wired */
+#endif
+#ifndef BUMPER_INPUTS
+#define BUMPER_INPUTS 0        /* how many bumpers are wired, 0 to 4 */
+#endif
+#ifndef BUMPERS_CLOSE
+#define BUMPERS_CLOSE 0        /* 1: their contacts close when pressed. A broken wire then is not noticed */
+#endif
+#ifndef DRIVER_INPUT
+#define DRIVER_INPUT 0         /* 1: the fault output of the motor drivers is wired */
+#endif
+#ifndef DRIVER_FAULT_HIGH
+#define DRIVER_FAULT_HIGH 0    /* 1: it is high in a fault; 0: low, as an open collector */
+#endif
+#ifndef BATTERY_TOP_OHM
+#define BATTERY_TOP_OHM 0L     /* resistor from the battery to its pin; 0: not wired */
+#endif
+#define BATTERY_BOTTOM_OHM 10000L /* resistor from that pin to ground */
+#ifndef CURRENT_UV_PER_A
+#define CURRENT_UV_PER_A 0L    /* uV of the current sensor for an ampere into the battery, negative if
+                                * it is wired the other way round; 0: not wired */
+#endif
+#define CURRENT_ZERO_MV 2500L  /* mV of the sensor without current */
+#define REFERENCE_MV 5000L     /* mV at the board's 5V pin, to which the measured values are relative */
+
 /* Pins. The eight encoder channels share one port, so that one short interrupt reads all wheels at
  * one moment: channel A of motors a to d on bits 0, 2, 4, 6, channel B on bits 1, 3, 5, 7. */
 
@@ -77,7 +105,17 @@
 #define PWM_DDR_4 DDRH
 #define PWM_PINS_4 (_BV(PH3) | _BV(PH4) | _BV(PH5))
 
+/* Contacts, all on one port: the emergency stop on bit 0, the bumpers on bits 1 to 4, the fault output of
+ * the drivers on bit 5. Battery and current are on the analog pins A0 and A1. */
+
+#define CONTACTS_IN PINC       /* Mega pins 37, 36 to 33, 32 */
+#define CONTACTS_PULL_UPS PORTC
+
 /* What follows is derived. */
+
+#define HAS_CONTACTS (ESTOP_INPUT || BUMPER_INPUTS || DRIVER_INPUT)
+#define HAS_ANALOGS (BATTERY_TOP_OHM || CURRENT_UV_PER_A)
+#define HAS_INPUTS (HAS_CONTACTS || HAS_ANALOGS)
 
 #define MOTORS 4
 #define PWM_TOP ((int16_t)(F_CPU / (2UL * PWM_HZ))) /* phase correct: up and down */
@@ -89,6 +127,9 @@ _Static_assert((COUNTS_PER_TURN) > 0 && (COUNTS_PER_TURN) <= 65535L,
 _Static_assert(REVERSE_TICKS * PWM_HZ >= CONTROL_HZ,
                "a duty of zero must have been taken over before the direction changes");
 _Static_assert(F_CPU / (2UL * PWM_HZ) <= 32767, "the PWM period must fit its timer");
+_Static_assert((BUMPER_INPUTS) >= 0 && (BUMPER_INPUTS) <= 4, "at most four bumpers");
+_Static_assert((BATTERY_TOP_OHM) + (BATTERY_BOTTOM_OHM) <= 99990LL * (BATTERY_BOTTOM_OHM) / (REFERENCE_MV),
+               "the status line reports at most 99.99 V");
 #if COMMAND_WATCHDOG_MS > 500
 #error "the motors must stop within 500 ms of silence"
 #endif

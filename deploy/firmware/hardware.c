@@ -45,11 +45,23 @@ static void encoders_start(void)
     PCICR = ENCODER_GROUP;
 }
 
+static void inputs_start(void)
+{
+    if (HAS_CONTACTS)
+        CONTACTS_PULL_UPS = 0xFF;
+    if (HAS_ANALOGS) {
+        DIDR0 = _BV(ADC0D) | _BV(ADC1D);
+        ADMUX = _BV(REFS0); /* relative to AVcc */
+        ADCSRA = _BV(ADEN) | _BV(ADSC) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0); /* at 125 kHz: 0.1 ms */
+    }
+}
+
 void hardware_start(void)
 {
     pwm_start();
     clocks_start();
     encoders_start();
+    inputs_start();
 }
 
 /* An edge of any encoder. The channels of one are a Gray code (A leads when it turns forward), so
@@ -201,4 +213,22 @@ void hardware_motor(uint8_t motor, int16_t duty, int8_t direction)
     }
     if (value)
         connect(motor);
+}
+
+uint8_t hardware_contacts(void)
+{
+    return CONTACTS_IN;
+}
+
+int16_t hardware_reading(uint8_t *analog)
+{
+    int16_t value;
+
+    if (ADCSRA & _BV(ADSC))
+        return -1;
+    value = (int16_t)ADC;
+    *analog = ADMUX & _BV(MUX0);
+    ADMUX ^= _BV(MUX0);
+    ADCSRA |= _BV(ADSC);
+    return value;
 }

@@ -31,4 +31,11 @@ void hardware_motors_off(void);
 /* One bridge: duty 0 to PWM_TOP; direction 1, -1, or 0 for both inputs low. */
 void hardware_motor(uint8_t motor, int16_t duty, int8_t direction);
 
+/* The levels of the contacts' pins, a bit each. */
+uint8_t hardware_contacts(void);
+
+/* The reading of an analog input, 0 to 1023, and which one it is; or -1 while it is not ready. Each
+ * reading starts the next one, of the other input. Call it once a millisecond. */
+int16_t hardware_reading(uint8_t *analog);
+
 #endif

@@ -2,6 +2,7 @@
 
 #include "config.h"
 #include "crc.h"
+#include "put.h"
 
 void count_up(uint16_t *counter)
 {
@@ -162,19 +163,6 @@ bool line_asks(const char *text, uint8_t length)
     return length == 1 && text[0] == '?';
 }
 
-static char *put_hex(char *at, uint16_t value, uint8_t digits)
-{
-    uint8_t i = digits;
-
-    while (i--) {
-        uint8_t nibble = (uint8_t)(value & 0xF);
-
-        at[i] = (char)(nibble < 10 ? '0' + nibble : 'A' + nibble - 10);
-        value >>= 4;
-    }
-    return at + digits;
-}
-
 static char *put_speed(char *at, char letter, int16_t hundredths)
 {
     uint16_t value = (uint16_t)(hundredths < 0 ? -hundredths : hundredths);
@@ -218,27 +206,6 @@ uint8_t line_reply(char *out, const struct command *command, const struct readin
     *at++ = '\r';
     *at++ = '\n';
     return (uint8_t)(at - out);
-}
-
-static char *put_text(char *at, const char *text)
-{
-    while (*text)
-        *at++ = *text++;
-    return at;
-}
-
-static char *put_decimal(char *at, uint32_t value)
-{
-    char digits[10];
-    uint8_t count = 0;
-
-    do {
-        digits[count++] = (char)('0' + value % 10);
-        value /= 10;
-    } while (value);
-    while (count)
-        *at++ = digits[--count];
-    return at;
 }
 
 static char *put_at_most(char *at, uint16_t value, uint16_t most)

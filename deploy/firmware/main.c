@@ -1,8 +1,9 @@
 /* The robot's microcontroller: a line comes in, four wheels turn at its speeds, a line goes out.
  *
  * It keeps the motors stopped from boot until a whole valid line came, stops them when none came for
- * COMMAND_WATCHDOG_MS or a wheel runs away, and is reset by its own hardware watchdog when this loop or
- * the control in it hangs; after a reset they are stopped again.
+ * COMMAND_WATCHDOG_MS, when a wheel runs away and when the emergency stop is pressed, and is reset by
+ * its own hardware watchdog when this loop or the control in it hangs; after a reset they are stopped
+ * again.
  *
  * The interrupts only count edges, milliseconds and bytes; all else happens in the loop below, so
  * nothing but its own data needs a guard.
@@ -19,6 +20,7 @@
 #include "pi.h"
 #include "serial.h"
 #include "speed.h"
+#include "status.h"
 #include "supervise.h"
 #include "watchdog.h"
 
@@ -44,6 +46,8 @@ static struct reading report;
 static uint32_t report_ms, control_ms;
 static bool checked_seen, stop_seen; /* since boot */
 static bool astray; /* a wheel did not do as told: off until the host is silent */
+static bool halted; /* the emergency stop was pressed: off until it is released and a stop came */
+static struct status status;
 static struct line_reader reader;
 static struct record record;
 static uint8_t reset_flags __attribute__((section(".noinit"))); /* set before the rest is zeroed */
@@ -143,18 +147,46 @@ static void control(bool allowed)
     }
 }
 
+static void look_at_inputs(void)
+{
+    uint8_t analog;
+    int16_t reading = HAS_ANALOGS ? hardware_reading(&analog) : -1;
+
+    if (reading >= 0)
+        status_reading(&status, analog, (uint16_t)reading);
+    if (HAS_CONTACTS)
+        status_contacts(&status, hardware_contacts());
+    if (status_stopped(&status))
+        halted = true;
+}
+
+/* Only behind all replies: so a status line never takes the place of one, and a reply waits for one
+ * status line at most. */
+static void report_inputs(void)
+{
+    char text[STATUS_MAX];
+    uint8_t length = serial_sent() ? status_line(&status, latest.milliseconds, text) : 0;
+
+    if (length)
+        serial_write(text, length);
+}
+
 static void on_millisecond(void)
 {
     bool fed, allowed;
 
     hardware_snapshot(&latest);
+    if (HAS_INPUTS)
+        look_at_inputs();
     fed = watchdog_allows(&watchdog, latest.milliseconds);
     if (!fed && motors_have_voltage())
         count_up(&record.trips);
     astray = astray && fed;
-    allowed = fed && !astray;
+    allowed = fed && !astray && !halted;
     if (!allowed)
         motors_off();
+    if (HAS_INPUTS)
+        report_inputs();
     if (latest.milliseconds - report_ms >= RENEW_MS)
         renew_report();
     if (latest.milliseconds - control_ms >= CONTROL_MS) {
@@ -198,8 +230,10 @@ static void on_command(const struct command *command)
     stop_seen = true;
     checked_seen |= command->checked;
     record.lines++;
+    if (HAS_INPUTS && is_stop(command))
+        halted = false; /* for a millisecond, while it is still pressed */
     for (i = 0; i < MOTORS; i++)
-        targets[i] = astray ? 0 : command->hundredths[i];
+        targets[i] = astray || halted ? 0 : command->hundredths[i];
     watchdog_feed(&watchdog, latest.milliseconds);
     if (latest.milliseconds - report_ms >= REPORT_MS)
         renew_report();
@@ -263,6 +297,8 @@ int main(void)
     set_sleep_mode(SLEEP_MODE_IDLE);
     wdt_enable(WDTO_120MS);
     watchdog_start(&watchdog);
+    if (HAS_INPUTS)
+        status_start(&status);
     motors_off();
     for (i = 0; i < MOTORS; i++) {
         speed_start(&wheels[i].control, 0, 0);

@@ -85,3 +85,8 @@ bool serial_write(const char *text, uint8_t length)
     }
     return true;
 }
+
+bool serial_sent(void)
+{
+    return to_send_head == to_send_tail;
+}

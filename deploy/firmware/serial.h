@@ -18,4 +18,7 @@ bool serial_idle(void);
  * line would be noise, and an old one no use. */
 bool serial_write(const char *text, uint8_t length);
 
+/* Is all that was written on its way? */
+bool serial_sent(void);
+
 #endif

@@ -148,6 +148,10 @@ class Status(NamedTuple):
     wrong_one: Sequence[int]
     """The last such speeds, hundredths of a rad/s."""
     open: bool
+    contact_ns: int
+    """Time when a contact was last opened or closed."""
+    reported_ns: int
+    """Time when the board had last sent that the emergency stop changed."""
     motors: tuple[Motor, ...]
     to_board: Wire
     from_board: Wire

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,37 @@ from tests.firmware.board import (
     build_runner,
     missing,
 )
+from tests.system.harness import until
 
 FREE_SPEEDS = "50,45,55,48"
 """Free speeds in rad/s: no motor is as the firmware's constants say."""
+
+ALL_INPUTS = (
+    "-DESTOP_INPUT=1", "-DBUMPER_INPUTS=4", "-DDRIVER_INPUT=1", "-DBATTERY_TOP_OHM=56000L",
+    "-DCURRENT_UV_PER_A=40000L",
+)  # fmt: skip
+"""Definitions of a build with every input."""
+
+ESTOP, BUMPERS, DRIVER = 37, (36, 35, 34, 33), 32
+"""Pins of the Mega."""
+
+BATTERY, CURRENT = 0, 1
+"""Analog pins of the Mega."""
+
+
+@contextmanager
+def wired_board(runner: Path, wired: dict[int, Path], baud: int = 115200) -> Iterator[Board]:
+    """Run a board with every input, a battery of 24 V and no current.
+
+    It has reported that nothing is pressed.
+    """
+    with Board(runner, wired[baud], "--baud", str(baud)) as board:
+        for pin in (ESTOP, *BUMPERS):
+            board.command(f"contact {pin} closed")
+        board.command(f"analog {BATTERY} 3636")
+        board.command(f"analog {CURRENT} 2500")
+        until(lambda: " estop=ok" in board.status().from_board.last, 5.0, "it is released")
+        yield board
 
 
 @pytest.fixture(scope="session")
@@ -51,6 +80,17 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def hanging_firmware(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The ELF with additional lines that make it hang."""
     return build_firmware(tmp_path_factory.mktemp("hanging"), "-DTEST_HANG")
+
+
+@pytest.fixture(scope="session")
+def wired(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    """The ELF with every input, for two baud rates."""
+    return {
+        baud: build_firmware(
+            tmp_path_factory.mktemp(f"wired_{baud}"), *ALL_INPUTS, f"-DBAUD_RATE={baud}UL"
+        )
+        for baud in (115200, 9600)
+    }
 
 
 @pytest.fixture(scope="session")

@@ -23,6 +23,9 @@
  *   encoder MOTOR ok|dead|swapped
  *   load MOTOR SHARE             the motor turns slower by this share; 1 = it is jammed
  *   push MOTOR SPEED             the wheel has this speed now, rad/s
+ *   contact PIN open|closed      what is between digital pin 30 to 37 and ground; open at first
+ *   bounce PIN MS                it opens and closes by chance for that long
+ *   analog PIN MV                the voltage at analog pin 0 or 1
  *   bench MS                     that much virtual time as fast as it goes
  *   quit
  */
@@ -41,6 +44,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include <avr_adc.h>
 #include <avr_ioport.h>
 #include <avr_uart.h>
 #include <sim_avr.h>
@@ -55,7 +59,7 @@
 
 /* Registers of the ATmega2560, as data addresses (data sheet, register summary). */
 enum {
-    DDRA = 0x21, PORTA = 0x22,
+    DDRA = 0x21, PORTA = 0x22, PINC = 0x26, DDRC = 0x27, PORTC = 0x28,
     DDRE = 0x2D, PORTE = 0x2E, DDRH = 0x101, PORTH = 0x102,
     PCIFR = 0x3B, PCICR = 0x68, PCMSK2 = 0x6D,
     TCCR3A = 0x90, TCCR3B = 0x91, ICR3 = 0x96, OCR3A = 0x98,
@@ -121,8 +125,8 @@ static int64_t wanted_ns; /* when it last wanted a motor to turn */
 
 static avr_t *avr;
 static avr_uart_t *uart;
-static avr_ioport_t *port_k;
-static avr_irq_t *uart_input;
+static avr_ioport_t *port_c, *port_k;
+static avr_irq_t *uart_input, *adc;
 static avr_int_vector_t pin_change;
 
 static double lag = 0.05, deadband, counts_per_turn = 3200;
@@ -134,6 +138,13 @@ static int64_t base_ns, skipped_ns;
 static int64_t on_ns, off_ns, heard_ns; /* in virtual time, as is this: from the last byte heard */
 static int64_t answer_ns;               /* to the first byte of the line that came then */
 static bool motors_run;
+
+/* Bit 0 is pin 37 of the Mega, bit 7 pin 30. */
+static uint8_t closed, bouncing;
+static avr_cycle_count_t bounces_until[8];
+static int64_t contact_ns;  /* when a contact was last set */
+static int64_t reported_ns; /* when the board had last sent that the emergency stop changed */
+static bool reported_pressed;
 
 static int master = -1;
 static bool opened; /* somebody has the port open */
@@ -257,6 +268,51 @@ static avr_cycle_count_t on_motor(avr_t *unused, avr_cycle_count_t when, void *w
     return when + (wait < 16.0 ? 16 : (avr_cycle_count_t)wait + 1);
 }
 
+/* An open contact has the level of its pull-up; a pin without one floats, and reads low here. */
+static void show_contacts(void)
+{
+    uint8_t now = (uint8_t)(avr->data[PORTC] & ~avr->data[DDRC] & ~(closed ^ bouncing));
+
+    avr->data[PINC] = now;
+    port_c->external.pull_value = now;
+}
+
+static avr_cycle_count_t on_bounce(avr_t *unused, avr_cycle_count_t when, void *which)
+{
+    int index = (int)(intptr_t)which;
+    avr_cycle_count_t next = when + F_CPU / 20000 + (unsigned)rand() % (F_CPU / 2000);
+
+    (void)unused;
+    bouncing &= (uint8_t)~(1u << index);
+    if (when < bounces_until[index])
+        bouncing |= (uint8_t)((rand() & 1) << index);
+    show_contacts();
+    if (when >= bounces_until[index])
+        return 0;
+    return next < bounces_until[index] ? next : bounces_until[index];
+}
+
+static bool set_contact(bool bounce, int pin, const char *value)
+{
+    int index = 37 - pin;
+
+    if (index < 0 || index > 7)
+        return false;
+    if (bounce) {
+        bounces_until[index] = avr->cycle + (avr_cycle_count_t)(atof(value) * (F_CPU / 1000));
+        avr_cycle_timer_register(avr, 1, on_bounce, (void *)(intptr_t)index);
+        return true;
+    }
+    contact_ns = virtual_ns();
+    closed &= (uint8_t)~(1u << index);
+    if (!strcmp(value, "closed"))
+        closed |= (uint8_t)(1u << index);
+    else if (strcmp(value, "open"))
+        return false;
+    show_contacts();
+    return true;
+}
+
 static void look_at_bridges(void);
 
 static avr_cycle_count_t on_top(avr_t *unused, avr_cycle_count_t when, void *which)
@@ -350,6 +406,7 @@ static void on_register(avr_irq_t *irq, uint32_t value, void *unused)
     (void)value;
     (void)unused;
     look_at_bridges();
+    show_contacts();
 }
 
 /* the wire */
@@ -477,6 +534,11 @@ static void on_byte_from_board(avr_irq_t *irq, uint32_t value, void *unused)
     byte = carried(&from_board, (uint8_t)value);
     if (byte < 0)
         return;
+    if (byte == '\n' && strstr(from_board.last, " estop=") &&
+        reported_pressed != !!strstr(from_board.last, " estop=pressed")) {
+        reported_pressed = !reported_pressed;
+        reported_ns = virtual_ns();
+    }
     if (muted || !opened || outgoing_length == QUEUE)
         from_board.lost++;
     else
@@ -545,6 +607,8 @@ static void after_reset(void)
         show_encoder(i);
         avr_cycle_timer_register(avr, 16, on_motor, (void *)(intptr_t)i);
     }
+    bouncing = 0;
+    show_contacts();
     look_at_bridges();
 }
 
@@ -665,11 +729,12 @@ static void print_status(void)
            ",\"skipped_ns\":%" PRId64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
            ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64
            ",\"answer_ns\":%" PRId64 ",\"wanted_ns\":%" PRId64 ",\"set_points\":%u,\"wrong\":%u"
-           ",\"wrong_one\":[%d,%d,%d,%d],\"open\":%s,\"motors\":[",
+           ",\"wrong_one\":[%d,%d,%d,%d],\"open\":%s,\"contact_ns\":%" PRId64
+           ",\"reported_ns\":%" PRId64 ",\"motors\":[",
            virtual_ns(), wall_ns(), base_ns, skipped_ns, 1.0 - (double)slept / (double)avr->cycle,
            resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns, wanted_ns,
            set_points, wrong, wrong_one.hundredths[0], wrong_one.hundredths[1], wrong_one.hundredths[2],
-           wrong_one.hundredths[3], opened ? "true" : "false");
+           wrong_one.hundredths[3], opened ? "true" : "false", contact_ns, reported_ns);
     for (i = 0; i < MOTORS; i++)
         printf("%s{\"duty\":%.6f,\"speed\":%.6f,\"counts\":%" PRId64 ",\"since_reset\":%" PRId64
                ",\"flips\":%u,\"flip_duty\":%.4f}",
@@ -757,6 +822,10 @@ static bool obeyed(const char *verb, const char *one, const char *two)
         supply = !strcmp(one, "on");
     } else if (!strcmp(verb, "encoder") || !strcmp(verb, "load") || !strcmp(verb, "push"))
         return set_motor(verb, one, two);
+    else if (!strcmp(verb, "contact") || !strcmp(verb, "bounce"))
+        return set_contact(verb[0] == 'b', atoi(one), two);
+    else if (!strcmp(verb, "analog"))
+        avr_raise_irq(adc + ADC_IRQ_ADC0 + atoi(one), (uint32_t)atoi(two));
     else if (!strcmp(verb, "quit"))
         quitting = true;
     else
@@ -859,7 +928,7 @@ static void say_nothing(avr_t *unused, const int level, const char *format, va_l
 static void power_on(const char *path)
 {
     static const uint16_t watched[] = {PORTA, DDRA,  DDRE,  DDRH,  PORTE,  PORTH,  TCCR3A, TCCR3B, TCCR4A,
-                                       TCCR4B, OCR3A, OCR4A, OCR4B, OCR4C,  ICR3,   ICR4};
+                                       TCCR4B, OCR3A, OCR4A, OCR4B, OCR4C,  ICR3,   ICR4,   PORTC,  DDRC};
     elf_firmware_t firmware;
     uint32_t no_flags = 0;
     size_t i;
@@ -884,8 +953,11 @@ static void power_on(const char *path)
     avr->reset = on_reset;
 
     uart = module("uart", '0');
+    port_c = module("port", 'C');
     port_k = module("port", 'K');
-    port_k->external.pull_mask = 0xFF;
+    port_c->external.pull_mask = port_k->external.pull_mask = 0xFF;
+    adc = avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, 0);
+    avr->vcc = avr->avcc = avr->aref = 5000;
     avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &no_flags);
     uart_input = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT),

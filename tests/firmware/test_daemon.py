@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from tests.firmware.board import Board, Host, Identity, Status
-from tests.firmware.conftest import FREE_SPEEDS
+from tests.firmware.conftest import BUMPERS, ESTOP, FREE_SPEEDS, wired_board
 from tests.system.harness import (
     ZERO,
     Bus,
@@ -75,9 +75,11 @@ class Rig(NamedTuple):
 
 
 @contextmanager
-def running(board: Board, where: Path, mcu: Mcu, port: Path | str = "") -> Iterator[Rig]:
+def running(
+    board: Board, where: Path, mcu: Mcu, port: Path | str = "", **tables: Mapping[str, object]
+) -> Iterator[Rig]:
     """Run a daemon at the board's port and a client of it, until the link is up."""
-    config = {"mcu": mcu, "log": {"format": "json"}}
+    config = {"mcu": mcu, "log": {"format": "json"}, **tables}
     with Daemon(where, port or board.path, config) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         yield Rig(board, daemon, bus)
@@ -407,6 +409,75 @@ def test_a_board_that_hangs_moves_nothing_before_neutral(
         with running(board, tmp_path, MODES[mode]) as rig:
             resets(rig, by_a_hang, unseen=0.1)
         assert account(board).reset == "watchdog"
+
+
+# the emergency stop
+
+
+def drives_in_the_end(board: Board, bus: Bus, commander: Commander) -> None:
+    """Wait until the robot drives.
+
+    If this machine was so busy that the link was lost or the board seemed silent, the robot waits
+    for zeros or for `clear`.
+    """
+
+    def look() -> Status | None:
+        state = bus.state()
+        if state["mode"] == "stopped":
+            bus.get("srv/clear")
+        if "send a zero first" in state["reason"]:
+            gives_way(bus, commander)
+        return turns(board, 0.5 / RADIUS)
+
+    until(look, 10.0, "it drives")
+
+
+@pytest.mark.parametrize(
+    ("mcu", "rate"),
+    [(COUNTS, 100), ({"baud_rate": 9600}, 10)],
+    ids=["115200 baud", "9600 baud"],
+)
+def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
+    runner: Path, wired: dict[int, Path], tmp_path: Path, mcu: Mcu, rate: int
+) -> None:
+    baud = 9600 if "baud_rate" in mcu else 115200
+    safety, control = {"estop": "required"}, {"rate": rate}
+    with (
+        wired_board(runner, wired, baud) as board,
+        running(board, tmp_path, mcu, safety=safety, control=control) as (_, _, bus),
+        bus.commanding(0.5) as commander,
+    ):
+        drives_in_the_end(board, bus, commander)
+        passes(board, 1500)
+        drives_in_the_end(board, bus, commander)
+        board.command(f"contact {ESTOP} open")
+        state = until(lambda: s if (s := bus.state())["mode"] == "stopped" else None, 3.0, "a stop")
+        assert state["emergency_stop"] == "pressed"
+        assert "emergency stop pressed at the robot" in state["reason"]
+        off = stands(board)
+        assert "p00.00,bp00.00,cp00.00,dp00.00" in off.to_board.last
+        refused = bus.get("srv/clear")
+        assert not refused["success"], refused
+        moves_nothing(board, off, 600)
+        board.command(f"contact {ESTOP} closed")
+        until(lambda: bus.state()["emergency_stop"] == "released", 3.0, "the release")
+        moves_nothing(board, off, 600)
+        assert bus.get("srv/clear")["success"]
+        moves_nothing(board, off, 300)
+        drives_in_the_end(board, bus, commander)
+        board.command(f"contact {BUMPERS[1]} open")
+        passes(board, 1500)
+        (row,) = [one for one in bus.get("diagnostics")["status"] if one["name"].endswith("board")]
+        values = {one["key"]: one["value"] for one in row["values"]}
+        counters = bus.state()["counters"]
+        print(f"\n{baud} baud, {rate} Hz: {values}; emergency stops "
+              f"{counters['emergency_stops']}")  # fmt: skip
+        assert values["bumpers"] == ".X.."
+        assert values["motor_driver"] == "ok"
+        assert float(values["volts"]) == pytest.approx(24.0, abs=0.1)
+        assert float(values["amperes"]) == pytest.approx(0.0, abs=0.2)
+        assert counters["emergency_stops"] == 1 or board.status().skipped_ns > 0, counters
+        assert not any(name.startswith("line_status") for name in counters), counters
 
 
 # the wire

@@ -1,17 +1,18 @@
-"""The Arduino example of the firmware's page sends status lines that the daemon takes."""
+"""The firmware's page: its Arduino example, its status lines and its table of settings are true."""
 
 from __future__ import annotations
 
 import ctypes
+import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 
 from acsard.core.link.board_status import decode_status
+from tests.firmware.board import FIRMWARE
 
-PAGE = Path(__file__).parents[2] / "deploy" / "firmware" / "README.md"
+PAGE = FIRMWARE / "README.md"
 
 ARDUINO = """
 #include <string.h>
@@ -59,3 +60,18 @@ def test_the_example_reports_ten_times_a_second_and_a_change_at_once(sketch: cty
     assert all(line.endswith(b"\r\n") for _, line in told)
     assert pressed == {350, 450, 550}
     assert {at for at, _ in told} - pressed == {0, 100, 200, 300, 620, 720, 820, 920}
+
+
+def test_each_status_line_of_the_page_is_one() -> None:
+    lines = re.findall(r"!status [^`\n]*\*[0-9A-F]{4}", PAGE.read_text(encoding="utf-8"))
+    assert len(lines) >= 4
+    for line in lines:
+        decode_status(line.encode(), True)
+
+
+def test_the_page_has_each_setting_of_the_inputs_with_its_value() -> None:
+    page, config = PAGE.read_text(encoding="utf-8"), (FIRMWARE / "config.h").read_text()
+    table = page.partition("settings of [the inputs]")[2].partition("\n\nAll wheels")[0]
+    shown = re.findall(r"^\| `(\w+)` \| (\d+) \|", table, re.MULTILINE)
+    inputs = config.partition("/* Inputs.")[2].partition("/* Pins.")[0]
+    assert shown == re.findall(r"^#define (\w+) (\d+)", inputs, re.MULTILINE)

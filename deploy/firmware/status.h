@@ -1,0 +1,53 @@
+/* The inputs of the board, and the status lines that report them beside the replies. Pure logic.
+ *
+ * Two kinds of line share the wire: the emergency stop and the bumpers ten times a second, and at once
+ * when one changes; the drivers' fault and the measured values once a second.
+ */
+#ifndef STATUS_H
+#define STATUS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define STATUS_MAX 64 /* bytes of the longest line with CR LF: 52 */
+#define CONTACTS 6    /* bits of their port: 0 emergency stop, 1 to 4 bumpers, 5 driver fault */
+#define ANALOGS 2     /* 0 battery, 1 current */
+
+/* Samples of a contact. Three that are pressed press it. Only 20 in a row that are free release it, and
+ * only those make the next press need three again: so a contact that bounces, or a loose wire, counts
+ * as pressed, and a single disturbance does not. */
+#define PRESS_SAMPLES 3
+#define FREE_SAMPLES 20
+
+struct contact {
+    uint8_t pressed, free; /* samples, at most the numbers above */
+};
+
+struct status {
+    struct contact contacts[CONTACTS];
+    uint8_t known, pressed; /* a bit for each contact */
+    struct {
+        uint32_t sum; /* of the readings since the last line with their mean */
+        uint16_t readings;
+    } analogs[ANALOGS];
+    uint32_t contacts_ms, values_ms; /* when each line was sent last */
+    int16_t sent;                    /* the emergency stop and the bumpers in the last one; -1: none yet */
+};
+
+/* As after boot: nothing is known of the inputs. */
+void status_start(struct status *status);
+
+/* A sample of all contacts: the levels of their pins, 1 is high. Call it once a millisecond. */
+void status_contacts(struct status *status, uint8_t levels);
+
+/* A reading of an analog input, 0 to 1023. */
+void status_reading(struct status *status, uint8_t analog, uint16_t value);
+
+/* Is the emergency stop pressed? Not before that is known, 20 ms after boot. */
+bool status_stopped(const struct status *status);
+
+/* Writes the line that is due with CR LF, no terminator, and takes it as sent. Returns its length, at
+ * most STATUS_MAX; 0 when none is due. */
+uint8_t status_line(struct status *status, uint32_t now_ms, char *out);
+
+#endif

@@ -1,0 +1,290 @@
+"""The firmware's machine code reads its inputs, reports them beside replies, and stops motors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from acsard.core.link.board_status import STATUS, BoardStatus, decode_status
+from tests.firmware.board import (
+    STOP,
+    Board,
+    Host,
+    Reply,
+    Speeds,
+    Status,
+    checked,
+    read_reply,
+    speeds_line,
+)
+from tests.firmware.conftest import BATTERY, BUMPERS, CURRENT, DRIVER, ESTOP, wired_board
+from tests.system.harness import until
+
+pytestmark = pytest.mark.firmware
+
+MS = 1_000_000
+
+DRIVE: Speeds = (10.0, -5.0, 20.0, -30.0)
+
+FREE = BoardStatus(estop=False, bumpers=(False,) * 4)
+
+
+@pytest.fixture
+def board(runner: Path, wired: dict[int, Path]) -> Iterator[Board]:
+    with wired_board(runner, wired) as board:
+        yield board
+
+
+@pytest.fixture
+def host(board: Board) -> Iterator[Host]:
+    with Host(board.path) as host:
+        host.says(b"!status")  # the first line that comes may have lost its beginning
+        yield host
+
+
+def reports(host: Host) -> list[BoardStatus]:
+    """Return the status lines that have come."""
+    return [decode_status(line, True) for _, line in host.lines() if line.startswith(STATUS)]
+
+
+def awaited(host: Host, wanted: BoardStatus) -> None:
+    """Wait for that status line."""
+    until(lambda: wanted in reports(host), 5.0, f"{wanted}")
+
+
+def passes(board: Board, ms: float) -> Status:
+    """Return the state after this much of the board's time."""
+    end = board.status().virtual_ns + ms * MS
+    return until(lambda: s if (s := board.status()).virtual_ns >= end else None, 10.0, f"{ms} ms")
+
+
+def asks(board: Board, host: Host, speeds: Speeds, ms: float) -> None:
+    """Send these speeds every 20 ms for that time of the board."""
+    end = board.status().virtual_ns + ms * MS
+    while (due := board.status().virtual_ns + 20 * MS) < end:
+        host.send(speeds_line(speeds))
+        while board.status().virtual_ns < due:
+            host.lines(0.002)
+
+
+# inputs
+
+
+def test_each_input_is_reported_in_its_field(board: Board, host: Host) -> None:
+    awaited(host, FREE)
+    for place, pin in enumerate((ESTOP, *BUMPERS)):
+        board.command(f"contact {pin} open")
+        bumpers = tuple(number == place - 1 for number in range(4))
+        awaited(host, BoardStatus(estop=place == 0, bumpers=bumpers))
+        board.command(f"contact {pin} closed")
+        awaited(host, FREE)
+    for action, fault in (("closed", True), ("open", False)):
+        board.command(f"contact {DRIVER} {action}")
+        until(lambda: any(s.driver_fault is fault for s in reports(host)), 5.0, f"fault {fault}")  # noqa: B023
+
+
+@pytest.mark.parametrize(("millivolts", "volts"), [(0, 0.0), (3333, 22.0), (4454, 29.4)])
+def test_the_battery_s_voltage_is_that_at_the_divider(
+    board: Board, host: Host, millivolts: int, volts: float
+) -> None:
+    """56 kilohms above 10 kilohms. A step of the converter is 0.03 V."""
+    board.command(f"analog {BATTERY} {millivolts}")
+    passes(board, 1000)
+    reports(host)
+    (told,) = until(lambda: [s for s in reports(host) if s.volts is not None], 5.0, "volts")[-1:]
+    print(f"{volts} V: reported {told.volts} V")
+    assert told.volts == pytest.approx(volts, abs=0.07)
+
+
+def test_the_current_has_its_sign(board: Board, host: Host) -> None:
+    for millivolts, amps in ((2100, -10.0), (2700, 5.0)):
+        board.command(f"analog {CURRENT} {millivolts}")
+        passes(board, 1000)
+        reports(host)
+        (told,) = until(lambda: [s for s in reports(host) if s.amps is not None], 5.0, "amps")[-1:]
+        assert told.amps == pytest.approx(amps, abs=0.25)
+
+
+def test_a_press_is_on_the_line_within_ten_milliseconds(board: Board, host: Host) -> None:
+    took = []
+    for action in ("open", "closed") * 10:
+        before = board.status().reported_ns
+        board.command(f"contact {ESTOP} {action}")
+        status = until(
+            lambda: s if (s := board.status()).reported_ns > before else None,  # noqa: B023
+            5.0, "a report",
+        )  # fmt: skip
+        took.append((status.reported_ns - status.contact_ns) / MS)
+    pressed, released = took[::2], took[1::2]
+    print(f"pressed {min(pressed):.1f} to {max(pressed):.1f} ms, released {min(released):.1f} to "
+          f"{max(released):.1f} ms until the line's last byte")  # fmt: skip
+    assert max(pressed) < 10.0
+    assert 20.0 < min(released) <= max(released) < 30.0
+
+
+def test_a_bounce_is_no_false_release(board: Board, host: Host) -> None:
+    board.command(f"bounce {ESTOP} 2")
+    board.command(f"contact {ESTOP} open")
+    awaited(host, BoardStatus(estop=True, bumpers=(False,) * 4))
+    told = []
+    for _ in range(60):
+        board.command(f"bounce {ESTOP} 2")
+        passes(board, 7)
+        told += reports(host)
+    assert len(told) >= 4
+    assert all(one.estop is not False for one in told)
+    board.command(f"bounce {ESTOP} 2")
+    board.command(f"contact {ESTOP} closed")
+    awaited(host, FREE)
+    passes(board, 150)
+    assert all(one.estop is not True for one in reports(host))
+
+
+def test_a_broken_wire_and_a_loose_one_read_as_pressed(board: Board, host: Host) -> None:
+    board.command(f"contact {ESTOP} open")
+    awaited(host, BoardStatus(estop=True, bumpers=(False,) * 4))
+    board.command(f"contact {ESTOP} closed")
+    awaited(host, FREE)
+    board.command(f"bounce {ESTOP} 1000")
+    passes(board, 50)
+    reports(host)
+    passes(board, 900)
+    told = [one.estop for one in reports(host) if one.estop is not None]
+    assert len(told) >= 7
+    assert all(told)
+
+
+def test_a_restart_reports_no_false_press(board: Board, host: Host) -> None:
+    board.command("reset")
+    assert b"reset=pin" in host.says(b"!acsard")
+    passes(board, 500)
+    told = [one.estop for one in reports(host) if one.estop is not None]
+    assert told == [False] * len(told)
+    assert len(told) >= 4
+
+
+# motors
+
+
+def test_a_press_takes_the_voltage_and_only_a_zero_after_the_release_gives_it_back(
+    board: Board, host: Host
+) -> None:
+    host.send(STOP)
+    asks(board, host, DRIVE, 300)
+    assert board.status().running
+    board.command(f"contact {ESTOP} open")
+    asks(board, host, DRIVE, 300)
+    status = board.status()
+    print(f"pressed -> no voltage {(status.off_ns - status.contact_ns) / MS:.1f} ms")
+    assert 0 < status.off_ns - status.contact_ns < 5 * MS
+    host.send(STOP)
+    asks(board, host, DRIVE, 300)
+    assert board.status().on_ns == status.on_ns, "a zero while it is pressed is not enough"
+    board.command(f"contact {ESTOP} closed")
+    asks(board, host, DRIVE, 500)
+    assert board.status().on_ns == status.on_ns, "nor is the release"
+    host.send(b"?")
+    assert b"trips=0 runaways=0" in host.says(b"!acsard")
+    host.send(STOP)
+    asks(board, host, DRIVE, 300)
+    assert board.status().running
+
+
+def test_a_board_that_starts_while_pressed_moves_nothing_until_a_zero_after_the_release(
+    board: Board, host: Host
+) -> None:
+    board.command(f"contact {ESTOP} open")
+    board.command("reset")
+    host.says(b"!acsard")
+    host.send(STOP)
+    asks(board, host, DRIVE, 300)
+    board.command(f"contact {ESTOP} closed")
+    asks(board, host, DRIVE, 300)
+    assert board.status().on_ns == 0
+    host.send(STOP)
+    asks(board, host, DRIVE, 300)
+    assert board.status().running
+
+
+def test_bumpers_and_the_driver_s_fault_take_no_voltage(board: Board, host: Host) -> None:
+    """The daemon decides what a bumper does."""
+    host.send(STOP)
+    for pin in BUMPERS:
+        board.command(f"contact {pin} open")
+    board.command(f"contact {DRIVER} closed")
+    asks(board, host, DRIVE, 300)
+    assert board.status().running
+
+
+# the wire
+
+
+@pytest.mark.parametrize(
+    ("baud", "period", "letters", "least"),
+    [(115200, 10, None, 9), (115200, 10, "", 9), (115200, 10, "S", 9),
+     (9600, 100, None, 9), (9600, 100, "", 9), (9600, 100, "S", 6)],
+)  # fmt: skip
+def test_each_line_has_its_reply_and_no_status_line_is_within_one(
+    runner: Path, wired: dict[int, Path], baud: int, period: int, letters: str | None, least: int
+) -> None:
+    """Plain lines, checked ones, and ones with counts, which fill the wire at 9600 baud."""
+    with wired_board(runner, wired, baud) as board, Host(board.path) as host:
+        host.says(b"!status")
+        sent, got, told, pressed = 0, list[Reply](), list[BoardStatus](), False
+        start = board.status().virtual_ns
+
+        def take(wait: float) -> None:
+            for at, line in host.lines(wait):
+                if line.startswith(STATUS):
+                    told.append(decode_status(line, True))
+                else:
+                    got.append(read_reply(line, at))
+
+        while (due := board.status().virtual_ns + period * MS) < start + 3000 * MS:
+            line = speeds_line(DRIVE) if sent else STOP
+            host.send(line if letters is None else checked(line, sent % 256, letters))
+            sent += 1
+            if sent % 5 == 0:
+                pressed = not pressed
+                board.command(f"contact {BUMPERS[0]} {'open' if pressed else 'closed'}")
+            while board.status().virtual_ns < due:
+                take(0.002)
+        passes(board, 500)
+        take(0)
+        seconds = (board.status().virtual_ns - start) / 1e9
+        contacts = sum(one.estop is not None for one in told)
+        values = sum(one.volts is not None for one in told)
+        print(f"{baud} baud, each {period} ms, {letters!r}: {sent} lines, {len(got)} "
+              f"replies, {contacts} lines of contacts and {values} of values in "
+              f"{seconds:.1f} s")  # fmt: skip
+        assert len(got) == sent
+        assert contacts >= least * seconds
+        assert values >= 2
+
+
+def test_no_status_line_takes_the_place_of_a_reply(board: Board, host: Host) -> None:
+    """Lines back to back are more than the board can answer, so no room is left for a second."""
+    host.send(STOP)
+    host.write((checked(STOP, 0, "S") + b"\r\n") * 250)
+    passes(board, 1200)
+    board.command(f"contact {ESTOP} open")
+    came = [line for _, line in host.lines()]
+    answers = [place for place, line in enumerate(came) if not line.startswith(STATUS)]
+    lengths = {len(read_reply(came[place]).line) for place in answers}
+    print(f"{len(answers)} replies to 251 lines in a second, "
+          f"{answers[-1] + 1 - len(answers)} status lines between them")  # fmt: skip
+    assert lengths == {31, 60}
+    assert len(answers) > 150
+    assert answers[-1] + 1 - len(answers) <= 2
+    awaited(host, BoardStatus(estop=True, bumpers=(False,) * 4))
+
+
+def test_a_board_without_inputs_sends_no_status_line(runner: Path, firmware: Path) -> None:
+    """`python -m tests.firmware.unchanged COMMIT` compares its machine code."""
+    with Board(runner, firmware) as board, Host(board.path) as host:
+        before = board.status().from_board.bytes
+        host.ask(STOP)
+        passes(board, 2000)
+        assert board.status().from_board.bytes == before + len(STOP) + 2

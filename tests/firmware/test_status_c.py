@@ -1,0 +1,239 @@
+"""The firmware's contacts, measured values and status lines, compiled for this machine."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.link.board_status import BoardStatus, decode_status
+from tests.firmware.board import build_library
+from tests.firmware.conftest import ALL_INPUTS
+
+CLOSED = 0b100000
+"""Levels of the pins when nothing is pressed: contacts to ground, and no fault."""
+
+Build = Callable[..., "Inputs"]
+
+
+class Inputs:
+    """The C functions for one build, and a status of its own."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        u8, u16, u32 = ctypes.c_uint8, ctypes.c_uint16, ctypes.c_uint32
+        self._library, self._status = library, ctypes.create_string_buffer(256)
+        self._out = ctypes.create_string_buffer(64 + 1)
+        library.status_contacts.argtypes = [ctypes.c_void_p, u8]
+        library.status_reading.argtypes = [ctypes.c_void_p, u8, u16]
+        library.status_stopped.argtypes = [ctypes.c_void_p]
+        library.status_stopped.restype = ctypes.c_bool
+        library.status_line.argtypes = [ctypes.c_void_p, u32, ctypes.c_char_p]
+        library.status_line.restype = u8
+        self.milliseconds = 0
+        self.boot()
+
+    def boot(self) -> None:
+        """Forget all."""
+        self.milliseconds = 0
+        self._library.status_start(self._status)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the emergency stop is pressed."""
+        pressed: bool = self._library.status_stopped(self._status)
+        return pressed
+
+    def sample(self, levels: int, readings: Sequence[int] = ()) -> BoardStatus | None:
+        """Let a millisecond pass. Return the fields of the line that is due then, or None."""
+        self.milliseconds += 1
+        for analog, value in enumerate(readings):
+            self._library.status_reading(self._status, analog, value)
+        self._library.status_contacts(self._status, levels)
+        return self.line()
+
+    def line(self) -> BoardStatus | None:
+        """Return the fields of the line that is due now, or None."""
+        length = self._library.status_line(self._status, self.milliseconds, self._out)
+        if not length:
+            return None
+        line = self._out.raw[:length]
+        assert line.endswith(b"\r\n")
+        assert length <= 52
+        return decode_status(line[:-2], True)
+
+    def lines(self, levels: int, length_ms: int, readings: Sequence[int] = ()) -> list[BoardStatus]:
+        """Return the lines of that time."""
+        every = [self.sample(levels, readings) for _ in range(length_ms)]
+        return [one for one in every if one is not None]
+
+
+@pytest.fixture(scope="module")
+def build(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> Build:
+    """Build the library with these definitions, once."""
+    built: dict[tuple[str, ...], ctypes.CDLL] = {}
+
+    def one(*defines: str) -> Inputs:
+        if defines not in built:
+            where = tmp_path_factory.mktemp("inputs")
+            built[defines] = ctypes.CDLL(str(build_library(where, *defines)))
+        return Inputs(built[defines])
+
+    return one
+
+
+@pytest.fixture(scope="module")
+def inputs(build: Build) -> Inputs:
+    """The library with every input."""
+    return build(*ALL_INPUTS)
+
+
+def test_firmware_as_delivered_never_sends_a_status_line(library: ctypes.CDLL) -> None:
+    inputs = Inputs(library)
+    assert inputs.lines(0xFF, 3000, (1023, 1023)) == []
+    assert not inputs.stopped
+
+
+@pytest.mark.parametrize("bit", range(5))
+def test_each_contact_is_reported_at_once_in_its_own_field(inputs: Inputs, bit: int) -> None:
+    inputs.boot()
+    assert inputs.lines(CLOSED, 500)[-1] == BoardStatus(estop=False, bumpers=(False,) * 4)
+    bumpers = tuple(number == bit - 1 for number in range(4))
+    assert inputs.lines(CLOSED ^ (1 << bit), 4) == [BoardStatus(estop=bit == 0, bumpers=bumpers)]
+    assert inputs.stopped == (bit == 0)
+
+
+def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs) -> None:
+    inputs.boot()
+    told = inputs.lines(CLOSED, 10_000, (512, 512))
+    assert 98 <= sum(one.estop is False and one.bumpers is not None for one in told) <= 100
+    values = BoardStatus(driver_fault=False, volts=16.5, amps=0.0)
+    assert [one for one in told if one.estop is None] == [values] * 10
+
+
+def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply(
+    inputs: Inputs,
+) -> None:
+    inputs.boot()
+    inputs.lines(CLOSED, 997, (0, 0))
+    told = inputs.lines(1, 4, (0, 0))  # at 1000 ms both lines are due
+    assert [one.estop for one in told] == [True, None]
+    assert told[1].driver_fault
+
+
+def test_nothing_is_reported_before_it_is_known(inputs: Inputs) -> None:
+    """A false press at a boot would stop the robot until `clear`."""
+    inputs.boot()
+    assert inputs.lines(CLOSED, 19) == []
+    assert inputs.lines(CLOSED, 1) == [BoardStatus(estop=False, bumpers=(False,) * 4)]
+    inputs.boot()
+    assert inputs.lines(CLOSED ^ 1, 19) == []
+    assert inputs.stopped
+    assert inputs.lines(CLOSED ^ 1, 1) == [BoardStatus(estop=True, bumpers=(False,) * 4)]
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(1, 25)), max_size=12))
+def test_a_contact_is_released_only_by_20_free_samples_and_pressed_by_three(
+    inputs: Inputs, runs: list[tuple[bool, int]]
+) -> None:
+    """Three, of which no two have 20 free ones in a row between them."""
+    inputs.boot()
+    inputs.lines(CLOSED, 25)
+    samples: list[bool] = [False] * 25
+    for pressed, length in runs:
+        for _ in range(length):
+            samples.append(pressed)
+            inputs.sample(CLOSED | pressed)
+            since = len(samples)
+            free = 0
+            while since and free < 20:
+                since -= 1
+                free = 0 if samples[since] else free + 1
+            assert inputs.stopped == (sum(samples[since:]) >= 3), samples
+
+
+def test_a_bounce_of_two_milliseconds_is_no_release_and_a_disturbance_of_two_no_press(
+    inputs: Inputs,
+) -> None:
+    inputs.boot()
+    inputs.lines(CLOSED, 100)
+    for length in (1, 2):
+        assert not any(one.estop for one in inputs.lines(CLOSED ^ 1, length))
+        assert not any(one.estop for one in inputs.lines(CLOSED, 30))
+    inputs.lines(CLOSED ^ 1, 10)
+    for _ in range(100):
+        told = inputs.lines(CLOSED, 2) + inputs.lines(CLOSED ^ 1, 3)
+        assert all(one.estop is not False for one in told)
+        assert inputs.stopped
+
+
+def test_a_loose_wire_counts_as_pressed(inputs: Inputs) -> None:
+    inputs.boot()
+    inputs.lines(CLOSED, 100)
+    for _ in range(4):
+        inputs.lines(CLOSED ^ 1, 1)
+        inputs.lines(CLOSED, 18)
+    assert inputs.stopped
+
+
+@pytest.mark.parametrize(
+    ("defines", "free", "pressed"),
+    [
+        (("-DBUMPER_INPUTS=2",), 0b000000, 0b000110),
+        (("-DBUMPER_INPUTS=2", "-DBUMPERS_CLOSE=1"), 0b000110, 0b000000),
+    ],
+)
+def test_bumpers_open_or_close_when_pressed(
+    build: Build, defines: tuple[str, ...], free: int, pressed: int
+) -> None:
+    inputs = build(*defines)
+    assert inputs.lines(free, 25) == [BoardStatus(bumpers=(False, False))]
+    assert inputs.lines(pressed, 5) == [BoardStatus(bumpers=(True, True))]
+    assert not inputs.stopped
+
+
+@pytest.mark.parametrize("high", [0, 1])
+def test_a_driver_s_fault_is_low_or_high(build: Build, high: int) -> None:
+    inputs = build("-DDRIVER_INPUT=1", f"-DDRIVER_FAULT_HIGH={high}")
+    fault = 0b100000 if high else 0
+    assert inputs.lines(fault ^ 0b100000, 1000) == [BoardStatus(driver_fault=False)]
+    assert inputs.lines(fault, 1000) == [BoardStatus(driver_fault=True)]
+
+
+@given(st.integers(0, 1023), st.integers(0, 1023))
+def test_volts_and_amperes_are_those_of_the_divider_and_the_sensor(
+    inputs: Inputs, battery: int, current: int
+) -> None:
+    """By a calculation of its own: 10 kilohms of 66, and 40 mV per ampere around 2.5 V."""
+    inputs.boot()
+    inputs.sample(CLOSED, (battery, current))
+    inputs.milliseconds = 1000
+    told = inputs.line()
+    assert told is not None
+    assert told.volts == pytest.approx(battery * 5 / 1024 * 6.6, abs=0.006)
+    assert told.amps == pytest.approx((current * 5 / 1024 - 2.5) / 0.04, abs=0.006)
+
+
+def test_the_volts_are_the_mean_of_a_second(build: Build) -> None:
+    inputs = build("-DBATTERY_TOP_OHM=56000L")
+    for _ in range(999):
+        assert inputs.sample(0, (700 + 40 * (inputs.milliseconds % 2),)) is None
+    told = inputs.sample(0, (720,))
+    assert told is not None
+    assert told.volts == pytest.approx(720 * 5 / 1024 * 6.6, abs=0.02)
+
+
+def test_values_beyond_the_line_s_form_stay_at_its_ends(build: Build) -> None:
+    wide = build("-DBATTERY_TOP_OHM=188000L", "-DCURRENT_UV_PER_A=1000L")
+    told = wide.lines(0, 1000, (1023, 1023))[-1]
+    assert told.volts == pytest.approx(98.9, abs=0.01)
+    assert told.amps == 999.99
+    assert wide.lines(0, 1000, (0, 0))[-1] == BoardStatus(volts=0.0, amps=-999.99)
+
+
+def test_a_sensor_that_is_wired_the_other_way_round_has_a_negative_setting(build: Build) -> None:
+    inputs = build("-DCURRENT_UV_PER_A=-100000L")
+    assert inputs.lines(0, 1000, (0, 0))[-1] == BoardStatus(amps=25.0)
+    assert inputs.lines(0, 1000, (0, 512))[-1] == BoardStatus(amps=0.0)
