@@ -270,17 +270,8 @@ class Fall:
 GOAL = 0.05
 """Largest share of the plain mean's error, for encoders that reveal a failure at once."""
 
-COARSE = {
-    (400, "stuck"): 0.1,
-    (96, "stuck"): 0.15,
-    (20, "dead"): 0.1,
-    (20, "reversed"): 0.5,
-    (20, "stuck"): 0.1,
-}
-"""Larger shares for cases in which 3.5 counts must pass before a failure shows.
-
-With 20 counts per turn and at low speed, a reversed wheel is not always found.
-"""
+COARSE = {(20, "reversed"): 0.25}
+"""Larger share for the case in which many counts must pass before a failure shows."""
 
 SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
 
