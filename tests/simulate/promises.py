@@ -162,8 +162,6 @@ class Witness:
         """Jerk is limited: the plans limit it on both axes, or on none."""
         self.linked = True
         """The daemon says that the link to the board is up."""
-        self.linked_ns = 0
-        """When the link came up last."""
         self.cut = False
         """The link was lost since the last line, so the speed starts over from zero."""
         self.pending: dict[str, int] = {}
