@@ -91,7 +91,7 @@ class Robot:
             config.odometry,
             self._kinematics,
             config.mcu.encoder_counts,
-            config.feedback.response_time,
+            config.feedback,
             self.session.quiet_ns / NS_PER_S,
         )
         self._arbiter = Arbiter(config.commands)
@@ -258,7 +258,7 @@ class Robot:
             if session.lateness.late_s:
                 self.counters["link_lost_host_stall"] += 1
         if link != "up":
-            self._sanity.forget()
+            self._forget()
         self._port_trouble = inputs.port_trouble
         if session.restarted:
             # No sender drives before the first link, so a zero sent during the start counts.
@@ -285,6 +285,10 @@ class Robot:
         return tuple(
             [estimate for line in feedback if (estimate := self._believe(line, now, events))]
         )
+
+    def _forget(self) -> None:
+        self._sanity.forget()
+        self._odometry.checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
         """Obey the inputs of the board, also a press that is over already."""
@@ -363,18 +367,19 @@ class Robot:
             if self._sanity.doubtful:
                 self._fault(f"impossible feedback: {why}", now, events)
             return None
+        checks = self._odometry.checks
+        wheels = checks.wheels
         # Motors without power obey no command, so they cannot contradict one.
-        sent = line.speeds if self._estop.why else self._speeds
-        fault = self._sanity.watch(sent, line.speeds, line.since)
+        sent = None if self._estop.why else self._speeds
+        fault = wheels.watch(sent, line.speeds, line.since)
         if fault:
             self._fault(fault, now, events)
-        if self._sanity.turned:
+        if wheels.pushed:
             self.counters["uncommanded_motion"] += 1
-            events.append(Event("uncommanded_motion", self._sanity.turned, "warning"))
-        estimate = self._odometry.fold(line, self._speeds)
-        checks = self._odometry.checks
-        if checks.wheels.events:
-            self.counters["wheel_faults"] += len(checks.wheels.events)
+            events.append(Event("uncommanded_motion", wheels.pushed, "warning"))
+        estimate = self._odometry.fold(line)
+        if wheels.events:
+            self.counters["wheel_faults"] += len(wheels.events)
         events += checks.events
         return estimate
 
@@ -413,7 +418,7 @@ class Robot:
                 released = life.clear(request.latch, asked_ns, now)
                 if not released:
                     return "nothing to clear: the robot is neither stopped nor in fault"
-                self._sanity.forget()
+                self._forget()
                 self._arbiter.require_neutral(asked_ns)
                 return released
             case "activate":

@@ -259,7 +259,7 @@ class SourceStatus(Struct, frozen=True):
 
 
 class WheelsStatus(Struct, frozen=True):
-    """Wheel faults and slip, from comparing front and rear wheels. Empty while they agree."""
+    """Wheel faults, slip and slow wheels. Empty while the wheels agree and obey."""
 
     text: str = ""
     """The trouble in words."""
@@ -269,6 +269,9 @@ class WheelsStatus(Struct, frozen=True):
     """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
     """Learned shares by which the front wheel turns more than the rear one, left and right."""
+    slow: tuple[str, ...] = ()
+    """The wheels that turn the right way, but too slowly, each with its share of the expected
+    speed."""
 
 
 class RoutersStatus(Struct, frozen=True):

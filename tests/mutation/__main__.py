@@ -55,6 +55,7 @@ SAFETY = (
     "acsard/core/motion/lifecycle.py",
     "acsard/core/motion/modes.py",
     "acsard/core/motion/sanity.py",
+    "acsard/core/motion/wheel_witness.py",
     "acsard/daemon/latch_rules.py",
 )
 ENOUGH, ENOUGH_OF_ALL = 0.95, 0.98

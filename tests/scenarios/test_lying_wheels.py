@@ -8,12 +8,20 @@ import random
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, FeedbackConfig, OdometryConfig, SimConfig
+from acsard.core.config.settings import (
+    Config,
+    FeedbackConfig,
+    LimitsConfig,
+    OdometryConfig,
+    SimConfig,
+)
+from acsard.core.link.feedback import Feedback
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from acsard.core.simulator.faults import Fault
 from acsard.core.simulator.simulated_robot import WatchedMcu
-from acsard.core.values import NS_PER_S, WHEELS
+from acsard.core.values import NS_PER_S, WHEELS, Estimate
 from tests.scenarios.world import World
+from tests.unit.core.motion.liars import Plain
 
 
 def world(
@@ -126,6 +134,74 @@ def test_with_a_gyro_the_heading_and_the_distance_stay_right() -> None:
     distance, turn = off(made)
     assert distance < 0.05
     assert turn < 0.05
+
+
+def reversed_encoder(seed: int) -> tuple[float, float, str]:
+    """Drive a robot of 96 counts at random and reverse an encoder until the fault.
+
+    Return by how far the pose and the plain mean of its wheels are turned at the end, rad, and why
+    it stopped. Its motors respond faster or slower than configured, and it drives fast or creeps.
+    """
+    dice, plain = random.Random(seed), Plain()
+    lag, scale = dice.choice((0.05, 0.2, 0.6)), dice.choice((0.25, 1.0))
+    sim = SimConfig(encoder_counts=96, motor_time_constant=lag)
+    made, wheel = world(sim=sim, fault_time=0.5), dice.randrange(4)
+    odometry = made.loop.robot._odometry
+    fold = odometry.fold
+
+    def both(line: Feedback) -> Estimate:
+        plain.fold(line)
+        return fold(line)
+
+    setattr(odometry, "fold", both)  # noqa: B010
+    made.drive(scale * dice.uniform(-0.6, 1), scale * dice.uniform(-2, 2), dice.uniform(0.5, 1.5))
+    with lies(made, "reversed", wheel):
+        for _ in range(6):
+            twist = scale * dice.uniform(-0.6, 1.0), scale * dice.uniform(-2, 2)
+            made.hold(*twist, dice.uniform(0.5, 2.0))
+            if made.state.mode == "fault":
+                break
+        reason = made.state.reason if WHEELS[wheel] in made.state.reason else ""
+        made.run(1.5)
+    by_plain = math.remainder(plain.pose.yaw - made.mcu.vehicle.pose.yaw, math.tau)
+    return off(made)[1], abs(by_plain), reason
+
+
+def test_forty_robots_of_96_counts_with_a_reversed_encoder_are_all_found() -> None:
+    found = [reversed_encoder(seed) for seed in range(40)]
+    kept, phantom = sum(one[0] for one in found), sum(one[1] for one in found)
+    print(f"\n{kept / phantom:.1%} of the phantom of {phantom:.1f} rad is kept")
+    assert [seed for seed, (_, _, reason) in enumerate(found) if not reason] == []
+    assert kept < 0.05 * phantom
+
+
+@pytest.mark.parametrize(
+    ("lag", "reaches"), [(0.6, 0.6), pytest.param(0.6, 1.0, marks=SLOW), pytest.param(0.2, 0.6)]
+)
+def test_a_big_robot_that_responds_late_and_falls_short_is_a_warning(
+    lag: float, reaches: float
+) -> None:
+    """Its wheels reach this share of the commanded speed, and its commands jump."""
+    rate = 20.0
+    limits = LimitsConfig(
+        linear_acceleration=rate, linear_deceleration=rate, linear_stop_deceleration=rate,
+        angular_acceleration=4 * rate, angular_deceleration=4 * rate,
+        angular_stop_deceleration=4 * rate,
+    )  # fmt: skip
+    for seed in range(4):
+        dice = random.Random(seed)
+        made = World(Config(limits=limits, sim=SimConfig(motor_time_constant=lag)))
+        made.run(1.0)
+        with made.mcu._with(drives=[reaches] * 4):
+            made.send(0.0)
+            made.run(0.1)
+            for _ in range(6):
+                made.hold(dice.uniform(-1, 1), dice.uniform(-3, 3), dice.uniform(0.3, 2.0))
+            for _ in range(2):
+                made.hold(0.8, 0.0, 2.5)
+            assert made.state.mode == "driving"
+            assert ("slower than commanded: " in row(made).message) is (reaches < 1.0)
+        assert not made.state.wheel_fault
 
 
 def test_pushed_by_hand_with_a_dead_encoder_nothing_is_known_and_slip_is_reported() -> None:

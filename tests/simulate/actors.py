@@ -594,8 +594,6 @@ class Run:
                 witness.ages.clocks[clock].followed = True
         self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
-        if seen.link == "up" and not witness.linked:
-            witness.linked_ns = true_ns
         witness.linked = seen.link == "up"
         # Lines without the check that the configuration requires make no link.
         self._linked |= witness.linked

@@ -12,9 +12,9 @@ from tests.simulate.planted_faults import (
     LIMITS,
     NEUTRAL,
     ROBOT,
-    SANITY,
     SESSION,
     VALUES,
+    WITNESS,
     Edit,
     Fault,
     fault,
@@ -88,9 +88,9 @@ CASES = (
     fault(
         "case 9",
         "healthy motors that lag latch the fault `runaway`",
-        SANITY,
-        "self.slowest = math.inf",
-        "self.slowest = 0.0",
+        WITNESS,
+        "self._nearest = math.inf",
+        "self._nearest = 0.0",
     ),
     fault(
         "case 10",

@@ -38,7 +38,8 @@ FRESHNESS, LIMITS, LIFECYCLE = (
     "core/motion/lifecycle.py",
 )
 MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/session.py"
-SANITY, ODOMETRY, PATH = "core/motion/sanity.py", "core/motion/odometry.py", "core/motion/path.py"
+WITNESS, ODOMETRY = "core/motion/wheel_witness.py", "core/motion/odometry.py"
+PATH = "core/motion/path.py"
 LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
 COMMANDS, KINEMATICS, CODEC = (
     "core/incoming/commands.py",
@@ -568,16 +569,16 @@ FAULTS = (
     fault(
         "sanity evidence",
         "evidence against a healthy wheel is never dropped",
-        SANITY,
-        "lasted = wheel.evidence[kind] + min(dt, most) if bad else 0.0",
-        "lasted = wheel.evidence[kind] + (min(dt, most) if bad else 0.0)",
+        WITNESS,
+        "self.evidence[kind] = self.evidence[kind] + min(dt, most) if sign else 0.0",
+        "self.evidence[kind] = self.evidence[kind] + (min(dt, most) if sign else 0.0)",
     ),
     fault(
         "sanity dead",
         "a healthy wheel that follows its command slowly is called dead",
-        SANITY,
-        "moving and least > SLACK and turns < 0.1 * least,",
-        "moving and least > SLACK and turns < 0.97 * least,",
+        WITNESS,
+        "moving and least > SLACK and abs(seen) < 0.1 * least",
+        "moving and least > SLACK and abs(seen) < 0.97 * least",
     ),
     # bus
     fault(

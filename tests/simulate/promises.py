@@ -162,11 +162,6 @@ class Witness:
         """Jerk is limited: the plans limit it on both axes, or on none."""
         self.linked = True
         """The daemon says that the link to the board is up."""
-        self.linked_ns = 0
-        """When the link came up last."""
-        self._coasts_ns = int(5 * lag * NS) if coarse else 0
-        """For this time behind a lost link the counts of a wheel that coasts may look like any
-        fault, because they jump from line to line."""
         self.cut = False
         """The link was lost since the last line, so the speed starts over from zero."""
         self.pending: dict[str, int] = {}
@@ -383,8 +378,7 @@ class Witness:
             recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
             if "pushed" in recent and self.last == ZERO and self.rested_ns >= self.last_ns:
                 recent.remove("pushed")  # a hand turns wheels that were at rest: never a fault
-            coasts = at_ns - self.linked_ns < self._coasts_ns
-            if self.mode and self.fault_ns is None and set(recent) <= HARMLESS and not coasts:
+            if self.mode and self.fault_ns is None and set(recent) <= HARMLESS:
                 raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
             if self.fault_ns is None:
                 self.fault_ns = at_ns

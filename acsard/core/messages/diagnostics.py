@@ -171,15 +171,17 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """Return the row that says whether the front and the rear wheels agree."""
+    """Return the row that says whether front and rear wheels agree and are as fast as expected."""
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
         "slipping": ", ".join(doubt.slipping),
+        "slow": ", ".join(doubt.slow),
         "front_more_left": f"{left:.3f}",
         "front_more_right": f"{right:.3f}",
     }
-    level, message = WARN if doubt.text else OK, doubt.text or "front and rear agree"
+    trouble = doubt.text or (doubt.slow and f"slower than commanded: {values['slow']}")
+    level, message = WARN if trouble else OK, trouble or "front and rear agree"
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
     return Row("wheels", level, message, values)
 

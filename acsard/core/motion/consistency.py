@@ -3,27 +3,27 @@
 `ConsistencyChecks` is the one interface of these checks. For each line it tells odometry which
 wheels to believe, whether they slip, and by how far the gyro says that the robot turned:
 
-- `wheel_faults.py` compares the two wheels of each side, and ignores one that is proved faulty.
+- `wheel_faults.py` compares the two wheels of each side with each other and with their command. It
+  ignores one that is proved faulty, and soon calls it a fault, which stops the robot.
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the believed wheels.
 - `learned_track.py` chooses the effective track by which the wheels turn the robot; a gyro that is
   compared with them teaches it.
 
-Each check uses the findings of another one, and only this module knows their order. `sanity.py`
-judges feedback too, but it stops the robot, while these checks decide what its pose is made of.
+Each check uses the findings of another one, and only this module knows their order.
 """
 
 from __future__ import annotations
 
 from msgspec.structs import replace
 
-from acsard.core.config.settings import OdometryConfig
+from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gap_filling import NOWHERE, Rolled, plus
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import LearnedTrack, Track
 from acsard.core.motion.wheel_faults import WheelFaults
-from acsard.core.values import Event, GyroSample, GyroStatus, WheelSpeeds
+from acsard.core.values import Event, GyroSample, GyroStatus
 
 
 class ConsistencyChecks:
@@ -34,7 +34,7 @@ class ConsistencyChecks:
         odometry: OdometryConfig,
         kinematics: Kinematics,
         encoder_counts: int,
-        response_time: float,
+        feedback: FeedbackConfig,
     ) -> None:
         """Start.
 
@@ -43,10 +43,10 @@ class ConsistencyChecks:
                 teaches the track.
             kinematics: The kinematics of the base.
             encoder_counts: Counts per wheel turn, 0 if unknown.
-            response_time: Response time of a slow wheel, s.
+            feedback: The table `[feedback]`, by which wheels contradict their commands.
         """
         self._kinematics = kinematics
-        self.wheels = WheelFaults(kinematics, encoder_counts, response_time)
+        self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
         self.gyro = Gyro() if odometry.gyro else None
         multiplier = kinematics.multipliers[2]
         self._track = LearnedTrack(multiplier) if odometry.learned_track else None
@@ -77,11 +77,11 @@ class ConsistencyChecks:
         if self.gyro is not None:
             self.gyro.forgive()
 
-    def look(self, line: Feedback, rolled: Rolled, commanded: WheelSpeeds | None) -> bool:
+    def look(self, line: Feedback, rolled: Rolled) -> bool:
         """Take a line and the wheel angles since the line before.
 
-        `commanded` is the commanded wheel speeds. Return whether a wheel has proved faulty, so that
-        the lines before must be recomputed without it.
+        Return whether a wheel has proved faulty, so that the lines before must be recomputed
+        without it.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -94,7 +94,7 @@ class ConsistencyChecks:
             self.on_trial = gyro.owes
             by_gyro = None if turn is None else turn.wheels
         self.turn = turn
-        found = wheels.look(rolled.seen, line.speeds, rolled.seconds, commanded, by_gyro)
+        found = wheels.look(rolled.seen, line.speeds, rolled.seconds, by_gyro)
         self.slips = wheels.slips or (turn is not None and turn.slips)
         return found
 

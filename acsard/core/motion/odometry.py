@@ -72,7 +72,7 @@ class Odometry:
         odometry: OdometryConfig,
         kinematics: Kinematics,
         encoder_counts: int = 0,
-        response_time: float = FeedbackConfig().response_time,
+        feedback: FeedbackConfig = FeedbackConfig(),  # noqa: B008
         quiet: float = math.inf,
     ) -> None:
         """Start at the origin.
@@ -81,7 +81,7 @@ class Odometry:
             odometry: The table `[odometry]`.
             kinematics: The kinematics of the base.
             encoder_counts: Counts per wheel turn, 0 if unknown.
-            response_time: Response time of a slow wheel, s.
+            feedback: The table `[feedback]`, by which wheels contradict their commands.
             quiet: Duration of silence after which the daemon commands rest, s.
         """
         self._kinematics, self._track = kinematics, CONFIGURED
@@ -96,7 +96,7 @@ class Odometry:
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(self._errors, encoder_counts)
         self._gaps = Gaps()
-        self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, response_time)
+        self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, feedback)
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
         """The last lines, for recomputation."""
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
@@ -153,14 +153,13 @@ class Odometry:
         """
         self._rolling.skip(feedback)
 
-    def fold(self, feedback: Feedback, commanded: WheelSpeeds | None = None) -> Estimate:
+    def fold(self, feedback: Feedback) -> Estimate:
         """Advance the pose by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty grows. At rest the pose stays: a single
         count is added only when its direction is clear. If a gyro provides the turn since the line
-        before, the wheels provide only the distance. Wheels that contradict `commanded`, the
-        commanded wheel speeds, are faulty. The other wheel of the side replaces a faulty wheel,
-        also in the lines before.
+        before, the wheels provide only the distance. The other wheel of the side replaces a faulty
+        wheel, also in the lines before.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
@@ -168,7 +167,7 @@ class Odometry:
             self._steps_of = feedback.steps
             known = [step for step in feedback.steps if step < math.inf]
             self._coarsest = max(known, default=0.0)
-        if checks.look(feedback, rolled, commanded):
+        if checks.look(feedback, rolled):
             self._take_back()
         turn, slips = checks.turn, checks.slips
         believed = checks.wheels.believed(speeds.as_tuple())

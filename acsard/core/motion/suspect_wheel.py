@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from msgspec import Struct
+from acsard.core.motion.wheel_witness import Expected
 
 FAULT_S, FAULT_LINES = 0.025, 2
 """Seconds and lines for which the sign must last: three lines at 100 Hz, so one bad reading is not
@@ -25,12 +25,9 @@ enough."""
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
 """Counts and rad by which the other wheel must have turned further meanwhile."""
 
-FOLLOWED_COUNTS, FOLLOWED_ANGLE = 1.5, 0.01
+FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
 """Counts and rad after which even a slow wheel has left its speed. A sound wheel cannot have
 repeated one speed by then. If the other wheel has followed the command, this one is stuck."""
-
-STUCK_COUNTS = 2.5
-"""As FOLLOWED_COUNTS for a wheel that does not contradict the other one yet."""
 
 LEAVES = 0.05
 """rad/s by which a command must differ from that at the first repetition."""
@@ -56,18 +53,6 @@ WORDS: dict[WheelFault, str] = {
     "reversed": "reports the opposite direction of the other wheel of its side",
     "stuck": "says one and the same speed",
 }
-
-
-class Known(Struct, frozen=True):
-    """The independent reference for one side's turn in one line, rad; `gyro` is None if unknown."""
-
-    slow: float
-    """Turn of a wheel that follows its command slowly."""
-    command: float
-    """Turn of a wheel that follows its command at once."""
-    commanded: bool
-    """Whether there is a command, and not a slow one."""
-    gyro: float | None
 
 
 class _Ballot:
@@ -114,10 +99,10 @@ class Suspect:
         self._lines = 0
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
-        self._first: float | None = None
-        """Speed of a slow wheel at the first line, rad/s, and the angle that it went since beyond
-        that speed, rad."""
-        self._followed = 0.0
+        self._begun: float | None = None
+        """Angle that the wheel turned in the first line, rad."""
+        self._known = False
+        """Whether the command was a reference in any line."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
         """Return whether the wheel shows a sign of a fault, after a line of `dt` s.
@@ -148,16 +133,26 @@ class Suspect:
             return "dead"
         return "stuck" if same else None
 
-    def compare(self, own: float, other: float, dt: float, known: Known) -> None:
-        """Add the reference for this line."""
-        if known.commanded:
-            low, high = min(known.slow, known.command), max(known.slow, known.command)
-            self._command.add(own, other, low, high)
-            slow = known.slow / dt
-            self._first = slow if self._first is None else self._first
-            self._followed += (slow - self._first) * dt
-        if known.gyro is not None:
-            self._gyro.add(own, other, known.gyro, known.gyro)
+    def compare(
+        self,
+        own: float,
+        other: float,
+        dt: float,
+        count: float,
+        expected: Expected,
+        gyro: float | None,
+    ) -> None:
+        """Add the references for this line; `gyro` is the true turn by a gyro, rad, or None."""
+        slow, command = expected.speed, expected.commanded
+        self._begun = abs(own) if self._begun is None else self._begun
+        # The sound wheels of a slow robot still turn against a command that has changed its sign,
+        # but they slow down.
+        obeys = not expected.settled and own * command < 0.0 and abs(own) <= self._begun + count
+        if expected.clear and not obeys:
+            self._command.add(own, other, min(slow, command) * dt, max(slow, command) * dt)
+            self._known = True
+        if gyro is not None:
+            self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
         """Return whether this wheel is faulty, and not the other wheel of its side.
@@ -169,21 +164,13 @@ class Suspect:
             return False
         if self._gyro.apart >= enough and abs(self._gyro.vote) >= VOTE:
             return self._gyro.vote > 0.0 and self._plain(self._gyro)
-        if self.sign == "stuck" and self._ignores(count):
-            return True
         if self._command.apart >= enough:
             return self._command.vote >= VOTE and self._plain(self._command)
-        nothing = self._first is None
-        return self.sign == "stuck" and nothing and self._seconds >= HAND_S
+        return self.sign == "stuck" and not self._known and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
         """Return whether a tyre cannot explain the difference to a wheel at a steady speed."""
         return self.sign != "stuck" or ballot.share >= STUCK
-
-    def _ignores(self, count: float) -> bool:
-        """Return whether the command has changed and only the other wheel has followed."""
-        enough = FOLLOWED_COUNTS * count + FOLLOWED_ANGLE
-        return abs(self._followed) >= enough and self._followed * self._apart > 0.0
 
 
 class Stuck:
@@ -206,9 +193,7 @@ class Stuck:
         """Return whether the command, rad/s, differs from that at the first repetition."""
         return abs(command - self._command) >= LEAVES
 
-    def says(
-        self, same: bool, apart: float, dt: float, count: float, slow: float, command: float
-    ) -> bool:
+    def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
         """Return whether the encoder is stuck, after a line of `dt` s.
 
         Args:
@@ -216,9 +201,9 @@ class Stuck:
             apart: Angle that the other wheel turned more in the line, rad.
             dt: Duration of the line, s.
             count: Angle of an encoder count, rad.
-            slow: Speed of a wheel that follows its command slowly, rad/s.
-            command: Speed of a wheel that follows at once, rad/s.
+            expected: The command, and the speed of a wheel that follows it slowly.
         """
+        slow, command = expected.speed, expected.commanded
         leaves = command - self._command
         if not (same and abs(leaves) >= LEAVES):  # this also holds for the first line
             self._begin(slow, command)
@@ -230,7 +215,7 @@ class Stuck:
         other = self._other if leaves > 0.0 else -self._other
         return (
             self._seconds >= FAULT_S
-            and followed >= STUCK_COUNTS * count + FOLLOWED_ANGLE
+            and followed >= FOLLOWED_COUNTS * count + FOLLOWED_ANGLE
             and other >= FAULT_COUNTS * count + FAULT_ANGLE
         )
 
@@ -251,5 +236,5 @@ def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:
     `now` is the present speed.
     """
     if fault == "reversed":
-        return own * other < 0.0
+        return own * other <= 0.0
     return stands(own, other) if fault == "dead" else own == now

@@ -97,8 +97,8 @@ def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
 
 def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Path) -> None:
     def forget(robot: Robot) -> None:
-        for wheel in robot._sanity._wheels:
-            del wheel.suspected
+        for side in robot._odometry.checks.wheels._sides:
+            del side.late
 
     recording = of_older_code(tmp_path / "old.mcap", forget)
     looked = DisplayReplay(recording)
@@ -111,7 +111,7 @@ SPOILERS: dict[str, Callable[[Robot], None]] = {
     "a number for the session": lambda robot: setattr(robot, "session", 5),
     "words for what was said last": lambda robot: setattr(robot, "_made", ("fast", "now")),
     "a list for a counter": lambda robot: setattr(robot, "counters", []),
-    "no wheels": lambda robot: setattr(robot._sanity, "_wheels", ()),
+    "no wheels": lambda robot: setattr(robot._odometry.checks.wheels, "_left", ()),
     "itself, almost": lambda robot: setattr(robot, "_odometry", Robot(Config())),
 }
 

@@ -721,8 +721,9 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
 
 
 def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
-    doubt = WheelsStatus("rear_left wheel is left out", ("rear_left",), ("right",), (0.01, -0.02))
-    for said, level in ((WheelsStatus(), 0), (doubt, 1)):
+    slow = ("front_right 60%",)
+    doubt = WheelsStatus("rear_left is left out", ("rear_left",), ("right",), (0.01, -0.02), slow)
+    for said, level in ((WheelsStatus(), 0), (WheelsStatus(slow=slow), 1), (doubt, 1)):
         report, snapshot = Report(CONFIG, START), replace(SNAPSHOT, doubt=said)
         list(report.due(OUTPUTS, set(), never))
         seen = partial(replace, snapshot)
@@ -731,10 +732,12 @@ def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
         assert isinstance(array, DiagnosticArray)
         (row,) = [one for one in array.status if one.name == "acsard: wheels"]
         assert (state.wheel_fault, row.level) == (said.text, level)
-        assert row.message == (said.text or "front and rear agree")
+        calm = "slower than commanded: front_right 60%" if said.slow else "front and rear agree"
+        assert row.message == (said.text or calm)
     assert {pair.key: pair.value for pair in row.values} == {
         "left_out": "rear_left",
         "slipping": "right",
+        "slow": "front_right 60%",
         "front_more_left": "0.010",
         "front_more_right": "-0.020",
     }

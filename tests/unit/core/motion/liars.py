@@ -20,7 +20,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.path import Path
-from acsard.core.values import Instant, Pose, WheelSpeeds
+from acsard.core.values import Estimate, Instant, Pose, WheelSpeeds
 
 Array = NDArray[np.float64]
 
@@ -129,6 +129,12 @@ def wishes(told: Array) -> list[WheelSpeeds]:
 
 def odometry(counts: int = 0) -> Odometry:
     return Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)
+
+
+def fold(robot: Odometry, line: Feedback, commanded: WheelSpeeds) -> tuple[Estimate, str]:
+    """Return the estimate after a line, and the wheel fault that it proves."""
+    fault = robot.checks.wheels.watch(commanded, line.speeds, line.dt)
+    return robot.fold(line), fault
 
 
 def apart(a: Pose, b: Pose) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import GYRO_SCALE
 from acsard.core.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
+from tests.unit.core.motion.liars import fold
 
 KINEMATICS = Kinematics(DriveConfig())
 
@@ -143,7 +144,7 @@ class Turning:
                 continue
             at = Instant(self.now_ns, self.now_ns)
             line = Feedback(at, speeds, dt, bridged=bridged)
-            self.yaw_variance = self.robot.fold(line, told).covariance.yawyaw
+            self.yaw_variance = fold(self.robot, line, told)[0].covariance.yawyaw
             self.does += [event.kind for event in self.gyro.events]
 
     @property

@@ -22,6 +22,7 @@ from acsard.core.motion.path import arc
 from acsard.core.motion.uncertainty import MAX_VARIANCE, NOWHERE
 from acsard.core.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.each import each
+from tests.unit.core.motion.liars import fold
 from tests.vectors.drive import (
     PATHS,
     SEED_STEP,
@@ -763,8 +764,8 @@ def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
     told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
     dead = WheelSpeeds(told.front_right, 0.0, told.rear_left, told.rear_right)
     for n in range(60):
-        honest.fold(Feedback(AT, told, 0.01), commanded=told)
-        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), commanded=told)
+        fold(honest, Feedback(AT, told, 0.01), told)
+        fold(liar, Feedback(AT, told if n < 50 else dead, 0.01), told)
         if n == 51:
             assert not liar.checks.wheels.status.left_out
             for robot in (liar, honest):

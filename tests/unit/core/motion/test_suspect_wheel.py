@@ -8,20 +8,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.suspect_wheel import WORDS, Known, Stuck, Suspect, WheelFault, was_faulty
+from acsard.core.motion.suspect_wheel import WORDS, Stuck, Suspect, WheelFault, was_faulty
+from acsard.core.motion.wheel_witness import COMMANDED, Expected
 from tests.each import each
 
 DT = 0.01
 FINE = math.tau / 3200
-NOTHING = Known(0.0, 0.0, False, None)
+Known = tuple[Expected, float | None]
+"""The expected speed and the gyro's turn, rad or None."""
 
 
-def told(speed: float, slow: float | None = None) -> Known:
-    return Known((speed if slow is None else slow) * DT, speed * DT, True, None)
+def told(speed: float, slow: float | None = None, gyro: float | None = None) -> Known:
+    expected = Expected()
+    expected.commanded, expected.speed = speed, speed if slow is None else slow
+    expected.clear = expected.settled = speed >= COMMANDED
+    return expected, gyro
+
+
+NOTHING = told(0.0)
 
 
 def felt(speed: float) -> Known:
-    return Known(0.0, 0.0, False, speed * DT)
+    return told(0.0, gyro=speed * DT)
 
 
 def lies(
@@ -34,7 +42,7 @@ def lies(
     suspect = Suspect()
     for _ in range(lines):
         if suspect.looks(own * DT, other * DT, same, DT, FINE):
-            suspect.compare(own * DT, other * DT, DT, known)
+            suspect.compare(own * DT, other * DT, DT, FINE, *known)
     return suspect.sign is not None and suspect.is_faulty(FINE), suspect.sign
 
 
@@ -62,8 +70,8 @@ def test_who_does_as_told_does_not_lie() -> None:
 
 
 def test_a_gyro_is_believed_before_the_command() -> None:
-    spins = Known(10.0 * DT, 10.0 * DT, True, 0.0)
-    assert lies(0.0, 10.0, Known(10.0 * DT, 10.0 * DT, True, None))[0]
+    spins = told(10.0, gyro=0.0)
+    assert lies(0.0, 10.0, told(10.0))[0]
     assert not lies(0.0, 10.0, spins, lines=100)[0]
 
 
@@ -74,16 +82,30 @@ def test_half_the_speed_is_no_sign_of_a_lie() -> None:
 def test_a_wheel_that_says_the_same_while_its_command_and_the_other_change_is_stuck() -> None:
     suspect, speed = Suspect(), 10.0
     lines = 0
-    while lines < 20:
+    while lines < 40:
         lines += 1
         speed -= 0.3
-        command = Known((speed + 2.0) * DT, (speed - 1.0) * DT, True, None)
+        command = told(speed - 1.0, speed + 2.0)
         assert suspect.looks(10.0 * DT, speed * DT, True, DT, FINE)
-        suspect.compare(10.0 * DT, speed * DT, DT, command)
+        suspect.compare(10.0 * DT, speed * DT, DT, FINE, *command)
         if suspect.is_faulty(FINE):
             break
     assert suspect.sign == "stuck"
-    assert 3 <= lines < 15
+    assert 3 <= lines < 30
+
+
+@pytest.mark.parametrize(("change", "out"), [(-0.2, False), (0.2, True)])
+def test_a_wheel_of_a_slow_robot_may_turn_against_a_new_command_while_it_slows_down(
+    change: float, out: bool
+) -> None:
+    suspect, against = Suspect(), told(10.0)
+    against[0].clear, against[0].settled = True, False
+    speed = -5.0
+    for _ in range(10):
+        speed -= change
+        assert suspect.looks(speed * DT, -speed * DT, False, DT, FINE)
+        suspect.compare(speed * DT, -speed * DT, DT, FINE, *against)
+    assert suspect.is_faulty(FINE) is out
 
 
 def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
@@ -95,7 +117,7 @@ def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
     ("lie", "own", "other", "lied"),
     [
         ("dead", 0.0, 5.0, True), ("dead", 5.0, 5.0, False),
-        ("reversed", -5.0, 5.0, True), ("reversed", 5.0, 5.0, False),
+        ("reversed", -5.0, 5.0, True), ("reversed", 0.0, 5.0, True), ("reversed", 5.0, 5.0, False),
         ("stuck", 7.0, 5.0, True), ("stuck", 7.01, 5.0, False),
     ],
 )  # fmt: skip
@@ -124,7 +146,7 @@ def after(acceleration: float, other: float = 1.0, same: bool = True, count: flo
         command += acceleration * DT if line >= 100 else 0.0
         slow += (command - slow) * DT / (SLOW_S + DT)
         turned = 10.0 + other * (command - 10.0)
-        if stuck.says(same, (turned - 10.0) * DT, DT, count, slow, command):
+        if stuck.says(same, (turned - 10.0) * DT, DT, count, told(command, slow)[0]):
             return (line - 99) * DT
     return math.inf
 
@@ -156,7 +178,7 @@ def test_a_speed_that_changes_in_between_begins_it_anew() -> None:
     stuck = Stuck()
     for line in range(1, 100):
         command = 10.0 + 0.2 * line
-        found = stuck.says(line % 3 != 0, 0.002 * line, DT, FINE, command - 1.0, command)
+        found = stuck.says(line % 3 != 0, 0.002 * line, DT, FINE, told(command, command - 1.0)[0])
         assert not found
 
 
@@ -177,5 +199,5 @@ def test_a_sound_wheel_with_an_encoder_of_any_kind_is_not_stuck(
             math.floor(angle / count) - before for angle, before in zip(angles, said, strict=True)
         )
         said = [said[0] + own, said[1] + other]
-        assert not stuck.says(own == last, (other - own) * count, DT, count, slow, command)
+        assert not stuck.says(own == last, (other - own) * count, DT, count, told(command, slow)[0])
         last = own

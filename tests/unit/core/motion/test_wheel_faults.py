@@ -24,6 +24,7 @@ from tests.unit.core.motion.liars import (
     Robot,
     apart,
     commands,
+    fold,
     lines,
     odometry,
     rolled,
@@ -44,7 +45,7 @@ class Bench:
 
     def __init__(self, counts: int = 3200) -> None:
         kinematics = Kinematics(DriveConfig())
-        self.faults = WheelFaults(kinematics, counts, FeedbackConfig().response_time)
+        self.faults = WheelFaults(kinematics, counts, FeedbackConfig())
         self.events: list[str] = []
 
     def run(
@@ -65,7 +66,8 @@ class Bench:
                 front_right * PERIOD, front_left * PERIOD, rear_left * PERIOD, rear_right * PERIOD
             )  # fmt: skip
             by_gyro = None if turn is None else turn * PERIOD
-            if self.faults.look(turned, says, PERIOD, told, by_gyro):
+            self.faults.watch(told, says, PERIOD)
+            if self.faults.look(turned, says, PERIOD, by_gyro):
                 found = min(found, (line + 1) * PERIOD)
             self.events += [event.kind for event in self.faults.events]
         return found
@@ -123,7 +125,7 @@ def test_it_counts_again_when_it_has_agreed_for_half_a_second() -> None:
 def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
     robot, plain = odometry(3200), Plain()
     for told in [TEN] * 200 + [only(0, 0.0)] * 50:
-        robot.fold(Feedback(AT, told, PERIOD), TEN)
+        fold(robot, Feedback(AT, told, PERIOD), TEN)
         plain.fold(Feedback(AT, told, PERIOD))
     assert abs(plain.pose.yaw) > 0.3
     assert abs(robot.pose.yaw) < 1e-3
@@ -133,7 +135,7 @@ def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
 def test_the_wheels_angles_are_what_the_encoders_said() -> None:
     robot = odometry()
     for says in [TEN] * 100 + [only(0, 0.0)] * 100:
-        estimate = robot.fold(Feedback(AT, says, PERIOD), TEN)
+        estimate, _ = fold(robot, Feedback(AT, says, PERIOD), TEN)
     assert estimate.positions == pytest.approx((10.0, 20.0, 20.0, 20.0))
     assert estimate.speeds == only(0, 0.0)
 
@@ -141,11 +143,11 @@ def test_the_wheels_angles_are_what_the_encoders_said() -> None:
 def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
     robot = odometry(3200)
     for says in [TEN] * 100 + [only(0, 0.0)] * 2:
-        robot.fold(Feedback(AT, says, PERIOD), TEN)
+        fold(robot, Feedback(AT, says, PERIOD), TEN)
     robot.set_pose(robot.pose)
     before = robot.pose
-    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
-    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    fold(robot, Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    fold(robot, Feedback(AT, only(0, 0.0), PERIOD), TEN)
     assert robot.checks.wheels.status.left_out == ("front_right",)
     assert apart(before, robot.pose)[0] == pytest.approx(0.01, abs=1e-3)
 
@@ -197,12 +199,12 @@ def test_slip_is_told_by_its_side_and_ends_half_a_second_after(wheel: int) -> No
 def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
     calm, slipping = odometry(3200), odometry(3200)
     for says in [TEN] * 200:
-        sure = calm.fold(Feedback(AT, says, PERIOD), TEN)
-        slipping.fold(Feedback(AT, says, PERIOD), TEN)
+        sure, _ = fold(calm, Feedback(AT, says, PERIOD), TEN)
+        fold(slipping, Feedback(AT, says, PERIOD), TEN)
     begun = sure.covariance.yawyaw
     for _ in range(100):
-        sure = calm.fold(Feedback(AT, TEN, PERIOD), TEN)
-        unsure = slipping.fold(Feedback(AT, only(0, 12.0), PERIOD), TEN)
+        sure, _ = fold(calm, Feedback(AT, TEN, PERIOD), TEN)
+        unsure, _ = fold(slipping, Feedback(AT, only(0, 12.0), PERIOD), TEN)
     assert unsure.twist_variances.linear > 90 * sure.twist_variances.linear
     assert unsure.twist_variances.lateral == pytest.approx(100 * sure.twist_variances.lateral)
     assert unsure.twist_variances.angular > 90 * sure.twist_variances.angular
@@ -226,7 +228,7 @@ def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
 
 
 class Fall:
-    """One drive with one failure: the pose errors with and without the check, until the fault."""
+    """One drive with one failure: the pose errors with and without the check."""
 
     def __init__(self, kind: str, seed: int, counts: int) -> None:
         rng = np.random.default_rng(seed)
@@ -253,16 +255,13 @@ class Fall:
                 if sanity.doubtful:
                     break
                 continue
-            fault = sanity.watch(wishing[i], line.speeds, PERIOD)
             plain.fold(line)
-            robot.fold(line, wishing[i])
+            fold(robot, line, wishing[i])
             if off is None and i >= begun and abs(lying[i, wheel] - true[i, wheel]) > 2.0:
                 off = i
             if out is None and robot.checks.wheels.status.left_out:
                 out = i
                 self.wrong += robot.checks.wheels.status.left_out != (WHEELS[wheel],) or i < begun
-            if fault:
-                break
         self.plain, self.mine = apart(healthy.pose, plain.pose), apart(healthy.pose, robot.pose)
         if off is not None:
             self.out_s = math.inf if out is None else max(0, out - off + 1) * PERIOD
@@ -271,17 +270,8 @@ class Fall:
 GOAL = 0.05
 """Largest share of the plain mean's error, for encoders that reveal a failure at once."""
 
-COARSE = {
-    (400, "stuck"): 0.1,
-    (96, "stuck"): 0.15,
-    (20, "dead"): 0.1,
-    (20, "reversed"): 0.5,
-    (20, "stuck"): 0.1,
-}
-"""Larger shares for cases in which 3.5 counts must pass before a failure shows.
-
-With 20 counts per turn and at low speed, a reversed wheel is not always found.
-"""
+COARSE = {(20, "reversed"): 0.25}
+"""Larger share for the case in which many counts must pass before a failure shows."""
 
 SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
 
@@ -296,9 +286,7 @@ SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
     ],
 )
 @pytest.mark.parametrize("kind", list(LIES))
-def test_until_the_fault_a_lie_costs_less_than_a_twentieth(
-    kind: str, counts: int, count: int
-) -> None:
+def test_a_lie_costs_less_than_a_twentieth(kind: str, counts: int, count: int) -> None:
     """The drives are random. `COARSE` allows more for coarse encoders."""
     falls = [Fall(kind, seed, counts) for seed in range(count)]
     plain = np.array([fall.plain for fall in falls]).mean(axis=0)
@@ -335,7 +323,7 @@ def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
     lying = LIES[kind](said(angles, counts), wheel, begun)
     robot = odometry()
     for i, (line, wish) in enumerate(zip(lines(lying, counts), wishes(told), strict=True)):
-        robot.fold(line, wish)
+        fold(robot, line, wish)
         if robot.checks.wheels.status.left_out:
             assert robot.checks.wheels.status.left_out == (WHEELS[wheel],)
             assert i >= begun
@@ -378,7 +366,7 @@ def healthy(
         robot.fold(Feedback(AT, one, PERIOD))
         plain.fold(Feedback(AT, one, PERIOD))
     for line, wish in zip(lines(speeds), wishes(told), strict=True):
-        robot.fold(line, wish)
+        fold(robot, line, wish)
         plain.fold(line)
         if line.speeds != STILL:
             was, slips = slips, bool(robot.checks.wheels.status.slipping)
@@ -426,7 +414,7 @@ def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float
     )  # fmt: skip
     robot = odometry()
     for i, (line, wish) in enumerate(zip(lines(said(angles, counts)), wishes(told), strict=True)):
-        robot.fold(line, wish)
+        fold(robot, line, wish)
         if i >= begun and robot.checks.wheels.status.slipping:
             return (i - begun + 1) * PERIOD
     return math.inf
