@@ -308,6 +308,10 @@ class Freshness:
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
+        """Foreign clocks that were never believed. A silence ends their proof and leaves nothing."""
+        self._unproved: dict[str, _Clock] = {}
+        """Steady clocks that were never believed. Their lowest delay holds from the first command
+        on."""
         self._numbers: dict[str, tuple[int, int]] = {}
         """Number and arrival of the last command of each sender that numbers without stamps."""
         self.forgiven_ns = 0
@@ -318,11 +322,16 @@ class Freshness:
         if command.stamp_ns is None:
             return self._in_order(command)
         name, at_ns = command.clock or command.source, command.arrived_ns
-        clock = self._clocks.pop(name, None) or self._newcomers.pop(name, None) or _Clock(at_ns)
+        clock = None
+        for held in (self._clocks, self._newcomers, self._unproved):
+            clock = clock or held.pop(name, None)
+        clock = clock or _Clock(at_ns)
         verdict = clock.judge(command, command.stamp_ns, timeout_ns)
         if verdict == "set":
             self.forgiven_ns += clock.forgiven_ns
-        held = self._clocks if clock.was_known else self._newcomers
+        held = self._unproved if command.steady else self._newcomers
+        if clock.was_known:
+            held = self._clocks
         held[name] = clock
         self._forget(at_ns)
         return verdict
@@ -344,20 +353,18 @@ class Freshness:
     def _forget(self, now_ns: int) -> None:
         """Forget the clocks that were silent for long, and any above the limit.
 
-        Above the limit, clocks that were never believed and are silent now go first. Below it they
-        stay, because the lowest delay of a steady clock holds from its first command on.
+        Above the limit, the first to go is a silent clock that was never believed.
         A recording begins with all clocks, which the loop writes in one step.
         """
-        both = [held for held in (self._newcomers, self._clocks) if held]
-        for held in both:
-            while held and now_ns - _oldest(held).at_ns > KEEP_NS:
+        limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
+        for held, silent_ns in limits:
+            while held and now_ns - _oldest(held).at_ns > silent_ns:
                 del held[next(iter(held))]
-        if len(self._newcomers) + len(self._clocks) > MAX_CLOCKS:
-            both = [held for held in both if held]
-            if now_ns - _oldest(both[0]).at_ns > GAP_NS:
-                held = both[0]
-            else:
-                held = min(both, key=lambda clocks: _oldest(clocks).at_ns)
+        some = [held for held, _ in limits if held]
+        if sum(map(len, some)) > MAX_CLOCKS:
+            held = min(some, key=lambda clocks: _oldest(clocks).at_ns)
+            if self._unproved and now_ns - _oldest(self._unproved).at_ns > GAP_NS:
+                held = self._unproved
             del held[next(iter(held))]
 
 
