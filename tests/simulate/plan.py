@@ -545,7 +545,9 @@ def _events(
         )
         if dice.random() < 0.3:
             again = round(at + dice.choice((0.03, 0.3, 3.0)) * dice.uniform(1.0, 2.0), 3)
-            once(again, "suspend", **{"for": round(dice.uniform(0.5, 60.0), 3)})
+            lasts = round(dice.uniform(0.5, 60.0), 3)
+            if again < seconds:  # Otherwise the board boots while the last sender sends its zeros.
+                once(again, "suspend", **{"for": lasts})
     for at in add("clock steps", 40):
         once(at, "wall", by=round(dice.choice((0.3, 3.0, 1e5)) * dice.uniform(-1.0, 1.0), 3))
     for at in add("restarts", 60):
