@@ -377,14 +377,6 @@ def test_senders_without_a_name_are_told_apart_by_their_source() -> None:
     assert verdicts[-2:] == ["fresh", "fresh"]
 
 
-@pytest.mark.parametrize("steady", [False, True])
-def test_a_known_clock_outlives_any_number_of_senders_that_send_once(steady: bool) -> None:
-    sender = Sender(steady=steady)
-    for number in range(2000):
-        sender.sends(5 * MS, 0, clock=f"stranger {number}")
-    assert sender.sends(0, 0) == "fresh"
-
-
 def test_the_proof_of_a_sender_among_others_ends_with_a_silence_of_over_2_s_as_well() -> None:
     sender = Sender(known=False)
     assert sender.sends(0, 0) == "first"

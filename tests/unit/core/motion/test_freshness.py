@@ -213,6 +213,14 @@ def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first()
     assert clock.sends(0.0) == "first"
 
 
+@pytest.mark.parametrize("steady", [False, True])
+def test_a_known_clock_outlives_any_number_of_senders_that_send_once(steady: bool) -> None:
+    clock = Clock(steady=steady)
+    for number in range(2000):
+        clock.sends(0.0, 5.0, f"stranger {number}")
+    assert clock.sends(0.0) == "fresh"
+
+
 def test_one_at_20_hz_stays_known_among_four_thousand_names_a_second() -> None:
     clock = Clock()
     for number in range(2000):
