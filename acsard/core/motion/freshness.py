@@ -308,7 +308,7 @@ class Freshness:
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Foreign clocks that were never believed. A silence ends their proof and leaves nothing."""
+        """Foreign clocks that were never believed. A silence ends their proof without a trace."""
         self._unproved: dict[str, _Clock] = {}
         """Steady clocks that were never believed. Their lowest delay holds from the first command
         on."""
