@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -37,12 +36,7 @@ from tests.system.ros_clients import (
 
 pytestmark = pytest.mark.network
 
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """The usual limits, but quick to drive and to stand."""
-    with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
-        yield daemon
+CONFIG = QUICK
 
 
 @pytest.fixture
