@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import atexit
 import gc
+import inspect
 import os
 import shutil
 import signal
@@ -127,6 +129,29 @@ def _rank(item: pytest.Item) -> int:
     if unit in ("loud", "systemd"):
         return 0 if unit == "loud" else 1
     return 2 if unit.split("/")[-2] in LIVE else 3
+
+
+STORY_S = 60.0
+"""The longest time of a test that is a coroutine."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine function in an event loop of its own."""
+    test, names = pyfuncitem.obj, inspect.signature(pyfuncitem.obj).parameters
+
+    async def story() -> None:
+        async with asyncio.timeout(STORY_S):
+            await test(**{name: pyfuncitem.funcargs[name] for name in names})
+        # Closing the loop would cancel a task that still cleans up, for example one that ends a
+        # child process, and the child's pipes would outlive the loop.
+        ending = [task for task in asyncio.all_tasks() if task.cancelling()]
+        await asyncio.gather(*ending, return_exceptions=True)
+
+    if not inspect.iscoroutinefunction(test):
+        return None
+    asyncio.run(story())
+    return True
 
 
 def pytest_collection_finish() -> None:

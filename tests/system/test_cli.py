@@ -16,7 +16,7 @@ import termios
 import threading
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -646,30 +646,13 @@ def held(terminal: Terminal, key: str) -> Iterator[None]:
 
 
 @contextmanager
-def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard drive` at a terminal of its own until it shows the robot."""
-    with Terminal() as terminal:
-        drive = ["drive", "--config", str(shared.config), *words]
-        command = [sys.executable, "-c", ON_TERMINAL, *drive]
-        with Program(
-            command,
-            shared.config.parent,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            until(
-                lambda: WAITS in terminal.screen,
-                10.0,
-                "the robot's state on the screen",
-            )
-            yield terminal, program
-
-
-@contextmanager
 def at_terminal(
-    daemon: Daemon, verb: str, term: str, columns: int = 80, how: str = ON_TERMINAL
+    daemon: Daemon,
+    verb: str,
+    term: str,
+    columns: int = 80,
+    how: str = ON_TERMINAL,
+    words: Sequence[str] = (),
 ) -> Iterator[tuple[Terminal, Program]]:
     """Run a verb at a terminal of its own, of that kind and width, with 24 lines."""
     with Terminal() as terminal:
@@ -679,7 +662,7 @@ def at_terminal(
         for name in ("COLUMNS", "LINES", "NO_COLOR"):
             env.pop(name, None)
         with Program(
-            [sys.executable, "-c", how, verb, "--config", str(daemon.config)],
+            [sys.executable, "-c", how, verb, "--config", str(daemon.config), *words],
             daemon.config.parent,
             env,
             stdin=terminal.slave,
@@ -692,10 +675,10 @@ def at_terminal(
 
 @contextmanager
 def without_a_screen(
-    shared: Daemon, how: str = ON_TERMINAL, columns: int = 80
+    shared: Daemon, *words: str, how: str = ON_TERMINAL, columns: int = 80
 ) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard drive` at a terminal that cannot show a screen."""
-    with at_terminal(shared, "drive", "dumb", columns, how) as (terminal, program):
+    with at_terminal(shared, "drive", "dumb", columns, how, words) as (terminal, program):
         until(lambda: WAITS in terminal.screen, 10.0, "the robot's state")
         yield terminal, program
 
@@ -792,7 +775,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
     # its zeros.
     with (
         bus.follow("cmd/teleop") as commands,
-        without_a_screen(shared, UNDER_A_SHELL) as (terminal, _),
+        without_a_screen(shared, how=UNDER_A_SHELL) as (terminal, _),
     ):
         with held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
@@ -803,7 +786,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
 
 
 def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
             assert bus.state()["source"] == "teleop"
@@ -817,7 +800,7 @@ def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: B
 
 
 def test_space_stops_at_once(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, _):
+    with without_a_screen(shared) as (terminal, _):
         with held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
         pressed = time.monotonic()
@@ -834,7 +817,7 @@ ARROWS = {"A": (1, 0), "B": (-1, 0), "D": (0, 1), "C": (0, -1)}
 
 @pytest.mark.slow
 def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, _):
+    with without_a_screen(shared) as (terminal, _):
         for letter, (ahead, left) in ARROWS.items():
             with held(terminal, f"\x1b[{letter}"):
 
@@ -850,7 +833,7 @@ def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> N
 
 @pytest.mark.slow
 def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared, "--linear", "0.2") as (terminal, _):
+    with without_a_screen(shared, "--linear", "0.2") as (terminal, _):
         terminal.press("w")
         until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")
         with held(terminal, "i"):
@@ -861,7 +844,7 @@ def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) ->
 def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was(
     shared: Daemon, bus: Bus
 ) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         during = terminal.settings
         with held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.3, 5.0, "moving")
@@ -884,7 +867,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
 def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
     shared: Daemon, bus: Bus, number: signal.Signals
 ) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         program.signal(number)
         program.ended(3.0)
         after = terminal.settings
@@ -894,7 +877,7 @@ def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
 
 @pytest.mark.slow
 def test_a_stranger_s_put_on_every_key_does_not_end_a_drive(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         for payload in (b"\xff", b"{}", b""):
             bus.session.put("acsard/**", payload)
         with held(terminal, "i"):

@@ -256,13 +256,10 @@ def test_connecting_to_nobody_is_a_connection_error_with_the_mend() -> None:
     assert "acsard run" in str(error.value)
 
 
-def test_connecting_async_to_nobody_is_the_same_error() -> None:
-    async def main() -> None:
+async def test_connecting_async_to_nobody_is_the_same_error() -> None:
+    with pytest.raises(UnreachableError):
         async with connect_async(free_endpoint()):
             pass
-
-    with pytest.raises(UnreachableError):
-        asyncio.run(main())
 
 
 @pytest.mark.parametrize("robot_id", ["a/b*", "", "robot 1"])

@@ -47,13 +47,12 @@ async def drives(guided: Guided, standing: Bus) -> None:
     assert standing.state()["source"] == "app"
 
 
-def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_written_file(
+async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_written_file(
     tmp_path: Path,
 ) -> None:
     alone = NoDaemon(tmp_path)
     found: list[Any] = []
-
-    async def story() -> None:
+    with Page(alone, tmp_path) as served:
         async with guiding(served) as guided:
             await guided.begin("check", port="sim")
             subject = await guided.says(lambda said: "subject" in said)
@@ -76,9 +75,6 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
             found.extend(s["guide"]["finding"] for s in heard if "finding" in str(s))
             told = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
             assert described.kinds(heard) >= told
-
-    with Page(alone, tmp_path) as served:
-        run(story)
     names = [one["name"] for one in found]
     assert names[0] == "baud rate"
     assert "watchdog" in names
@@ -87,41 +83,39 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
     assert written["port"] == "sim"
 
 
-def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, standing: Bus) -> None:
+async def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(
+    page: Page, standing: Bus
+) -> None:
     before = page.refused()
-
-    async def story() -> None:
-        async with guiding(page) as guided, guiding(page) as other:
-            await drives(guided, standing)
-            about = await other.says(lambda said: said.get("running"))
-            assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
-            # Only one runs at a time, and no other client answers, presses or ends it.
-            await other.begin("check", port="sim")
-            refused = await other.ours.find(lambda said: said.get("refused") == "begin")
-            assert "calibrate already runs (here)" in refused["reason"]
-            await other.ours.say(press="key")
-            await other.ours.say(press="leave")
-            for number in range(100):
-                await other.ours.say(reply=number, value=1)
-            # Answers without a question do nothing, however many come.
-            for number in range(150):
-                await guided.ours.say(reply=number, value="start")
-            refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
-            assert "is not open" in refused["reason"]
-            assert (standing.state()["linear"] or 0.0) > 0.25
-            pressed = time.monotonic()
-            await guided.ours.say(press="key")
-            await beside(standing.at_rest)
-            took = time.monotonic() - pressed
-            # 0.3 m/s at 1 m/s2, and a part of the way.
-            assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
-            end = await guided.ended()
-            assert (end["ended"], end["meaning"]) == (1, "failure")
-            assert "a key was pressed" in end["text"]
-            assert "writes no file" in end["text"]
-            await other.says(lambda said: said.get("running") == "")
-
-    run(story)
+    async with guiding(page) as guided, guiding(page) as other:
+        await drives(guided, standing)
+        about = await other.says(lambda said: said.get("running"))
+        assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
+        # Only one runs at a time, and no other client answers, presses or ends it.
+        await other.begin("check", port="sim")
+        refused = await other.ours.find(lambda said: said.get("refused") == "begin")
+        assert "calibrate already runs (here)" in refused["reason"]
+        await other.ours.say(press="key")
+        await other.ours.say(press="leave")
+        for number in range(100):
+            await other.ours.say(reply=number, value=1)
+        # Answers without a question do nothing, however many come.
+        for number in range(150):
+            await guided.ours.say(reply=number, value="start")
+        refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
+        assert "is not open" in refused["reason"]
+        assert (standing.state()["linear"] or 0.0) > 0.25
+        pressed = time.monotonic()
+        await guided.ours.say(press="key")
+        await beside(standing.at_rest)
+        took = time.monotonic() - pressed
+        # 0.3 m/s at 1 m/s2, and a part of the way.
+        assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
+        end = await guided.ended()
+        assert (end["ended"], end["meaning"]) == (1, "failure")
+        assert "a key was pressed" in end["text"]
+        assert "writes no file" in end["text"]
+        await other.says(lambda said: said.get("running") == "")
     none_left(page)
     assert page.refused()["malformed"] >= before.get("malformed", 0) + 200
 
@@ -136,59 +130,50 @@ def left(guided: Guided, page: Page) -> None:
 
 
 @pytest.mark.parametrize("how", [gone, left])
-def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
+async def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
     page: Page, standing: Bus, how: Callable[[Guided, Page], None]
 ) -> None:
-    async def story() -> None:
-        async with guiding(page) as guided:
-            await drives(guided, standing)
-            (child,) = commands(page)
-            begun = time.monotonic()
-            how(guided, page)
-            await beside(standing.at_rest)
-            took = time.monotonic() - begun
-            assert took < 0.3 + 0.4 + lost(begun, begun + took)
-            await beside(lambda: none_left(page))
-            assert not Path(f"/proc/{child}").exists()
-        async with guiding(page) as another:
-            await another.begin("calibrate", method="tape")
-            await another.asks("How far apart")
-
-    run(story)
+    async with guiding(page) as guided:
+        await drives(guided, standing)
+        (child,) = commands(page)
+        begun = time.monotonic()
+        how(guided, page)
+        await beside(standing.at_rest)
+        took = time.monotonic() - begun
+        assert took < 0.3 + 0.4 + lost(begun, begun + took)
+        await beside(lambda: none_left(page))
+        assert not Path(f"/proc/{child}").exists()
+    async with guiding(page) as another:
+        await another.begin("calibrate", method="tape")
+        await another.asks("How far apart")
     none_left(page)
 
 
-def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> None:
-    async def story() -> None:
-        async with guiding(page, pings=False) as guided:
-            for _ in range(4):  # a busy machine may end it before
-                await guided.begin("calibrate", method="umbmark")
-                await guided.answer(await guided.asks("How wide"), 300)
-                await guided.starts()
-                end = await guided.ended()
-                if "no sign of life" in end["text"]:
-                    break
-                await guided.says(lambda said: said.get("running") == "")
-            assert f"no sign of life of the operator arrived for {HEARD_S:g} s" in end["text"]
-            await beside(standing.at_rest)
-
-    run(story)
+async def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> None:
+    async with guiding(page, pings=False) as guided:
+        for _ in range(4):  # a busy machine may end it before
+            await guided.begin("calibrate", method="umbmark")
+            await guided.answer(await guided.asks("How wide"), 300)
+            await guided.starts()
+            end = await guided.ended()
+            if "no sign of life" in end["text"]:
+                break
+            await guided.says(lambda said: said.get("running") == "")
+        assert f"no sign of life of the operator arrived for {HEARD_S:g} s" in end["text"]
+        await beside(standing.at_rest)
 
 
-def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
+async def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
     page: Page, standing: Bus
 ) -> None:
-    async def story() -> None:
-        async with guiding(page) as guided:
-            await drives(guided, standing)
-            silent = time.monotonic()
-            guided.falls_silent()
-            await beside(standing.at_rest)
-            took = time.monotonic() - silent
-            # Add the ramp: 0.3 m/s at 1 m/s2, and a part of the way.
-            assert took < 1.0 + 0.3 + 0.4 + lost(silent, silent + took)
-
-    run(story)
+    async with guiding(page) as guided:
+        await drives(guided, standing)
+        silent = time.monotonic()
+        guided.falls_silent()
+        await beside(standing.at_rest)
+        took = time.monotonic() - silent
+        # Add the ramp: 0.3 m/s at 1 m/s2, and a part of the way.
+        assert took < 1.0 + 0.3 + 0.4 + lost(silent, silent + took)
     none_left(page)
 
 
@@ -197,7 +182,7 @@ LINES = 10
 
 
 @pytest.mark.network
-def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_second(
+async def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_second(
     hosts: Hosts, tmp_path: Path
 ) -> None:
     """No connection closes, and no program gets an error."""
@@ -219,23 +204,6 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
                 return one.at
         return None
 
-    async def story() -> None:
-        async with guiding(served, token=token) as guided:
-            await guided.begin("calibrate", method="umbmark")
-            await guided.answer(await guided.asks("How wide"), 300)
-            begun = time.monotonic()
-            await guided.starts("1. Place the")
-            speed = await beside(lambda: until(lambda: fast(begun), 10.0, "the leg moves"))
-            hosts.cut()
-            gone = time.monotonic()
-            try:
-                at = await beside(lambda: until(lambda: slower(gone, speed), 5.0, "it slows down"))
-            finally:
-                hosts.heal()
-            print(f"slower after {at - gone:.2f} s")
-            # The page's server, the command and the daemon. A busy machine delays each.
-            assert at - gone < 1.0 + 3 * lost(gone, at)
-
     with (
         FarPeer(tmp_path) as peer,
         on(hosts.robot, Daemon(tmp_path, peer.path)) as daemon,
@@ -243,7 +211,23 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
     ):
         token = served.invite("maintainer", "phone")
         with inside(hosts.stranger):
-            run(story)
+            async with guiding(served, token=token) as guided:
+                await guided.begin("calibrate", method="umbmark")
+                await guided.answer(await guided.asks("How wide"), 300)
+                begun = time.monotonic()
+                await guided.starts("1. Place the")
+                speed = await beside(lambda: until(lambda: fast(begun), 10.0, "the leg moves"))
+                hosts.cut()
+                gone = time.monotonic()
+                try:
+                    at = await beside(
+                        lambda: until(lambda: slower(gone, speed), 5.0, "it slows down")
+                    )
+                finally:
+                    hosts.heal()
+                print(f"slower after {at - gone:.2f} s")
+                # The page's server, the command and the daemon. A busy machine delays each.
+                assert at - gone < 1.0 + 3 * lost(gone, at)
         none_left(served)
 
 
@@ -403,14 +387,11 @@ def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(tmp_p
             again.says("PASS    motor a", 30.0)
 
 
-def test_what_may_be_begun_is_listed(page: Page) -> None:
-    async def story() -> None:
-        told = json.loads(await text(f"{page.here}/api/guide"))
-        assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
-        assert told["method"] == "positions"
-        assert "no floor to lay a tape on" in told["advice"]
-        assert told["ports"][0]["port"] == "sim"  # the configured port
-        if len(told["ports"]) == 1:
-            assert "systemctl stop acsard" in told["note"]
-
-    run(story)
+async def test_what_may_be_begun_is_listed(page: Page) -> None:
+    told = json.loads(await text(f"{page.here}/api/guide"))
+    assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
+    assert told["method"] == "positions"
+    assert "no floor to lay a tape on" in told["advice"]
+    assert told["ports"][0]["port"] == "sim"  # the configured port
+    if len(told["ports"]) == 1:
+        assert "systemctl stop acsard" in told["note"]

@@ -80,25 +80,6 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
             assert bus.state()["x"] > moved, "odometry went on from where it was"
 
 
-@pytest.mark.slow
-def test_the_port_can_be_lost_and_found_many_times(tmp_path: Path, peer: Peer) -> None:
-    with (
-        Daemon(tmp_path, peer.path) as daemon,
-        Bus(daemon.endpoint) as bus,
-        bus.follow("state") as states,
-    ):
-        bus.linked()
-        for _ in range(3):
-            pulled = peer.unplug()
-            down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
-            peer.plug()
-            states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
-            assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
-            assert set(peer.session.said()[1:]) == {ZERO_LINE}
-        with bus.commanding(0.5):
-            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "driving at last")
-
-
 def test_a_stop_stays_latched_over_a_replug(tmp_path: Path, peer: Peer) -> None:
     with (
         Daemon(tmp_path, peer.path) as daemon,
