@@ -6,8 +6,6 @@ import cmath
 import json
 import math
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -43,7 +41,7 @@ from tests.system.harness import (
     free_endpoint,
     until,
 )  # fmt: skip
-from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.terminals import Terminal, at_terminal
 from tests.system.typed import typed
 from tests.unit.calibration.guided.played import Player
 from tests.unit.calibration.robots import Robot
@@ -80,19 +78,9 @@ RIDES_S = 120.0
 @contextmanager
 def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard calibrate` at a terminal of its own, with its results in a pipe."""
-    given = ["calibrate", "--config", str(daemon.config), *words]
-    with (
-        Terminal() as terminal,
-        Program(
-            [sys.executable, "-c", ON_TERMINAL, *given],
-            daemon.config.parent,
-            stdin=terminal.slave,
-            stderr=terminal.slave,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        ) as program,
-    ):
-        yield terminal, program
+    given = ("calibrate", "--config", str(daemon.config), *words)
+    with at_terminal(daemon.config.parent, *given, piped="stdout") as found:
+        yield found
 
 
 def asks(terminal: Terminal, program: Program, words: str, times: int, within: float) -> None:

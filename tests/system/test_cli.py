@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import pty
-import re
-import select
 import signal
-import struct
-import subprocess
-import sys
-import termios
-import threading
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,6 +28,15 @@ from tests.system.harness import (
     finish,
     free_endpoint,
     until,
+)
+from tests.system.terminals import (
+    ON_TERMINAL,
+    SCREEN,
+    UNDER_A_SHELL,
+    Terminal,
+    at_terminal,
+    held,
+    screens,
 )
 from tests.system.typed import typed
 
@@ -571,128 +571,27 @@ def test_what_is_only_asked_is_not_waited_for(shared: Daemon, verb: str) -> None
 # drive
 
 
-ON_TERMINAL = """\
-import fcntl, os, sys, termios
-fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-os.execv(sys.executable, [sys.executable, "-m", "acsard", *sys.argv[1:]])
-"""
-"""Makes its standard input the controlling terminal, as a shell does, so that ^C is a signal."""
-
-
-UNDER_A_SHELL = """\
-import fcntl, os, sys, termios
-fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-words = ["bash", "--norc", "-ic", '"$@"; true', "bash", sys.executable, "-m", "acsard"]
-os.execvp("bash", [*words, *sys.argv[1:]])
-"""
-"""The same program, as a job of a shell."""
-
-
-class Terminal:
-    """A person at a terminal: presses keys and reads the screen."""
-
-    def __init__(self) -> None:
-        self.screen = ""
-        self._master, self.slave = pty.openpty()
-        self._open = True
-        self._leave = threading.Event()
-        self._reader = threading.Thread(target=self._read)
-
-    def __enter__(self) -> Terminal:
-        self._reader.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._open:
-            self.close()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._open = False
-        self._leave.set()
-        self._reader.join()
-        os.close(self._master)
-        os.close(self.slave)
-
-    def press(self, key: str) -> None:
-        os.write(self._master, key.encode())
-
-    @property
-    def settings(self) -> list[object]:
-        return list(termios.tcgetattr(self.slave))
-
-    def _read(self) -> None:
-        while not self._leave.is_set():
-            if select.select([self._master], [], [], 0.05)[0]:
-                self.screen += os.read(self._master, 4096).decode(errors="replace")
-
-
-@contextmanager
-def held(terminal: Terminal, key: str) -> Iterator[None]:
-    """Hold a key down: it repeats 20 times a second until it is released."""
-    released = threading.Event()
-
-    def repeat() -> None:
-        while not released.wait(0.05):
-            terminal.press(key)
-
-    thread = threading.Thread(target=repeat)
-    thread.start()
-    try:
-        yield
-    finally:
-        released.set()
-        thread.join()
-
-
-@contextmanager
-def at_terminal(
-    daemon: Daemon,
-    verb: str,
-    term: str,
-    columns: int = 80,
-    how: str = ON_TERMINAL,
-    words: Sequence[str] = (),
-) -> Iterator[tuple[Terminal, Program]]:
-    """Run a verb at a terminal of its own, of that kind and width, with 24 lines."""
-    with Terminal() as terminal:
-        size = struct.pack("HHHH", 24, columns, 0, 0)
-        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
-        env = environment(TERM=term)
-        for name in ("COLUMNS", "LINES", "NO_COLOR"):
-            env.pop(name, None)
-        with Program(
-            [sys.executable, "-c", how, verb, "--config", str(daemon.config), *words],
-            daemon.config.parent,
-            env,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            yield terminal, program
-
-
 @contextmanager
 def without_a_screen(
     shared: Daemon, *words: str, how: str = ON_TERMINAL, columns: int = 80
 ) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard drive` at a terminal that cannot show a screen."""
-    with at_terminal(shared, "drive", "dumb", columns, how, words) as (terminal, program):
+    drive = ("drive", "--config", str(shared.config), *words)
+    with at_terminal(shared.config.parent, *drive, how=how, columns=columns, piped="stderr") as (
+        terminal,
+        program,
+    ):
         until(lambda: WAITS in terminal.screen, 10.0, "the robot's state")
         yield terminal, program
-
-
-def screens(terminal: Terminal) -> list[str]:
-    """Return all whole screens so far, without their colours."""
-    frames = terminal.screen.split("\x1b[H")[1:-1]
-    return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame) for frame in frames]
 
 
 @contextmanager
 def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard drive` at a terminal of that width that can show a screen."""
-    with at_terminal(shared, "drive", "xterm-256color", columns) as (terminal, program):
+    drive = ("drive", "--config", str(shared.config))
+    with at_terminal(
+        shared.config.parent, *drive, term=SCREEN, columns=columns, piped="stderr"
+    ) as (terminal, program):
         until(lambda: [one for one in screens(terminal) if WAITS in one], 10.0, "it")
         yield terminal, program
 
