@@ -161,14 +161,6 @@ def test_check_json_is_the_configuration_in_force(shared: Daemon, bus: Bus) -> N
     assert json.loads(ended.out) == bus.get("config")
 
 
-def test_check_of_a_bad_file_ends_with_78_and_the_mend(tmp_path: Path) -> None:
-    (tmp_path / "acsard.toml").write_text("[drive]\nwheel_radus = 0.05\n")
-    ended = typed("check", "--config", str(tmp_path / "acsard.toml"))
-    assert (ended.code, ended.out) == (78, "")
-    assert "drive.wheel_radus" in ended.err
-    assert "did you mean wheel_radius?" in ended.err
-
-
 # echo and hz
 
 
@@ -260,14 +252,6 @@ def test_who_waits_sees_that_the_daemon_has_ended(tmp_path: Path) -> None:
         daemon.signal(signal.SIGINT)
         daemon.ended(5.0)
         until(lambda: seen() == Presence(linked=False, here=False), 5.0, "that it is gone")
-
-
-def test_echo_of_no_messages_prints_none(shared: Daemon) -> None:
-    words = acsard("echo", "odom", "-n", "0", "--config", str(shared.config))
-    with Program(words, shared.config.parent) as echo:
-        code = echo.ended(3.0)
-        assert code in (0, 2)
-    assert echo.stdout == ""
 
 
 def test_echo_into_a_reader_that_leaves_ends_quietly(shared: Daemon, bus: Bus) -> None:
@@ -559,13 +543,6 @@ def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
     assert (ended.code, ended.out) == (2, "")
     assert "acsard call stop" in ended.err
     assert bus.state()["mode"] != "stopped"
-
-
-@each("verb", ["echo", "hz"])
-def test_what_is_only_asked_is_not_waited_for(shared: Daemon, verb: str) -> None:
-    ended = tool(shared, verb, "info")
-    assert (ended.code, ended.out) == (2, "")
-    assert "acsard get info" in ended.err
 
 
 # drive

@@ -15,7 +15,7 @@ import time
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -398,17 +398,6 @@ def _waits(one: socket.socket) -> bool:
         return True
     except ConnectionError:
         return False
-
-
-async def test_an_address_has_room_for_twenty_pages(table: Table, bus: Bus) -> None:
-    where = f"{table.page.here}/ws"
-    with table.attack("the 21st page of an address", "503", "too_many"):
-        async with aiohttp.ClientSession() as session, AsyncExitStack() as stack:
-            for _ in range(20):
-                await stack.enter_async_context(session.ws_connect(where))
-            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-                await session.ws_connect(where)
-            assert caught.value.status == 503
 
 
 def test_a_browser_with_many_cookies_of_other_ports_gets_the_page(table: Table) -> None:

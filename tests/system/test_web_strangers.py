@@ -26,7 +26,6 @@ from acsard.web.limits import (
     CONNECTIONS_ALIKE,
     CONNECTIONS_HERE,
     CONNECTIONS_OF_ONE,
-    CONNECTIONS_OF_TOKEN,
 )
 from acsard.web.server import TIDY_S
 from tests.system.browser import NAME, Page, hands, run
@@ -229,23 +228,6 @@ async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(pa
         await asyncio.wait_for(owned.read(1), 2 * TIDY_S)
     for writer in (first, second):
         writer.transport.abort()
-
-
-async def test_a_token_has_a_share_of_the_pages_from_however_many_addresses(
-    page: Page, bus: Bus, operator: str
-) -> None:
-    shared = page.invite("viewer", "class")
-    async with AsyncExitStack() as stack:
-        opened = 0
-        for n in range(CONNECTIONS_OF_TOKEN + 5):
-            session = page.client(shared, f"127.0.0.{2 + n % 5}")
-            await stack.enter_async_context(session)
-            with suppress(aiohttp.WSServerHandshakeError):
-                await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
-                opened += 1
-        assert opened == CONNECTIONS_OF_TOKEN
-        async with hands(page, operator) as ours:
-            assert (await ours.call("stop"))["ok"]
 
 
 async def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(
