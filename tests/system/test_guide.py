@@ -287,8 +287,10 @@ def ended(pid: int) -> bool:
 
 
 @pytest.mark.network
-def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
-    async def story(token: str) -> None:
+async def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
+    before = page.refused().get("role", 0)
+    for role in ("viewer", "operator"):
+        token = page.invite(role, role)
         async with guiding(page, token=token) as theirs:
             for what in ("calibrate", "check"):
                 await theirs.begin(what)
@@ -297,11 +299,6 @@ def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
             url = f"{page.away}/api/guide"
             async with page.client(token) as session, session.get(url) as answer:
                 assert answer.status == 403
-
-    before = page.refused().get("role", 0)
-    for role in ("viewer", "operator"):
-        token = page.invite(role, role)
-        run(lambda: story(token))  # noqa: B023
     assert page.refused()["role"] == before + 6
     assert commands(page) == []
 
@@ -309,79 +306,53 @@ def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
 INJECTED: list[dict[str, object]] = [
     {"begin": "run"},
     {"begin": "calibrate", "words": ["--write"]},
-    {"begin": "calibrate", "method": "tape --write"},
-    {"begin": "calibrate", "method": "--log=/etc/passwd"},
-    {"begin": "calibrate", "method": "positions", "positions": "--yes"},
-    {"begin": "calibrate", "method": "positions", "positions": "**"},
-    {"begin": "calibrate", "method": "positions"},
-    {"begin": "calibrate", "method": "tape", "positions": "sim/pose"},
-    {"begin": "calibrate", "port": "sim"},
-    {"begin": "check", "port": "/etc/passwd"},
-    {"begin": "check", "port": "sim --yes"},
-    {"begin": "check", "port": ""},
     {"begin": "check", "port": "--yes"},
-    {"begin": "check", "port": "sim", "method": "tape"},
-    {"begin": "check", "port": "x" * 300},
 ]
+"""The unit tests of `web/guide.py` have all other wishes that are refused."""
 
 
-def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
-    async def story() -> None:
-        async with guiding(page) as guided:
-            for wish in INJECTED:
-                await guided.ours.say(**wish)
-
-                def refused(said: Any) -> bool:
-                    return "refused" in said or "ended" in said.get("guide", {})
-
-                said = await guided.ours.find(refused)
-                if "guide" in said:
-                    assert said["guide"]["ended"] == 2, said
-                    assert said["guide"]["text"], said
-                else:
-                    await asyncio.sleep(1.0)  # a refusal is logged once a second
-            assert not any("question" in str(said) for said in guided.ours.heard)
-
-    run(story, 120.0)
+async def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
+    async with guiding(page) as guided:
+        for wish in INJECTED:
+            await guided.ours.say(**wish)
+            await guided.ours.find(lambda said: "refused" in said)
+            await asyncio.sleep(1.0)  # a refusal is sent once a second
+        assert not any("question" in str(said) for said in guided.ours.heard)
     assert commands(page) == []
 
 
-def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(tmp_path: Path) -> None:
+async def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(
+    tmp_path: Path,
+) -> None:
     with Program(acsard("sim"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
-
-        async def story() -> None:
+        with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
+            with Bus(holder.endpoint) as bus:
+                bus.linked()
             async with guiding(served) as guided:
                 await guided.begin("check", port=port)
                 end = await guided.ended()
-                assert end["ended"] == 75
-                assert end["meaning"] == "port, bus address or robot id in use"
-                assert f"process {holder.pid}" in end["text"]
-                assert "systemctl stop acsard" in end["text"]
+            assert end["ended"] == 75
+            assert end["meaning"] == "port, bus address or robot id in use"
+            assert f"process {holder.pid}" in end["text"]
+            assert "systemctl stop acsard" in end["text"]
             told = json.loads(await text(f"{served.here}/api/guide"))
             # A pty counts as an ordinary port: the advice for the simulator does not apply to it.
             assert (told["method"], told["advice"]) == ("", "")
 
-        with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
-            with Bus(holder.endpoint) as bus:
-                bus.linked()
-            run(story)
 
-
-def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(tmp_path: Path) -> None:
+async def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(
+    tmp_path: Path,
+) -> None:
     with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
-
-        async def story() -> None:
+        with Page(NoDaemon(tmp_path, port), tmp_path) as served:
             async with guiding(served) as guided:
                 await guided.begin("check", port=port)
                 await guided.lifted()
                 await guided.says(lambda said: "motor a" in said.get("doing", ""))
                 gone(guided, served)
             await beside(lambda: none_left(served))
-
-        with Page(NoDaemon(tmp_path, port), tmp_path) as served:
-            run(story)
         # The next check finds the wheels at rest, and the port free.
         with Program(acsard("mcu", "check", "--port", port, "--yes"), tmp_path) as again:
             again.says("PASS    motor a", 30.0)
