@@ -138,14 +138,11 @@ def test_the_command_runs_the_installed_package() -> None:
 # a child in the event loop
 
 
-def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
-    async def story() -> int | None:
-        with suppress(ValueError):
-            async with running(program("import time; time.sleep(100)")) as child:
-                raise ValueError
-        return child.returncode
-
-    assert asyncio.run(story()) == -signal.SIGKILL
+async def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
+    with suppress(ValueError):
+        async with running(program("import time; time.sleep(100)")) as child:
+            raise ValueError
+    assert child.returncode == -signal.SIGKILL
 
 
 def test_a_child_is_collected_although_nobody_reads_its_output() -> None:
@@ -161,26 +158,19 @@ def test_a_child_is_collected_although_nobody_reads_its_output() -> None:
     assert asyncio.run(asyncio.wait_for(story(), 20)) == -signal.SIGKILL
 
 
-def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> None:
-    async def story() -> tuple[bytes, int | None]:
-        async with running(program("print(1); raise SystemExit(3)"), stdout=PIPE) as child:
-            out, _ = await child.communicate()
-        return out, child.returncode
-
-    assert asyncio.run(story()) == (b"1\n", 3)
+async def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> None:
+    async with running(program("print(1); raise SystemExit(3)"), stdout=PIPE) as child:
+        out, _ = await child.communicate()
+    assert (out, child.returncode) == (b"1\n", 3)
 
 
-def test_a_child_gets_its_limits_and_one_that_has_ended_needs_none() -> None:
+async def test_a_child_gets_its_limits_and_one_that_has_ended_needs_none() -> None:
     limits = Limits(nice=19, memory_bytes=64 << 20)
-
-    async def story() -> bytes:
-        text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
-        async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
-            assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
-            _, said = await child.communicate(b"go")
-        return said
-
-    assert b"MemoryError" in asyncio.run(story())
+    text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
+    async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
+        assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
+        _, said = await child.communicate(b"go")
+    assert b"MemoryError" in said
     ended = subprocess.Popen(program(""))
     ended.wait(WAIT_S)
     module.limit(ended.pid, limits)

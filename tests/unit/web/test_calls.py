@@ -49,7 +49,7 @@ def calls_of(
     return Calls(known, ends, sees)
 
 
-def test_stops_beyond_the_room_wait_for_one_asked_after_them_and_none_is_said_to_be_done() -> None:
+async def test_stops_beyond_the_room_wait_for_one_that_is_asked_after_them() -> None:
     asked: Counter[str] = Counter()
     go = threading.Event()
 
@@ -62,19 +62,16 @@ def test_stops_beyond_the_room_wait_for_one_asked_after_them_and_none_is_said_to
         asked["later"] += 1
         return ServiceReply(False, "not stopped")
 
-    async def story() -> list[ServiceReply]:
-        stops = Stops()
-        first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
-        await asyncio.sleep(0)
-        later = [asyncio.create_task(stops.ask(refused)) for _ in range(100)]
-        done, _ = await asyncio.wait(later, timeout=0.1)
-        assert not done
-        go.set()
-        async with asyncio.timeout(PATIENCE_S):
-            assert all(reply.success for reply in await asyncio.gather(*first))
-            return await asyncio.gather(*later)
-
-    assert asyncio.run(story()) == [ServiceReply(False, "not stopped")] * 100
+    stops = Stops()
+    first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
+    await asyncio.sleep(0)
+    later = [asyncio.create_task(stops.ask(refused)) for _ in range(100)]
+    done, _ = await asyncio.wait(later, timeout=0.1)
+    assert not done
+    go.set()
+    async with asyncio.timeout(PATIENCE_S):
+        assert all(reply.success for reply in await asyncio.gather(*first))
+        assert (await asyncio.gather(*later)) == [ServiceReply(False, "not stopped")] * 100
     assert asked == {"first": STOPS_AT_ONCE, "later": 1}
 
 
