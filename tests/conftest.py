@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import atexit
 import gc
 import inspect
@@ -17,6 +16,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
+
+from tests.each import run
 
 # There is no deadline, because a slow machine must not fail a property that holds. The examples are
 # the same in every run, so that luck never decides how a change is judged. `explore` looks for new
@@ -131,26 +132,13 @@ def _rank(item: pytest.Item) -> int:
     return 2 if unit.split("/")[-2] in LIVE else 3
 
 
-STORY_S = 60.0
-"""The longest time of a test that is a coroutine."""
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test that is a coroutine function in an event loop of its own."""
+    """Run a test that is a coroutine function."""
     test, names = pyfuncitem.obj, inspect.signature(pyfuncitem.obj).parameters
-
-    async def story() -> None:
-        async with asyncio.timeout(STORY_S):
-            await test(**{name: pyfuncitem.funcargs[name] for name in names})
-        # Closing the loop would cancel a task that still cleans up, for example one that ends a
-        # child process, and the child's pipes would outlive the loop.
-        ending = [task for task in asyncio.all_tasks() if task.cancelling()]
-        await asyncio.gather(*ending, return_exceptions=True)
-
     if not inspect.iscoroutinefunction(test):
         return None
-    asyncio.run(story())
+    run(test(**{name: pyfuncitem.funcargs[name] for name in names}))
     return True
 
 
