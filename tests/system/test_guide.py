@@ -51,7 +51,6 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
     tmp_path: Path,
 ) -> None:
     alone = NoDaemon(tmp_path)
-    found: list[Any] = []
     with Page(alone, tmp_path) as served:
         async with guiding(served) as guided:
             await guided.begin("check", port="sim")
@@ -72,7 +71,7 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
             end = await guided.ended()
             assert (end["ended"], end["meaning"]) == (1, "failure")  # it was another map
             heard = guided.ours.heard
-            found.extend(s["guide"]["finding"] for s in heard if "finding" in str(s))
+            found = [s["guide"]["finding"] for s in heard if "finding" in str(s)]
             told = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
             assert described.kinds(heard) >= told
     names = [one["name"] for one in found]

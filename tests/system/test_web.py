@@ -63,7 +63,6 @@ async def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bu
 async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_looked(
     daemon: Daemon, bus: Bus, tmp_path: Path
 ) -> None:
-    kept: list[Any] = []
     with Page(daemon, tmp_path) as page:
         async with hands(page) as ours:
             async with hands(page) as first:
@@ -76,8 +75,7 @@ async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebo
             await ours.drive(0.0)
             await asyncio.to_thread(bus.at_rest)
             async with hands(page) as later:
-                kept.append((await later.find(lambda said: "minute" in said))["minute"])
-    (minute,) = kept
+                minute = (await later.find(lambda said: "minute" in said))["minute"]
     assert max(minute["linear"]) > 0.25
     assert max(one or 0.0 for one in minute["wished_linear"]) == pytest.approx(0.3)
     assert minute["age"] == sorted(minute["age"], reverse=True)
@@ -137,13 +135,12 @@ async def test_all_that_it_says_is_described_and_nothing_that_is_described_is_ne
 async def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
     page: Page, bus: Bus
 ) -> None:
-    commands: list[Any] = []
     with bus.follow("cmd/teleop") as heard:
         async with hands(page) as ours:
             await ours.say(subscribe="state", rate=50)
             await ours.until_driving(0.3)
         bus.at_rest()
-        commands.extend(seen.value for seen in heard.seen)
+        commands = [seen.value for seen in heard.seen]
     assert [one for one in commands[-3:-1] if one["linear"]["x"] == 0] == []
     assert commands[-1]["linear"]["x"] == 0
 
