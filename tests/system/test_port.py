@@ -46,7 +46,7 @@ class Line(NamedTuple):
 
     def port(
         self,
-        tell: Callable[[Event], object] = lambda event: None,
+        tell: Callable[[Event], None] = lambda event: None,
         wake: Callable[[], None] = lambda: None,
         asleep: Asleep | None = None,
     ) -> SerialPort:

@@ -6,7 +6,7 @@ import queue
 import struct
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -534,6 +534,7 @@ TREES: dict[str, type[ZenohClient]] = {"bridge": BridgeHalf, "rmw": RmwClient}
 @pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
 def test_a_command_to_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) -> None:
     driven = fleet.one
+    drive: AbstractContextManager[object]
     if tree == "native":
         drive = driven.commanding(0.3)
     else:
