@@ -157,15 +157,6 @@ def test_zero_passes_always(guard: Guarded, mode: str, linked: bool) -> None:
     assert objection(guard, outputs(STOP, mode=mode, linked=linked, age_ms=None)) == ""
 
 
-def test_a_commanded_line_passes(guard: Guarded) -> None:
-    assert objection(guard, outputs(line(12.5, -8.75, 15.0, -10.25))) == ""
-
-
-def test_a_line_as_fast_as_the_last_one_sent_passes_without_a_command(guard: Guarded) -> None:
-    sent(guard, 12.5, -8.75, 15.0, -10.25)
-    assert objection(guard, coasting(line(12.5, -8.75, 15.0, -10.25))) == ""
-
-
 @pytest.mark.parametrize("trailing_comma", [True, False])
 def test_a_ramp_to_zero_passes_to_the_end(trailing_comma: bool) -> None:
     kinematics = Kinematics(DriveConfig())

@@ -20,10 +20,6 @@ def test_nobody_drives_when_nobody_commands() -> None:
     assert choice.wait == Wait("command")
 
 
-def test_without_sources_nobody_drives() -> None:
-    assert Bench().driver() == ""
-
-
 def test_a_command_is_followed_and_the_choice_names_its_source() -> None:
     bench = Bench(HIGH)
     assert bench.send(HIGH) == ""
@@ -136,16 +132,6 @@ def test_the_order_of_configuration_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
-def test_among_equals_the_first_to_come_keeps_the_robot(sources: tuple[Source, ...]) -> None:
-    bench = Bench(*sources)
-    for _ in range(50):
-        bench.send(LEFT)
-        assert bench.driver() == "left"
-        bench.wait(20).send(RIGHT)
-        assert bench.driver() == "left"
-
-
-@pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
 def test_among_equals_the_second_takes_over_when_the_first_is_silent_and_keeps_it(
     sources: tuple[Source, ...],
 ) -> None:
@@ -173,15 +159,6 @@ def test_among_equals_the_first_to_come_has_the_robot_back_after_a_higher_one(
         bench.wait(100).send(LEFT)
         bench.send(RIGHT)
     assert bench.driver() == "right"
-
-
-def test_a_lower_priority_never_keeps_the_robot_from_a_higher() -> None:
-    bench = Bench(LEFT, HIGH, RIGHT)
-    bench.send(LEFT)
-    assert bench.driver() == "left"
-    bench.send(RIGHT)
-    bench.send(HIGH)
-    assert bench.driver() == "high"
 
 
 # the senders of one source

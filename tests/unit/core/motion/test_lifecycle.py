@@ -487,14 +487,6 @@ def test_each_deactivate_has_a_new_number_and_the_last_is_the_one_that_is_report
     assert life.why == f"switched off by ann at {AT}:02 UTC; call srv/activate"
 
 
-def test_the_two_seconds_of_a_plain_activate_count_from_the_first_step() -> None:
-    life = Lifecycle(active=True, latches=Latches(inactive=OFF))
-    life.begin(Instant(ns(10.0), 0))
-    with pytest.raises(RefusedError, match=r"the daemon started 1\.5 s ago and the robot is still"):
-        activate(life, 11.5)
-    assert activate(life, 12.0)
-
-
 def test_an_activate_of_an_active_robot_changes_nothing_whatever_it_names() -> None:
     life = ready()
     before = life.latches

@@ -268,13 +268,6 @@ def test_requiring_neutral_forgets_every_command() -> None:
     assert bench.status(LOW).age_s is None
 
 
-def test_requiring_neutral_forgets_what_was_neutral() -> None:
-    bench = Bench(HIGH)
-    bench.arbiter.require_neutral()
-    bench.send(HIGH)
-    assert bench.driver() == ""
-
-
 def test_requiring_neutral_forgets_who_came_first() -> None:
     bench = Bench(LEFT, RIGHT)
     bench.send(RIGHT)
