@@ -503,28 +503,11 @@ def test_no_reason_outweighs_another_refusal() -> None:
 # the clock of a stamp
 
 
-@pytest.mark.parametrize("stamp_ns", [None, 5])
-def test_the_stamp_of_the_header_counts_before_that_of_the_arrival(stamp_ns: int | None) -> None:
-    got = command(stamped(1_700_000_000, 500_000_000), stamp_ns=stamp_ns)
-    assert got.stamp_ns == 1_700_000_000_500_000_000
-
-
-@pytest.mark.parametrize("stamp_ns", [None, 5])
-def test_a_header_stamp_of_zero_is_none(stamp_ns: int | None) -> None:
-    assert command(stamped(0), stamp_ns=stamp_ns).stamp_ns == stamp_ns
-    assert command(twist(), stamp_ns=stamp_ns).stamp_ns == stamp_ns
-
-
 def test_wheel_commands_are_stamped_the_same_way() -> None:
     body = joints(1.0, 1.0, 1.0, 1.0)
     header = {"header": {"stamp": {"sec": 9, "nanosec": 1}}}
     assert wheels(body | header, stamp_ns=5).stamp_ns == 9_000_000_001
     assert wheels(body, stamp_ns=5).stamp_ns == 5
-
-
-def test_the_clock_is_the_one_of_the_arrival_s_sender_else_of_the_key() -> None:
-    assert command(twist(), sender="z1").clock == public_name("z1")
-    assert command(twist(), sender="").clock == "native/app"
 
 
 def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
@@ -721,15 +704,6 @@ def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
     )
 
 
-def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
-    command = RECEIVER.command(by_ros("rmw", stamped(12, 34)))
-    assert (command.stamp_ns, command.clock) == (
-        12_000_000_034,
-        f"gid {public_name(GID.hex())}, header on rmw/cmd/nav",
-    )
-    assert RECEIVER.command(by_ros("rmw", stamped(0))).stamp_ns == SENT_NS
-
-
 @pytest.mark.parametrize(
     ("attachment", "reason"),
     [
@@ -746,12 +720,6 @@ def test_by_a_bridge_any_attachment_is_ignored() -> None:
     command = RECEIVER.command(by_ros("bridge", twist(), attachment=b"rqh" + bytes(17)))
     assert command.twist == Twist(0.5, 0.2)
     assert command.stamp_ns is None
-
-
-def test_by_a_bridge_the_clock_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
-    assert RECEIVER.command(by_ros("bridge", twist())).clock == "bridge/nav"
-    seen = RECEIVER.command(by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"))
-    assert (seen.stamp_ns, seen.clock) == (SENT_NS, f"bridge/{public_name('router')}")
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
@@ -802,22 +770,6 @@ def test_the_sender_over_rmw_is_the_publisher() -> None:
     assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).sender != name
 
 
-def test_the_sender_of_a_stamped_sample_is_the_session_that_stamped_it() -> None:
-    assert command(twist(), sender="z1", stamp_ns=5).sender == public_name("z1")
-    bridged = RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5))
-    assert bridged.sender == f"bridge/{public_name('z2')}"
-
-
-def test_the_sender_of_an_unstamped_sample_is_its_source_in_its_tree() -> None:
-    assert command(twist()).sender == wheels(joints(1.0, 1.0, 1.0, 1.0)).sender == "native/app"
-    assert RECEIVER.command(by_ros("bridge", twist())).sender == "bridge/nav"
-
-
-def test_a_header_s_stamp_changes_no_sender() -> None:
-    assert command(stamped(12)).sender == "native/app"
-    assert RECEIVER.command(by_ros("rmw", stamped(12))).sender == f"gid {public_name(GID.hex())}"
-
-
 def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> None:
     good = arrival(written(twist(), "json"), sender="z1", stamp_ns=5)
     assert sender(replace(good, payload=b"hello")) == RECEIVER.command(good).sender
@@ -840,40 +792,6 @@ def signed(**told: Any) -> bytes:
     return msgspec.msgpack.encode({"sender": "joystick/s3cret"} | told)
 
 
-def test_our_attachment_says_who_sent_it_when_and_as_which() -> None:
-    told = command(twist(), attachment=signed(stamp=9, sequence=3), sender="z1", stamp_ns=5)
-    assert (told.sender, told.clock, told.stamp_ns) == (JOYSTICK, JOYSTICK, 9)
-    assert (told.sequence, told.shared) == (3, False)
-
-
-def test_a_message_s_own_stamp_goes_before_our_attachment_s() -> None:
-    told = command(stamped(12), attachment=signed(stamp=9))
-    assert told.stamp_ns == 12_000_000_000
-    assert told.clock == f"{JOYSTICK}, header on native/cmd/app"
-    assert told.sender == JOYSTICK
-
-
-def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
-    assert command(twist(), attachment=signed(), sender="z1", stamp_ns=5).stamp_ns == 5
-    assert command(twist(), attachment=signed()).stamp_ns is None
-
-
-def test_an_attachment_that_is_not_ours_changes_nothing() -> None:
-    for attachment in (b"trace", b"{}", b"\x80", signed()[:-1]):
-        assert command(twist(), attachment=attachment).sender == "native/app"
-
-
-def test_many_may_look_like_one_by_a_bridge_or_by_their_key_alone() -> None:
-    assert RECEIVER.command(by_ros("bridge", twist())).shared
-    assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).shared
-    assert RECEIVER.command(by_ros("bridge", twist(), attachment=signed())).shared
-    assert command(twist()).shared
-    assert command(stamped(12)).shared
-    assert not command(twist(), sender="z2", stamp_ns=5).shared
-    assert command(twist(), stamp_ns=5).shared  # the stamp of a router
-    assert not command(twist(), attachment=signed()).shared
-
-
 @pytest.mark.parametrize(
     ("ahead_ns", "replaced"), [(0, False), (500_000_000, False), (500_000_001, True)]
 )
@@ -886,6 +804,73 @@ def test_a_stamp_that_zenoh_replaced_is_known_by_how_far_ahead_the_sender_s_own_
     assert told.stamp_ns == SENT_NS + ahead_ns
     assert not command(twist(), attachment=attachment).stamp_replaced
     assert not command(twist(), received_ns=SENT_NS).stamp_replaced
+
+
+GID_NAME = f"gid {public_name(GID.hex())}"
+Z1, ROUTER = public_name("z1"), public_name("router")
+
+
+def ours(body: dict[str, Any], **changes: Any) -> Arrival:
+    return arrival(written(body, "json"), **changes)
+
+
+IDENTITIES: dict[str, tuple[Arrival, str, str, int | None, bool]] = {
+    "a key alone": (ours(twist()), "native/app", "native/app", None, True),
+    "wheels": (
+        ours(joints(1.0, 1.0, 1.0, 1.0), key="wheel_cmd/app"), "native/app", "native/app", None,
+        True,
+    ),
+    "the stamp of a router": (ours(twist(), stamp_ns=5), "native/app", "native/app", 5, True),
+    "a session that stamps": (ours(twist(), sender="z1", stamp_ns=5), Z1, Z1, 5, False),
+    "a header": (ours(stamped(12)), "native/app", HEADER_S, 12 * 10**9, True),
+    "a header, stamped": (ours(stamped(12), stamp_ns=5), "native/app", HEADER_S, 12 * 10**9, True),
+    "a header of zero": (ours(stamped(0)), "native/app", "native/app", None, True),
+    "a header of 0, stamped": (ours(stamped(0), stamp_ns=5), "native/app", "native/app", 5, True),
+    "rmw": (by_ros("rmw", twist(), sender="router"), GID_NAME, GID_NAME, SENT_NS, False),
+    "rmw, a header": (
+        by_ros("rmw", stamped(12, 34)), GID_NAME, f"{GID_NAME}, header on rmw/cmd/nav",
+        12_000_000_034, False,
+    ),
+    "rmw, a header of zero": (by_ros("rmw", stamped(0)), GID_NAME, GID_NAME, SENT_NS, False),
+    "a bridge": (by_ros("bridge", twist()), "bridge/nav", "bridge/nav", None, True),
+    "a bridge that stamps": (
+        by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"), f"bridge/{ROUTER}",
+        f"bridge/{ROUTER}", SENT_NS, True,
+    ),
+    "a bridge, our attachment": (
+        by_ros("bridge", twist(), attachment=signed()), "bridge/nav", "bridge/nav", None, True,
+    ),
+    "our attachment": (
+        ours(twist(), attachment=signed(stamp=9, sequence=3), sender="z1", stamp_ns=5),
+        JOYSTICK, JOYSTICK, 9, False,
+    ),
+    "our attachment and a header": (
+        ours(stamped(12), attachment=signed(stamp=9)), JOYSTICK,
+        f"{JOYSTICK}, header on native/cmd/app", 12 * 10**9, False,
+    ),
+    "our attachment without a stamp": (
+        ours(twist(), attachment=signed()), JOYSTICK, JOYSTICK, None, False,
+    ),
+    **{
+        f"another attachment, {one!r}": (
+            ours(twist(), attachment=one), "native/app", "native/app", None, True,
+        )
+        for one in (b"trace", b"{}", b"\x80", signed()[:-1])
+    },
+}  # fmt: skip
+"""A sample with its sender, its clock, its stamp, and whether many may look like its sender."""
+
+
+@each("case", IDENTITIES)
+def test_a_sample_says_who_sent_it_by_which_clock_and_when(case: str) -> None:
+    came, *expected = IDENTITIES[case]
+    told = RECEIVER.command(came)
+    assert [told.sender, told.clock, told.stamp_ns, told.shared] == expected
+
+
+def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
+    told = command(twist(), attachment=signed(sequence=3), sender="z1", stamp_ns=5)
+    assert (told.stamp_ns, told.sequence) == (5, 3)
 
 
 # certificates
