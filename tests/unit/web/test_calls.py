@@ -192,24 +192,21 @@ async def test_stops_of_one_client_to_one_robot_share_the_next_one_and_none_is_l
     assert not merged._rests
 
 
-def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_ones() -> None:
-    async def story() -> None:
-        merged, sent = Merged(), 0
+async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_ones() -> None:
+    merged, sent = Merged(), 0
 
-        async def stop() -> ServiceReply:
-            nonlocal sent
-            sent += 1
-            return ServiceReply(True, "stopped")
+    async def stop() -> ServiceReply:
+        nonlocal sent
+        sent += 1
+        return ServiceReply(True, "stopped")
 
-        await merged.ask("viewer", stop)
-        # The event loop is late, so it runs the next stop and the end of the pause in one turn.
-        time.sleep(2 * MERGE_S)
-        for _ in range(2):
-            async with asyncio.timeout(PATIENCE_S):
-                assert (await asyncio.create_task(merged.ask("viewer", stop))).success
-        assert sent == 3
-
-    asyncio.run(story())
+    await merged.ask("viewer", stop)
+    # The event loop is late, so it runs the next stop and the end of the pause in one turn.
+    time.sleep(2 * MERGE_S)
+    for _ in range(2):
+        async with asyncio.timeout(PATIENCE_S):
+            assert (await asyncio.create_task(merged.ask("viewer", stop))).success
+    assert sent == 3
 
 
 async def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_stopped() -> (

@@ -6,9 +6,7 @@ import asyncio
 import gzip
 import os
 import sys
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -49,17 +47,6 @@ async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> Re
         while (told := found.ask(path, (stamp, 0))).report not in states:
             await asyncio.sleep(0.01)
     return told
-
-
-def run(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    async def whole() -> None:
-        await story()
-        # A drawing that was given up is ending its program. The end of the event loop would cancel
-        # that too, and the pipes of the program would outlive the loop.
-        ending = [task for task in asyncio.all_tasks() if task.cancelling()]
-        await asyncio.gather(*ending, return_exceptions=True)
-
-    asyncio.run(whole())
 
 
 async def test_it_is_begun_by_who_asks_and_there_when_it_is_done() -> None:
@@ -166,22 +153,17 @@ async def test_what_nobody_asks_for_any_more_is_given_up_and_its_process_ends(
     assert found.drawn("a.mcap") is None
 
 
-def test_who_opens_a_report_keeps_it_for_another_quarter_of_an_hour(
+async def test_who_opens_a_report_keeps_it_for_another_quarter_of_an_hour(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_ns = 0
     monkeypatch.setattr("acsard.web.recordings.clock.mono_ns", lambda: now_ns)
-
-    async def story() -> None:
-        nonlocal now_ns
-        found = drawn_by(DRAWS)
-        await become(found, A, "ready")
-        for _ in range(3):
-            now_ns += KEEP_NS - NS_PER_S
-            found.tidy()
-            assert found.drawn("a.mcap")
-        now_ns += KEEP_NS + NS_PER_S
+    found = drawn_by(DRAWS)
+    await become(found, A, "ready")
+    for _ in range(3):
+        now_ns += KEEP_NS - NS_PER_S
         found.tidy()
-        assert found.drawn("a.mcap") is None
-
-    run(story)
+        assert found.drawn("a.mcap")
+    now_ns += KEEP_NS + NS_PER_S
+    found.tidy()
+    assert found.drawn("a.mcap") is None
