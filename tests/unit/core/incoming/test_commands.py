@@ -1,4 +1,7 @@
-"""A sample becomes a command or is refused whole, and `DecodeError` is the only error."""
+"""A sample becomes a command or is refused whole, and `DecodeError` is the only error.
+
+It says who sent it, and its sender is bound to a certificate.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,25 @@ from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.config.settings import CommandsConfig, DriveConfig, JointsConfig
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, sender
+from acsard.core.incoming.commands import (
+    BOUND_NS,
+    MAX_BOUND,
+    MAX_COMMAND_BYTES,
+    Arrival,
+    Bindings,
+    Receiver,
+    caller_name,
+    sender,
+)
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.core.messages.schema import JointState, TwistStamped
 from acsard.core.messages.schema import Twist as TwistMessage
-from acsard.core.messages.signature import public_name
+from acsard.core.messages.signature import DIGITS, MAX_NAME, public_name
 from acsard.core.motion.arbiter import Arbiter
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import Attachment
@@ -906,3 +920,101 @@ def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> N
     assert receiver.command(bridged).sender == "bridge/app"
     for key in ("cmd/app", "cmd/app/anna", "cmd/app/ben"):
         assert receiver.command(arrival(written(twist(), "json"), key=key)).shared
+
+
+# senders bound to certificates
+
+
+def test_the_first_certificate_keeps_the_sender_for_as_long_as_it_speaks() -> None:
+    bindings = Bindings()
+    for at_ns in range(0, 5 * BOUND_NS, BOUND_NS // 2):
+        assert bindings.other("a", "anna", at_ns) is None
+        assert bindings.other("a", "ben", at_ns + 1) == "anna"
+        assert bindings.other("a", "", at_ns + 1) == "anna"
+    assert bindings.other("b", "ben", at_ns) is None
+
+
+def test_this_machine_is_a_place_like_a_certificate() -> None:
+    bindings = Bindings()
+    assert bindings.other("a", "", 0) is None
+    assert bindings.other("a", "anna", 1) == ""
+
+
+def test_refused_commands_do_not_lengthen_the_binding_and_after_a_silence_it_ends() -> None:
+    bindings = Bindings()
+    bindings.other("a", "anna", 0)
+    assert bindings.other("a", "ben", BOUND_NS) == "anna"
+    assert bindings.other("a", "ben", BOUND_NS + 1) is None
+    assert bindings.other("a", "anna", BOUND_NS + 2) == "ben"
+
+
+def test_a_flood_of_sender_ids_takes_no_memory_and_those_that_speak_stay_bound() -> None:
+    bindings = Bindings()
+    bindings.other("a", "anna", 0)
+    for number in range(4 * MAX_BOUND):
+        bindings.other(f"other {number}", "ben", number)
+        if number % 100 == 0:
+            assert bindings.other("a", "anna", number) is None
+    assert bindings.other("a", "ben", number) == "anna"
+    assert len(bindings._seen) <= MAX_BOUND
+
+
+# the name of a caller
+
+
+def signed_as(name: str) -> bytes:
+    return msgspec.json.encode({"sender": name})
+
+
+def test_a_native_call_has_the_name_it_gives() -> None:
+    for form in (msgspec.json, msgspec.msgpack):
+        signature = form.encode({"sender": "alice@laptop patrol/s3cret", "sequence": 7})
+        assert caller_name("native", signature) == "alice@laptop patrol/b8978a0526b85c8d (native)"
+
+
+@each(
+    "attachment",
+    [b"", b"joe", b"{}", b'{"sender": 7}', b'{"sender": "\xff"}', b"\x81", signed_as("")],
+)
+def test_who_gives_no_name_is_unnamed(attachment: bytes) -> None:
+    assert caller_name("native", attachment) == "unnamed (native)"
+
+
+def test_what_was_stamped_tells_the_session_that_stamped_it() -> None:
+    session = public_name("1f2e")
+    assert caller_name("native", b"", "1f2e") == f"unnamed (native, session {session})"
+
+
+def test_an_rmw_client_is_its_gid() -> None:
+    gid = bytes(range(16))
+    assert caller_name("rmw", bytes(17) + gid) == f"unnamed (rmw {gid.hex()})"
+
+
+def test_a_bridge_tells_nothing() -> None:
+    assert caller_name("bridge", b"rqh" + bytes(17)) == "unnamed (bridge)"
+
+
+@each(
+    ("name", "kept"),
+    [
+        ("mallory (rmw 00)", "mallory ?rmw 00?"),
+        ("a, b", "a? b"),
+        ("a\nACSARD_EVENT=stop", "a?ACSARD_EVENT?stop"),
+        ("\x1b[2J", "??2J"),
+        ("\u202elaptop", "?laptop"),
+        ("Jürgen", "Jürgen"),
+    ],
+)
+def test_a_name_cannot_pass_for_the_words_around_it(name: str, kept: str) -> None:
+    who = caller_name("native", signed_as(f"{name}/s3cret"))
+    assert who == f"{kept}/{public_name(f'{name}/s3cret')[-DIGITS:]} (native)"
+
+
+@given(st.binary(max_size=100) | st.text(max_size=100).map(signed_as))
+def test_any_attachment_makes_a_short_printable_name(attachment: bytes) -> None:
+    who = caller_name("native", attachment)
+    name = who.removesuffix(" (native)")
+    assert who == f"{name} (native)"
+    assert 1 <= len(name) <= MAX_NAME + 1 + DIGITS
+    assert name.isprintable()
+    assert not set(name) & set('(),="\n')
