@@ -27,6 +27,7 @@ from tests.system.harness import (
     environment,
     finish,
     free_endpoint,
+    running,
     until,
 )
 from tests.system.terminals import (
@@ -492,8 +493,7 @@ def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Pat
     with Program(acsard("sim", "--link", "mcu"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
         assert port == "mcu"
-        with Daemon(tmp_path, port) as daemon, Bus(daemon.endpoint) as bus:
-            bus.linked()
+        with running(tmp_path, port) as (daemon, bus):
             assert bus.get("info")["simulated"] is False
             with connect(daemon.endpoint) as robot:
                 begun = time.monotonic()

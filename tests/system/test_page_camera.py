@@ -21,7 +21,7 @@ from acsard.web.camera import SEND_S
 from tests.system.browser import NAME, Page
 from tests.system.camera_stream import Stream
 from tests.system.chromium import CHROMIUM, PHONE, browsing
-from tests.system.harness import Bus, Daemon, free_endpoint, resident_kb, until
+from tests.system.harness import Daemon, free_endpoint, resident_kb, running, until
 
 pytestmark = pytest.mark.slow
 
@@ -36,10 +36,8 @@ def filmed(tmp_path: Path) -> Iterator[Filmed]:
     stream = Stream()
     Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
     seen = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
-    with Daemon(tmp_path, config=seen) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, tmp_path) as server:
-            yield Filmed(stream, server)
+    with running(tmp_path, config=seen) as (daemon, _), Page(daemon, tmp_path) as server:
+        yield Filmed(stream, server)
     stream.close()
 
 

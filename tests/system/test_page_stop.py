@@ -11,7 +11,7 @@ import pytest
 from acsard.web.answers import INLINED, PAGE
 from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
-from tests.system.harness import Bus, Daemon, until
+from tests.system.harness import Bus, running, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -70,13 +70,11 @@ class Robot:
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     where = tmp_path_factory.mktemp("stop")
-    with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, where) as page, browsing() as browser:
-            browser.size(*PHONE)
-            browser.ask("Network.enable")
-            browser.ask("Network.setCacheDisabled", cacheDisabled=True)
-            yield Robot(bus, page, browser)
+    with running(where) as (daemon, bus), Page(daemon, where) as page, browsing() as browser:
+        browser.size(*PHONE)
+        browser.ask("Network.enable")
+        browser.ask("Network.setCacheDisabled", cacheDisabled=True)
+        yield Robot(bus, page, browser)
 
 
 @pytest.fixture
