@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -84,13 +85,21 @@ def impatient(robot: Robot) -> Iterator[Robot]:
     robot.browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
 
 
-@pytest.mark.parametrize("name", FILES)
+def half(names: Sequence[str], which: int) -> list[Any]:
+    """Leave one half of the files to the nightly job; halves 0 and 1 have each module in one."""
+    return [
+        pytest.param(name, marks=() if FILES.index(name) % 2 == which else pytest.mark.nightly)
+        for name in names
+    ]
+
+
+@pytest.mark.parametrize("name", half(FILES, 0))
 def test_stop_latches_as_soon_as_it_is_red_without_this_file(impatient: Robot, name: str) -> None:
     with impatient.without(name):
         until(lambda: impatient.mode == "stopped", 5.0, f"stopped without {name}")
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", half(MODULES, 1))
 def test_a_page_without_this_module_says_reload_and_its_stick_is_grey(
     robot: Robot, name: str
 ) -> None:

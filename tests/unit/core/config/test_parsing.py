@@ -584,10 +584,6 @@ def test_a_speed_the_wheels_cannot_reach_is_a_warning() -> None:
     assert "limits.wheel_speed = 40" in text
 
 
-def test_the_defaults_give_no_warning() -> None:
-    assert warnings(Config()) == []
-
-
 # random input
 
 NAMES = sorted({key.path.rpartition(".")[2] for key in KEYS} | {"id_", "x", "prot"})
@@ -676,11 +672,6 @@ def test_a_key_with_control_characters_is_still_one_printable_line(text: str) ->
 )
 def test_no_number_is_too_long_and_no_nesting_too_deep_to_be_a_line(text: bytes) -> None:
     assert len(problems_of(text)) == 1
-
-
-def test_leaving_this_machine_with_the_default_id_is_a_warning() -> None:
-    found = warnings(parse(b'[bus]\nlisten = ["tcp/0.0.0.0:7448"]\ninsecure = true'))
-    assert any("robot.id" in text for text in found)
 
 
 # names of certificates
