@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
-from tests.system.harness import Bus, Daemon, client_config, free_endpoint, until
+from tests.system.harness import Bus, Daemon, client_config, free_endpoint, running, until
 from tests.system.ros_clients import (
     EMPTY_REQUEST,
     GET,
@@ -123,11 +123,9 @@ def ground(
         return
     where = tmp_path_factory.mktemp("ground")
     with (
-        Daemon(where, config=QUICK) as daemon,
-        Bus(daemon.endpoint) as bus,
+        running(where, config=QUICK) as (daemon, bus),
         Sdk(daemon.endpoint, where) as sdk,
     ):
-        bus.linked()
         yield Ground(daemon, bus, sdk, commands, "")
 
 

@@ -32,6 +32,7 @@ from tests.system.harness import (
     environment,
     finish,
     free_endpoint,
+    running,
     until,
     write_config,
 )
@@ -96,11 +97,9 @@ async def test_all_that_it_says_is_described_and_nothing_that_is_described_is_ne
         "sim": {"faults": ["battery=80:600"]},
     }
     with (
-        Daemon(tmp_path, config=config) as daemon,
-        Bus(daemon.endpoint) as bus,
+        running(tmp_path, config=config) as (daemon, _),
         Page(daemon, tmp_path) as page,
     ):
-        bus.linked()
         async with hands(page) as ours:
             await ours.find(lambda said: "minute" in said)
             for key in KEYS:
