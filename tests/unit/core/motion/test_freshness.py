@@ -282,16 +282,6 @@ def test_delays_that_keep_falling_below_the_promptest_do_not_count() -> None:
     assert set(verdicts[1:]) == {"stale"}
 
 
-def test_a_clock_that_was_set_and_falls_silent_meanwhile_is_refused_for_the_whole_time_again() -> (
-    None
-):
-    clock = Clock()
-    assert set(clock.steadily(1000.0, 1400)) == {"stale"}
-    assert clock.sends(1000.0, after=2001) == "stale"
-    assert set(clock.steadily(1000.0, 1450)) == {"stale"}
-    assert "set" in clock.steadily(1000.0, 150)
-
-
 def test_a_clock_that_is_slewed_fast_is_followed() -> None:
     clock = Clock()
     assert {clock.sends(-4.0 * n) for n in range(500)} == {"fresh"}
