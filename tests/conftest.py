@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import inspect
 import os
 import shutil
 import signal
@@ -15,6 +16,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
+
+from tests.each import run
 
 # There is no deadline, because a slow machine must not fail a property that holds. The examples are
 # the same in every run, so that luck never decides how a change is judged. `explore` looks for new
@@ -127,6 +130,16 @@ def _rank(item: pytest.Item) -> int:
     if unit in ("loud", "systemd"):
         return 0 if unit == "loud" else 1
     return 2 if unit.split("/")[-2] in LIVE else 3
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine function."""
+    test, names = pyfuncitem.obj, inspect.signature(pyfuncitem.obj).parameters
+    if not inspect.iscoroutinefunction(test):
+        return None
+    run(test(**{name: pyfuncitem.funcargs[name] for name in names}))
+    return True
 
 
 def pytest_collection_finish() -> None:

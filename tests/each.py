@@ -6,10 +6,28 @@ names its parameter set.
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
+
+STORY_S = 60.0
+"""The longest time of a test that is a coroutine."""
+
+
+def run(test: Coroutine[Any, Any, None]) -> None:
+    """Run a test that is a coroutine in an event loop of its own."""
+
+    async def story() -> None:
+        async with asyncio.timeout(STORY_S):
+            await test
+        # Closing the loop would cancel a task that still cleans up, for example one that ends a
+        # child process, and the child's pipes would outlive the loop.
+        ending = [task for task in asyncio.all_tasks() if task.cancelling()]
+        await asyncio.gather(*ending, return_exceptions=True)
+
+    asyncio.run(story())
 
 
 def each(names: str | tuple[str, ...], sets: Iterable[Any]) -> Callable[[Any], Any]:
@@ -21,14 +39,16 @@ def each(names: str | tuple[str, ...], sets: Iterable[Any]) -> Callable[[Any], A
     every = list(sets)
     given = (names,) if isinstance(names, str) else names
 
-    def decorate(test: Callable[..., None]) -> Callable[..., None]:
+    def decorate(test: Callable[..., Any]) -> Callable[..., None]:
         @functools.wraps(test)
         def all_of_them(**fixtures: Any) -> None:
             assert every, "there is nothing to test"
             for values in every:
                 chosen = dict(zip(given, (values,) if len(given) == 1 else values, strict=True))
                 try:
-                    test(**fixtures, **chosen)
+                    story = test(**fixtures, **chosen)
+                    if inspect.iscoroutine(story):
+                        run(story)
                 except BaseException as error:
                     error.add_note(f"with {chosen}")
                     raise

@@ -69,7 +69,8 @@ def test_every_command_that_something_runs_is_on_a_page() -> None:
 
 def named_tests(file: str) -> set[str]:
     tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
+    functions = {node.name for node in tree.body if isinstance(node, kinds)}
     return {name for name in functions if name.startswith("test_")}
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.system.harness import Bus, Daemon
+from tests.system.harness import Bus, Daemon, running
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(900)]
 
@@ -64,15 +64,13 @@ def cost(where: Path, records: bool) -> Cost:
     """Return the cost of one daemon that drives."""
     where.mkdir(parents=True)
     words = ["--record", str(where / "record")] if records else []
-    with Daemon(where, words=words) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with bus.commanding(0.3):
-            time.sleep(SETTLES_S)
-            used, written, began = processor_s(daemon.pid), size(where), time.monotonic()
-            time.sleep(SPAN_S)
-            used, span = processor_s(daemon.pid) - used, time.monotonic() - began
-            written = size(where) - written
-            state = bus.state()
+    with running(where, words=words) as (daemon, bus), bus.commanding(0.3):
+        time.sleep(SETTLES_S)
+        used, written, began = processor_s(daemon.pid), size(where), time.monotonic()
+        time.sleep(SPAN_S)
+        used, span = processor_s(daemon.pid) - used, time.monotonic() - began
+        written = size(where) - written
+        state = bus.state()
     late = state["latencies"]["period_lateness"]["since_start"]
     missed = int(state["counters"].get("missed_periods", 0))
     return Cost(100 * used / span, late["p50"], late["p99"], missed, written / span)
@@ -135,8 +133,7 @@ def test_recording_takes_little_of_the_processor(tmp_path: Path) -> None:
 
 def test_an_idle_day_is_less_than_90_mb(tmp_path: Path) -> None:
     words = ["--record", str(tmp_path / "record")]
-    with Daemon(tmp_path, words=words) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, words=words):
         time.sleep(SETTLES_S)
         written, began = size(tmp_path), time.monotonic()
         time.sleep(REST_S)

@@ -18,7 +18,7 @@ from tests.system.harness import Bus, Daemon, Peer, until
 from tests.system.hosts import Hosts, two_hosts
 
 if TYPE_CHECKING:
-    from tests.system.dds import NewDomain
+    from tests.system.dds import DdsDomain, NewDomain
 
 _before = cores.idle()
 """When the current test began."""
@@ -67,10 +67,22 @@ def dds(kept: Path) -> NewDomain:
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A daemon on the simulator for tests that do not change it."""
-    with Daemon(tmp_path_factory.mktemp("shared")) as daemon:
+def shared(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Daemon]:
+    """A daemon on the simulator for all tests of a module, with its `CONFIG` if it has one."""
+    config = getattr(request.module, "CONFIG", None)
+    with Daemon(tmp_path_factory.mktemp("shared"), config=config) as daemon:
         yield daemon
+
+
+@pytest.fixture(scope="module")
+def domain(
+    shared: Daemon, dds: NewDomain, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[DdsDomain]:
+    """A DDS domain with a bridge to `shared`."""
+    with dds(tmp_path_factory.mktemp("dds")) as domain, domain.bridge(shared.endpoint):
+        yield domain
 
 
 @pytest.fixture

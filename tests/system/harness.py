@@ -936,3 +936,13 @@ def alive_at(endpoint: str, daemon: Program) -> Iterator[Any]:
         yield session.liveliness().declare_subscriber(
             "acsard/acsar/alive", zenoh.handlers.FifoChannel(10), history=True
         )
+
+
+@contextmanager
+def running(
+    where: Path, port: Path | str = "sim", config: Tables | None = None, **how: Any
+) -> Iterator[tuple[Daemon, Bus]]:
+    """A daemon whose link is up, and a plain client of it."""
+    with Daemon(where, port, config, **how) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        yield daemon, bus

@@ -15,7 +15,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,9 +33,10 @@ from tests.system.harness import (
     Tables,
     client_config,
     environment,
+    free_endpoint,
     until,
 )
-from tests.system.strangers import words
+from tests.system.strangers import ROUTER, words
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ODOMETRY, TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -570,6 +571,52 @@ def session_at(endpoint: str) -> Iterator[zenoh.Session]:
     """A plain client."""
     with zenoh.open(client_config(endpoint)) as session:
         yield session
+
+
+# two robots
+
+
+@contextmanager
+def two_robots(where: Path, *names: str) -> Iterator[tuple[str, dict[str, Daemon]]]:
+    """Start a router, and there a robot that is a peer and one that is a client.
+
+    Yields the router's address and the daemons by name. The robots' ids are their namespaces too.
+    """
+    meeting, daemons = free_endpoint(), {}
+    with Program(words(ROUTER, meeting), where) as router, ExitStack() as stack:
+        router.says("routing")
+        for name, mode in zip(names, ("peer", "client"), strict=True):
+            config: Tables = {
+                "robot": {"id": name},
+                "bus": {"connect": [meeting], "mode": mode},
+                "ros": {"namespace": name},
+                **QUICK,
+            }
+            robot = Daemon(where, config=config, name=name, ready=False)
+            daemons[name] = stack.enter_context(robot)
+        for daemon in daemons.values():
+            daemon.says("bus ")
+        yield meeting, daemons
+
+
+@contextmanager
+def over_router(meeting: str, name: str) -> Iterator[Bus]:
+    """A client of one of the robots, with the link up."""
+    with Bus(meeting, name) as bus:
+        until(lambda: bus.ask("info"), 5.0, f"{name} over the router")
+        bus.linked()
+        yield bus
+
+
+@contextmanager
+def undisturbed(robot: Bus) -> Iterator[None]:
+    """Check that this robot, which stands, receives no command and does not move meanwhile."""
+    before = robot.at_rest()
+    yield
+    after = robot.state()
+    assert changes(before, after) == {}
+    for key in ("x", "mode", "wheels"):
+        assert after[key] == before[key], key
 
 
 # the results of commands

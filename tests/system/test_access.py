@@ -485,19 +485,3 @@ def test_a_link_ends_with_its_certificate(robot: Robot, tmp_path: Path) -> None:
         assert list(session.get(f"{ME}/info", timeout=1.0))
         until(lambda: not list(session.info.routers_zid()), 6.0, "the link ends")
         assert time.monotonic() > end - 1.1  # certificates count whole seconds
-
-
-def test_the_matrix_is_as_written(robot: Robot) -> None:
-    cells = right = 0
-    print(f"\n{'':10}{' '.join(f'{who:>10}' for who in IDENTITIES)}  (! is not as written)")
-    for verb in VERBS:
-        for row in ROWS[verb]:
-            marks = []
-            for who in IDENTITIES:
-                done = robot.outcome(who, verb)[row.label]
-                good = done == (who in row.who)
-                cells, right = cells + 1, right + good
-                marks.append(f"{'yes' if done else '-'}{'' if good else ' !'}")
-            print(f"{verb:10}{' '.join(f'{mark:>10}' for mark in marks)}  {row.label}")
-    print(f"{right} of {cells} cells as written")
-    assert right == cells

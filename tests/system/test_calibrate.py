@@ -6,8 +6,6 @@ import cmath
 import json
 import math
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -41,9 +39,10 @@ from tests.system.harness import (
     Program,
     acsard,
     free_endpoint,
+    running,
     until,
 )  # fmt: skip
-from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.terminals import Terminal, at_terminal
 from tests.system.typed import typed
 from tests.unit.calibration.guided.played import Player
 from tests.unit.calibration.robots import Robot
@@ -80,19 +79,9 @@ RIDES_S = 120.0
 @contextmanager
 def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard calibrate` at a terminal of its own, with its results in a pipe."""
-    given = ["calibrate", "--config", str(daemon.config), *words]
-    with (
-        Terminal() as terminal,
-        Program(
-            [sys.executable, "-c", ON_TERMINAL, *given],
-            daemon.config.parent,
-            stdin=terminal.slave,
-            stderr=terminal.slave,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        ) as program,
-    ):
-        yield terminal, program
+    given = ("calibrate", "--config", str(daemon.config), *words)
+    with at_terminal(daemon.config.parent, *given, piped="stdout") as found:
+        yield found
 
 
 def asks(terminal: Terminal, program: Program, words: str, times: int, within: float) -> None:
@@ -157,8 +146,7 @@ def found_with_a_gyro(daemon: Daemon, bus: Bus) -> dict[str, Any]:
 
 @pytest.mark.soak
 def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_path: Path) -> None:
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=SKIDDING) as (daemon, bus):
         found = tried(bus, lambda: found_with_a_gyro(daemon, bus))
         written = parse(daemon.config.read_bytes())
     print(f"turn: {found['turn_error_before']:.0f} -> {found['turn_error_after']:.1f} deg in 360")
@@ -247,8 +235,7 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
     def reads(words: str) -> str:
         return "" if STARTS in words else measured(bus, words)
 
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=SKIDDING) as (daemon, bus):
         said = goes_through(daemon, bus, "tape", reads)
         written = parse(daemon.config.read_bytes()).drive
     assert "error of a turn of 360 deg" in said
@@ -295,8 +282,7 @@ def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
     tmp_path: Path, way: str
 ) -> None:
     config = SKIDDING | {"control": {"rate": 10.0}}  # the link, which a busy machine may interrupt
-    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=config) as (daemon, bus):
         said = tried(bus, lambda: goes_through(daemon, bus, way, Beside(bus).reads))
         written = parse(daemon.config.read_bytes()).drive
     print(f"{way}: {written.wheel_separation_multiplier} {written.left_wheel_radius_multiplier} "
@@ -309,8 +295,7 @@ def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
 
 @pytest.mark.slow
 def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path: Path) -> None:
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=SKIDDING) as (daemon, bus):
         before = daemon.config.read_bytes()
         with calibrating(daemon, "--write") as (terminal, program):
             begun(terminal, program, bus)
@@ -333,40 +318,41 @@ def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path
     ["stop", *(pytest.param(how, marks=pytest.mark.nightly) for how in ("teleop", "interrupt"))],
 )
 def test_whatever_else_ends_a_leg_is_reported(tmp_path: Path, how: str) -> None:
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with calibrating(daemon) as (terminal, program):
-            begun(terminal, program, bus)
-            if how == "stop":
-                bus.put("stop", {})
-                why = "the robot is stopped"
-            elif how == "teleop":
-                with bus.commanding(0.0, source="teleop"):
-                    assert program.ended(5.0) == 1
-                why = "teleop commands the robot now"
-            else:
-                terminal.press("\x03")
-                why = "the operator ended the drive"
-            assert program.ended(5.0) == 1
-            until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
-            assert why in terminal.screen
+    with (
+        running(tmp_path, config=SKIDDING) as (daemon, bus),
+        calibrating(daemon) as (terminal, program),
+    ):
+        begun(terminal, program, bus)
+        if how == "stop":
+            bus.put("stop", {})
+            why = "the robot is stopped"
+        elif how == "teleop":
+            with bus.commanding(0.0, source="teleop"):
+                assert program.ended(5.0) == 1
+            why = "teleop commands the robot now"
+        else:
+            terminal.press("\x03")
+            why = "the operator ended the drive"
+        assert program.ended(5.0) == 1
+        until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
+        assert why in terminal.screen
 
 
 @pytest.mark.slow
 def test_a_daemon_that_dies_ends_the_leg(tmp_path: Path) -> None:
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with calibrating(daemon) as (terminal, program):
-            begun(terminal, program, bus)
-            daemon.process.kill()
-            assert program.ended(10.0) == 1
-            assert "nothing received from the daemon" in terminal.screen
+    with (
+        running(tmp_path, config=SKIDDING) as (daemon, bus),
+        calibrating(daemon) as (terminal, program),
+    ):
+        begun(terminal, program, bus)
+        daemon.process.kill()
+        assert program.ended(10.0) == 1
+        assert "nothing received from the daemon" in terminal.screen
 
 
 @pytest.mark.soak
 def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path: Path) -> None:
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=SKIDDING) as (daemon, _):
         words = ["calibrate", "--positions", "sim/pose", "--yes", "--json"]
         with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
             assert program.ended(RIDES_S) == 0, program.stderr
@@ -382,8 +368,7 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
 def test_on_the_simulator_a_process_that_stands_still_does_not_end_the_drive(
     tmp_path: Path, stalled: str
 ) -> None:
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=SKIDDING) as (daemon, bus):
         words = ["calibrate", "--positions", "sim/pose", "--yes", "--json"]
         with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
             until(lambda: (bus.state()["linear"] or 0.0) > 0.25, 20.0, "the first leg moves")
@@ -465,8 +450,7 @@ def test_a_state_that_cannot_be_read_ends_the_leg_and_says_so(free: str) -> None
 
 
 def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None:
-    with Daemon(tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, port=peer.path) as (daemon, _):
         for words, why in ((["--yes"], "this robot is real"), ([], "terminal")):
             ended = typed("calibrate", *words, "--config", str(daemon.config))
             assert ended.code == 2

@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import pty
-import re
-import select
 import signal
-import struct
-import subprocess
-import sys
-import termios
-import threading
 import time
 import tomllib
 from collections.abc import Iterator
@@ -36,7 +27,17 @@ from tests.system.harness import (
     environment,
     finish,
     free_endpoint,
+    running,
     until,
+)
+from tests.system.terminals import (
+    ON_TERMINAL,
+    SCREEN,
+    UNDER_A_SHELL,
+    Terminal,
+    at_terminal,
+    held,
+    screens,
 )
 from tests.system.typed import typed
 
@@ -161,14 +162,6 @@ def test_check_json_is_the_configuration_in_force(shared: Daemon, bus: Bus) -> N
     assert json.loads(ended.out) == bus.get("config")
 
 
-def test_check_of_a_bad_file_ends_with_78_and_the_mend(tmp_path: Path) -> None:
-    (tmp_path / "acsard.toml").write_text("[drive]\nwheel_radus = 0.05\n")
-    ended = typed("check", "--config", str(tmp_path / "acsard.toml"))
-    assert (ended.code, ended.out) == (78, "")
-    assert "drive.wheel_radus" in ended.err
-    assert "did you mean wheel_radius?" in ended.err
-
-
 # echo and hz
 
 
@@ -260,14 +253,6 @@ def test_who_waits_sees_that_the_daemon_has_ended(tmp_path: Path) -> None:
         daemon.signal(signal.SIGINT)
         daemon.ended(5.0)
         until(lambda: seen() == Presence(linked=False, here=False), 5.0, "that it is gone")
-
-
-def test_echo_of_no_messages_prints_none(shared: Daemon) -> None:
-    words = acsard("echo", "odom", "-n", "0", "--config", str(shared.config))
-    with Program(words, shared.config.parent) as echo:
-        code = echo.ended(3.0)
-        assert code in (0, 2)
-    assert echo.stdout == ""
 
 
 def test_echo_into_a_reader_that_leaves_ends_quietly(shared: Daemon, bus: Bus) -> None:
@@ -508,8 +493,7 @@ def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Pat
     with Program(acsard("sim", "--link", "mcu"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
         assert port == "mcu"
-        with Daemon(tmp_path, port) as daemon, Bus(daemon.endpoint) as bus:
-            bus.linked()
+        with running(tmp_path, port) as (daemon, bus):
             assert bus.get("info")["simulated"] is False
             with connect(daemon.endpoint) as robot:
                 begun = time.monotonic()
@@ -561,155 +545,30 @@ def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
     assert bus.state()["mode"] != "stopped"
 
 
-@each("verb", ["echo", "hz"])
-def test_what_is_only_asked_is_not_waited_for(shared: Daemon, verb: str) -> None:
-    ended = tool(shared, verb, "info")
-    assert (ended.code, ended.out) == (2, "")
-    assert "acsard get info" in ended.err
-
-
 # drive
-
-
-ON_TERMINAL = """\
-import fcntl, os, sys, termios
-fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-os.execv(sys.executable, [sys.executable, "-m", "acsard", *sys.argv[1:]])
-"""
-"""Makes its standard input the controlling terminal, as a shell does, so that ^C is a signal."""
-
-
-UNDER_A_SHELL = """\
-import fcntl, os, sys, termios
-fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-words = ["bash", "--norc", "-ic", '"$@"; true', "bash", sys.executable, "-m", "acsard"]
-os.execvp("bash", [*words, *sys.argv[1:]])
-"""
-"""The same program, as a job of a shell."""
-
-
-class Terminal:
-    """A person at a terminal: presses keys and reads the screen."""
-
-    def __init__(self) -> None:
-        self.screen = ""
-        self._master, self.slave = pty.openpty()
-        self._open = True
-        self._leave = threading.Event()
-        self._reader = threading.Thread(target=self._read)
-
-    def __enter__(self) -> Terminal:
-        self._reader.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._open:
-            self.close()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._open = False
-        self._leave.set()
-        self._reader.join()
-        os.close(self._master)
-        os.close(self.slave)
-
-    def press(self, key: str) -> None:
-        os.write(self._master, key.encode())
-
-    @property
-    def settings(self) -> list[object]:
-        return list(termios.tcgetattr(self.slave))
-
-    def _read(self) -> None:
-        while not self._leave.is_set():
-            if select.select([self._master], [], [], 0.05)[0]:
-                self.screen += os.read(self._master, 4096).decode(errors="replace")
-
-
-@contextmanager
-def held(terminal: Terminal, key: str) -> Iterator[None]:
-    """Hold a key down: it repeats 20 times a second until it is released."""
-    released = threading.Event()
-
-    def repeat() -> None:
-        while not released.wait(0.05):
-            terminal.press(key)
-
-    thread = threading.Thread(target=repeat)
-    thread.start()
-    try:
-        yield
-    finally:
-        released.set()
-        thread.join()
-
-
-@contextmanager
-def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard drive` at a terminal of its own until it shows the robot."""
-    with Terminal() as terminal:
-        drive = ["drive", "--config", str(shared.config), *words]
-        command = [sys.executable, "-c", ON_TERMINAL, *drive]
-        with Program(
-            command,
-            shared.config.parent,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            until(
-                lambda: WAITS in terminal.screen,
-                10.0,
-                "the robot's state on the screen",
-            )
-            yield terminal, program
-
-
-@contextmanager
-def at_terminal(
-    daemon: Daemon, verb: str, term: str, columns: int = 80, how: str = ON_TERMINAL
-) -> Iterator[tuple[Terminal, Program]]:
-    """Run a verb at a terminal of its own, of that kind and width, with 24 lines."""
-    with Terminal() as terminal:
-        size = struct.pack("HHHH", 24, columns, 0, 0)
-        fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
-        env = environment(TERM=term)
-        for name in ("COLUMNS", "LINES", "NO_COLOR"):
-            env.pop(name, None)
-        with Program(
-            [sys.executable, "-c", how, verb, "--config", str(daemon.config)],
-            daemon.config.parent,
-            env,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            yield terminal, program
 
 
 @contextmanager
 def without_a_screen(
-    shared: Daemon, how: str = ON_TERMINAL, columns: int = 80
+    shared: Daemon, *words: str, how: str = ON_TERMINAL, columns: int = 80
 ) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard drive` at a terminal that cannot show a screen."""
-    with at_terminal(shared, "drive", "dumb", columns, how) as (terminal, program):
+    drive = ("drive", "--config", str(shared.config), *words)
+    with at_terminal(shared.config.parent, *drive, how=how, columns=columns, piped="stderr") as (
+        terminal,
+        program,
+    ):
         until(lambda: WAITS in terminal.screen, 10.0, "the robot's state")
         yield terminal, program
-
-
-def screens(terminal: Terminal) -> list[str]:
-    """Return all whole screens so far, without their colours."""
-    frames = terminal.screen.split("\x1b[H")[1:-1]
-    return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame) for frame in frames]
 
 
 @contextmanager
 def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard drive` at a terminal of that width that can show a screen."""
-    with at_terminal(shared, "drive", "xterm-256color", columns) as (terminal, program):
+    drive = ("drive", "--config", str(shared.config))
+    with at_terminal(
+        shared.config.parent, *drive, term=SCREEN, columns=columns, piped="stderr"
+    ) as (terminal, program):
         until(lambda: [one for one in screens(terminal) if WAITS in one], 10.0, "it")
         yield terminal, program
 
@@ -792,7 +651,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
     # its zeros.
     with (
         bus.follow("cmd/teleop") as commands,
-        without_a_screen(shared, UNDER_A_SHELL) as (terminal, _),
+        without_a_screen(shared, how=UNDER_A_SHELL) as (terminal, _),
     ):
         with held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
@@ -803,7 +662,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
 
 
 def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
             assert bus.state()["source"] == "teleop"
@@ -817,7 +676,7 @@ def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: B
 
 
 def test_space_stops_at_once(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, _):
+    with without_a_screen(shared) as (terminal, _):
         with held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
         pressed = time.monotonic()
@@ -834,7 +693,7 @@ ARROWS = {"A": (1, 0), "B": (-1, 0), "D": (0, 1), "C": (0, -1)}
 
 @pytest.mark.slow
 def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, _):
+    with without_a_screen(shared) as (terminal, _):
         for letter, (ahead, left) in ARROWS.items():
             with held(terminal, f"\x1b[{letter}"):
 
@@ -850,7 +709,7 @@ def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> N
 
 @pytest.mark.slow
 def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared, "--linear", "0.2") as (terminal, _):
+    with without_a_screen(shared, "--linear", "0.2") as (terminal, _):
         terminal.press("w")
         until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")
         with held(terminal, "i"):
@@ -861,7 +720,7 @@ def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) ->
 def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was(
     shared: Daemon, bus: Bus
 ) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         during = terminal.settings
         with held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.3, 5.0, "moving")
@@ -884,7 +743,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
 def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
     shared: Daemon, bus: Bus, number: signal.Signals
 ) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         program.signal(number)
         program.ended(3.0)
         after = terminal.settings
@@ -894,7 +753,7 @@ def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
 
 @pytest.mark.slow
 def test_a_stranger_s_put_on_every_key_does_not_end_a_drive(shared: Daemon, bus: Bus) -> None:
-    with teleop(shared) as (terminal, program):
+    with without_a_screen(shared) as (terminal, program):
         for payload in (b"\xff", b"{}", b""):
             bus.session.put("acsard/**", payload)
         with held(terminal, "i"):

@@ -22,7 +22,8 @@ from tests.system.harness import (
     free_endpoint,
     until,
 )
-from tests.system.test_cli import ON_TERMINAL, VERBS, WAITS, Terminal
+from tests.system.terminals import ON_TERMINAL, Terminal
+from tests.system.test_cli import VERBS, WAITS
 
 SGR = re.compile(r"\x1b\[([\d;:]*)m")
 

@@ -29,7 +29,7 @@ from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
 from acsard.core.values import ROLES
 from acsard.host.errors import Exit
-from tests.system.browser import Page, hands, run
+from tests.system.browser import Page, hands
 from tests.system.fleet_router import (
     ITS_NAME,
     ROBOT_FILE,
@@ -547,19 +547,16 @@ def test_the_tools_join_as_the_manual_says(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("name", ["viewer", "robot1"])
-def test_a_page_by_tls_has_a_card_of_its_own_robot_and_says_why_of_no_other(
+async def test_a_page_by_tls_has_a_card_of_its_own_robot_and_says_why_of_no_other(
     fleet: Fleet, name: str, tmp_path: Path
 ) -> None:
-    async def story() -> None:
+    by_tls = ["--connect", fleet.endpoint, "--tls", str(fleet.where / name), "--id", "robot1"]
+    with Page(fleet.daemons[0], tmp_path, *by_tls) as page:
         async with hands(page) as ours:
             await ours.say(subscribe="fleet")
             seen = await ours.find(lambda said: said.get("fleet"))
             assert [(one["robot"], one["mode"]) for one in seen["fleet"]] == [("robot1", "ready")]
             assert "passes only exact keys" in seen["note"]
-
-    by_tls = ["--connect", fleet.endpoint, "--tls", str(fleet.where / name), "--id", "robot1"]
-    with Page(fleet.daemons[0], tmp_path, *by_tls) as page:
-        run(story)
 
 
 # the files

@@ -47,13 +47,11 @@ async def drives(guided: Guided, standing: Bus) -> None:
     assert standing.state()["source"] == "app"
 
 
-def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_written_file(
+async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_written_file(
     tmp_path: Path,
 ) -> None:
     alone = NoDaemon(tmp_path)
-    found: list[Any] = []
-
-    async def story() -> None:
+    with Page(alone, tmp_path) as served:
         async with guiding(served) as guided:
             await guided.begin("check", port="sim")
             subject = await guided.says(lambda said: "subject" in said)
@@ -73,12 +71,9 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
             end = await guided.ended()
             assert (end["ended"], end["meaning"]) == (1, "failure")  # it was another map
             heard = guided.ours.heard
-            found.extend(s["guide"]["finding"] for s in heard if "finding" in str(s))
+            found = [s["guide"]["finding"] for s in heard if "finding" in str(s)]
             told = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
             assert described.kinds(heard) >= told
-
-    with Page(alone, tmp_path) as served:
-        run(story)
     names = [one["name"] for one in found]
     assert names[0] == "baud rate"
     assert "watchdog" in names
@@ -87,41 +82,39 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
     assert written["port"] == "sim"
 
 
-def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, standing: Bus) -> None:
+async def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(
+    page: Page, standing: Bus
+) -> None:
     before = page.refused()
-
-    async def story() -> None:
-        async with guiding(page) as guided, guiding(page) as other:
-            await drives(guided, standing)
-            about = await other.says(lambda said: said.get("running"))
-            assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
-            # Only one runs at a time, and no other client answers, presses or ends it.
-            await other.begin("check", port="sim")
-            refused = await other.ours.find(lambda said: said.get("refused") == "begin")
-            assert "calibrate already runs (here)" in refused["reason"]
-            await other.ours.say(press="key")
-            await other.ours.say(press="leave")
-            for number in range(100):
-                await other.ours.say(reply=number, value=1)
-            # Answers without a question do nothing, however many come.
-            for number in range(150):
-                await guided.ours.say(reply=number, value="start")
-            refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
-            assert "is not open" in refused["reason"]
-            assert (standing.state()["linear"] or 0.0) > 0.25
-            pressed = time.monotonic()
-            await guided.ours.say(press="key")
-            await beside(standing.at_rest)
-            took = time.monotonic() - pressed
-            # 0.3 m/s at 1 m/s2, and a part of the way.
-            assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
-            end = await guided.ended()
-            assert (end["ended"], end["meaning"]) == (1, "failure")
-            assert "a key was pressed" in end["text"]
-            assert "writes no file" in end["text"]
-            await other.says(lambda said: said.get("running") == "")
-
-    run(story)
+    async with guiding(page) as guided, guiding(page) as other:
+        await drives(guided, standing)
+        about = await other.says(lambda said: said.get("running"))
+        assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
+        # Only one runs at a time, and no other client answers, presses or ends it.
+        await other.begin("check", port="sim")
+        refused = await other.ours.find(lambda said: said.get("refused") == "begin")
+        assert "calibrate already runs (here)" in refused["reason"]
+        await other.ours.say(press="key")
+        await other.ours.say(press="leave")
+        for number in range(100):
+            await other.ours.say(reply=number, value=1)
+        # Answers without a question do nothing, however many come.
+        for number in range(150):
+            await guided.ours.say(reply=number, value="start")
+        refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
+        assert "is not open" in refused["reason"]
+        assert (standing.state()["linear"] or 0.0) > 0.25
+        pressed = time.monotonic()
+        await guided.ours.say(press="key")
+        await beside(standing.at_rest)
+        took = time.monotonic() - pressed
+        # 0.3 m/s at 1 m/s2, and a part of the way.
+        assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
+        end = await guided.ended()
+        assert (end["ended"], end["meaning"]) == (1, "failure")
+        assert "a key was pressed" in end["text"]
+        assert "writes no file" in end["text"]
+        await other.says(lambda said: said.get("running") == "")
     none_left(page)
     assert page.refused()["malformed"] >= before.get("malformed", 0) + 200
 
@@ -136,59 +129,50 @@ def left(guided: Guided, page: Page) -> None:
 
 
 @pytest.mark.parametrize("how", [gone, left])
-def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
+async def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
     page: Page, standing: Bus, how: Callable[[Guided, Page], None]
 ) -> None:
-    async def story() -> None:
-        async with guiding(page) as guided:
-            await drives(guided, standing)
-            (child,) = commands(page)
-            begun = time.monotonic()
-            how(guided, page)
-            await beside(standing.at_rest)
-            took = time.monotonic() - begun
-            assert took < 0.3 + 0.4 + lost(begun, begun + took)
-            await beside(lambda: none_left(page))
-            assert not Path(f"/proc/{child}").exists()
-        async with guiding(page) as another:
-            await another.begin("calibrate", method="tape")
-            await another.asks("How far apart")
-
-    run(story)
+    async with guiding(page) as guided:
+        await drives(guided, standing)
+        (child,) = commands(page)
+        begun = time.monotonic()
+        how(guided, page)
+        await beside(standing.at_rest)
+        took = time.monotonic() - begun
+        assert took < 0.3 + 0.4 + lost(begun, begun + took)
+        await beside(lambda: none_left(page))
+        assert not Path(f"/proc/{child}").exists()
+    async with guiding(page) as another:
+        await another.begin("calibrate", method="tape")
+        await another.asks("How far apart")
     none_left(page)
 
 
-def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> None:
-    async def story() -> None:
-        async with guiding(page, pings=False) as guided:
-            for _ in range(4):  # a busy machine may end it before
-                await guided.begin("calibrate", method="umbmark")
-                await guided.answer(await guided.asks("How wide"), 300)
-                await guided.starts()
-                end = await guided.ended()
-                if "no sign of life" in end["text"]:
-                    break
-                await guided.says(lambda said: said.get("running") == "")
-            assert f"no sign of life of the operator arrived for {HEARD_S:g} s" in end["text"]
-            await beside(standing.at_rest)
-
-    run(story)
+async def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> None:
+    async with guiding(page, pings=False) as guided:
+        for _ in range(4):  # a busy machine may end it before
+            await guided.begin("calibrate", method="umbmark")
+            await guided.answer(await guided.asks("How wide"), 300)
+            await guided.starts()
+            end = await guided.ended()
+            if "no sign of life" in end["text"]:
+                break
+            await guided.says(lambda said: said.get("running") == "")
+        assert f"no sign of life of the operator arrived for {HEARD_S:g} s" in end["text"]
+        await beside(standing.at_rest)
 
 
-def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
+async def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
     page: Page, standing: Bus
 ) -> None:
-    async def story() -> None:
-        async with guiding(page) as guided:
-            await drives(guided, standing)
-            silent = time.monotonic()
-            guided.falls_silent()
-            await beside(standing.at_rest)
-            took = time.monotonic() - silent
-            # Add the ramp: 0.3 m/s at 1 m/s2, and a part of the way.
-            assert took < 1.0 + 0.3 + 0.4 + lost(silent, silent + took)
-
-    run(story)
+    async with guiding(page) as guided:
+        await drives(guided, standing)
+        silent = time.monotonic()
+        guided.falls_silent()
+        await beside(standing.at_rest)
+        took = time.monotonic() - silent
+        # Add the ramp: 0.3 m/s at 1 m/s2, and a part of the way.
+        assert took < 1.0 + 0.3 + 0.4 + lost(silent, silent + took)
     none_left(page)
 
 
@@ -197,7 +181,7 @@ LINES = 10
 
 
 @pytest.mark.network
-def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_second(
+async def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_second(
     hosts: Hosts, tmp_path: Path
 ) -> None:
     """No connection closes, and no program gets an error."""
@@ -219,23 +203,6 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
                 return one.at
         return None
 
-    async def story() -> None:
-        async with guiding(served, token=token) as guided:
-            await guided.begin("calibrate", method="umbmark")
-            await guided.answer(await guided.asks("How wide"), 300)
-            begun = time.monotonic()
-            await guided.starts("1. Place the")
-            speed = await beside(lambda: until(lambda: fast(begun), 10.0, "the leg moves"))
-            hosts.cut()
-            gone = time.monotonic()
-            try:
-                at = await beside(lambda: until(lambda: slower(gone, speed), 5.0, "it slows down"))
-            finally:
-                hosts.heal()
-            print(f"slower after {at - gone:.2f} s")
-            # The page's server, the command and the daemon. A busy machine delays each.
-            assert at - gone < 1.0 + 3 * lost(gone, at)
-
     with (
         FarPeer(tmp_path) as peer,
         on(hosts.robot, Daemon(tmp_path, peer.path)) as daemon,
@@ -243,7 +210,23 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
     ):
         token = served.invite("maintainer", "phone")
         with inside(hosts.stranger):
-            run(story)
+            async with guiding(served, token=token) as guided:
+                await guided.begin("calibrate", method="umbmark")
+                await guided.answer(await guided.asks("How wide"), 300)
+                begun = time.monotonic()
+                await guided.starts("1. Place the")
+                speed = await beside(lambda: until(lambda: fast(begun), 10.0, "the leg moves"))
+                hosts.cut()
+                gone = time.monotonic()
+                try:
+                    at = await beside(
+                        lambda: until(lambda: slower(gone, speed), 5.0, "it slows down")
+                    )
+                finally:
+                    hosts.heal()
+                print(f"slower after {at - gone:.2f} s")
+                # The page's server, the command and the daemon. A busy machine delays each.
+                assert at - gone < 1.0 + 3 * lost(gone, at)
         none_left(served)
 
 
@@ -303,8 +286,10 @@ def ended(pid: int) -> bool:
 
 
 @pytest.mark.network
-def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
-    async def story(token: str) -> None:
+async def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
+    before = page.refused().get("role", 0)
+    for role in ("viewer", "operator"):
+        token = page.invite(role, role)
         async with guiding(page, token=token) as theirs:
             for what in ("calibrate", "check"):
                 await theirs.begin(what)
@@ -313,11 +298,6 @@ def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
             url = f"{page.away}/api/guide"
             async with page.client(token) as session, session.get(url) as answer:
                 assert answer.status == 403
-
-    before = page.refused().get("role", 0)
-    for role in ("viewer", "operator"):
-        token = page.invite(role, role)
-        run(lambda: story(token))  # noqa: B023
     assert page.refused()["role"] == before + 6
     assert commands(page) == []
 
@@ -325,92 +305,69 @@ def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
 INJECTED: list[dict[str, object]] = [
     {"begin": "run"},
     {"begin": "calibrate", "words": ["--write"]},
-    {"begin": "calibrate", "method": "tape --write"},
-    {"begin": "calibrate", "method": "--log=/etc/passwd"},
-    {"begin": "calibrate", "method": "positions", "positions": "--yes"},
-    {"begin": "calibrate", "method": "positions", "positions": "**"},
-    {"begin": "calibrate", "method": "positions"},
-    {"begin": "calibrate", "method": "tape", "positions": "sim/pose"},
-    {"begin": "calibrate", "port": "sim"},
-    {"begin": "check", "port": "/etc/passwd"},
-    {"begin": "check", "port": "sim --yes"},
-    {"begin": "check", "port": ""},
     {"begin": "check", "port": "--yes"},
-    {"begin": "check", "port": "sim", "method": "tape"},
-    {"begin": "check", "port": "x" * 300},
 ]
+"""The unit tests of `web/guide.py` have all other wishes that are refused."""
 
 
-def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
-    async def story() -> None:
-        async with guiding(page) as guided:
-            for wish in INJECTED:
-                await guided.ours.say(**wish)
-
-                def refused(said: Any) -> bool:
-                    return "refused" in said or "ended" in said.get("guide", {})
-
-                said = await guided.ours.find(refused)
-                if "guide" in said:
-                    assert said["guide"]["ended"] == 2, said
-                    assert said["guide"]["text"], said
-                else:
-                    await asyncio.sleep(1.0)  # a refusal is logged once a second
-            assert not any("question" in str(said) for said in guided.ours.heard)
-
-    run(story, 120.0)
+async def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
+    async with guiding(page) as guided:
+        for wish in INJECTED:
+            await guided.ours.say(**wish)
+            said = await guided.ours.find(
+                lambda said: "refused" in said or "ended" in said.get("guide", {})
+            )
+            if "guide" in said:
+                assert said["guide"]["ended"] == 2, said
+                assert said["guide"]["text"], said
+            else:
+                await asyncio.sleep(1.0)  # a refusal is sent once a second
+        assert not any("question" in str(said) for said in guided.ours.heard)
     assert commands(page) == []
 
 
-def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(tmp_path: Path) -> None:
+async def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(
+    tmp_path: Path,
+) -> None:
     with Program(acsard("sim"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
-
-        async def story() -> None:
+        with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
+            with Bus(holder.endpoint) as bus:
+                bus.linked()
             async with guiding(served) as guided:
                 await guided.begin("check", port=port)
                 end = await guided.ended()
-                assert end["ended"] == 75
-                assert end["meaning"] == "port, bus address or robot id in use"
-                assert f"process {holder.pid}" in end["text"]
-                assert "systemctl stop acsard" in end["text"]
+            assert end["ended"] == 75
+            assert end["meaning"] == "port, bus address or robot id in use"
+            assert f"process {holder.pid}" in end["text"]
+            assert "systemctl stop acsard" in end["text"]
             told = json.loads(await text(f"{served.here}/api/guide"))
             # A pty counts as an ordinary port: the advice for the simulator does not apply to it.
             assert (told["method"], told["advice"]) == ("", "")
 
-        with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
-            with Bus(holder.endpoint) as bus:
-                bus.linked()
-            run(story)
 
-
-def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(tmp_path: Path) -> None:
+async def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(
+    tmp_path: Path,
+) -> None:
     with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
-
-        async def story() -> None:
+        with Page(NoDaemon(tmp_path, port), tmp_path) as served:
             async with guiding(served) as guided:
                 await guided.begin("check", port=port)
                 await guided.lifted()
                 await guided.says(lambda said: "motor a" in said.get("doing", ""))
                 gone(guided, served)
             await beside(lambda: none_left(served))
-
-        with Page(NoDaemon(tmp_path, port), tmp_path) as served:
-            run(story)
         # The next check finds the wheels at rest, and the port free.
         with Program(acsard("mcu", "check", "--port", port, "--yes"), tmp_path) as again:
             again.says("PASS    motor a", 30.0)
 
 
-def test_what_may_be_begun_is_listed(page: Page) -> None:
-    async def story() -> None:
-        told = json.loads(await text(f"{page.here}/api/guide"))
-        assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
-        assert told["method"] == "positions"
-        assert "no floor to lay a tape on" in told["advice"]
-        assert told["ports"][0]["port"] == "sim"  # the configured port
-        if len(told["ports"]) == 1:
-            assert "systemctl stop acsard" in told["note"]
-
-    run(story)
+async def test_what_may_be_begun_is_listed(page: Page) -> None:
+    told = json.loads(await text(f"{page.here}/api/guide"))
+    assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
+    assert told["method"] == "positions"
+    assert "no floor to lay a tape on" in told["advice"]
+    assert told["ports"][0]["port"] == "sim"  # the configured port
+    if len(told["ports"]) == 1:
+        assert "systemctl stop acsard" in told["note"]

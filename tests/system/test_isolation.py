@@ -386,7 +386,13 @@ HOLD_UP = ("publish", "querier", "as_peer")
 """Attacks that zenohd's rules do not cover: they block the router, and a person must restart it."""
 
 
-@pytest.mark.parametrize("form", [form for form in FORMS if form not in HOLD_UP])
+@pytest.mark.parametrize(
+    "form",
+    [
+        pytest.param(form, marks=pytest.mark.nightly if n % 2 else ())
+        for n, form in enumerate(form for form in FORMS if form not in HOLD_UP)
+    ],
+)
 def test_who_attacks_zenohd_does_not_disturb_the_robot_behind_it(tmp_path: Path, form: str) -> None:
     with fleet(tmp_path, zenohd) as network:
         figures = Robot(tmp_path, network).attacked(form, "viewer", 1.5)

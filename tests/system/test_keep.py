@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 import tomllib
 from pathlib import Path
@@ -58,19 +57,6 @@ def test_without_keep_the_file_stays(tmp_path: Path) -> None:
         before = daemon.config.read_bytes()
         assert "; until the next start; a lowered limit" in tool(daemon, KEY, VALUE).out
         assert daemon.config.read_bytes() == before
-
-
-def test_a_read_only_file_is_refused_and_nothing_is_set(tmp_path: Path) -> None:
-    with Daemon(tmp_path, config={"limits": {"linear_speed": 0.5}}) as daemon:
-        daemon.config.chmod(0o444)
-        ended = tool(daemon, KEY, VALUE, "--keep")
-        assert ended.code == 1
-        assert ended.out.startswith("nothing is set: ")
-        assert "it is read-only for the daemon" in ended.out
-        with connect(daemon.endpoint) as robot:
-            assert robot.get("config")["limits"]["linear_speed"] == 0.5
-        told = json.loads(tool(daemon, KEY, VALUE, "--keep", "--json").out)
-        assert told["success"] is False
 
 
 def test_keep_and_a_refusal_of_the_robot(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from acsard.daemon.late_causes import BECAUSE
-from tests.system.harness import ROOT, Bus, Daemon, acsard, environment, until
+from tests.system.harness import ROOT, Daemon, acsard, environment, running, until
 from tests.system.late_plants import CGROUP, hog, spin
 
 pytestmark = [
@@ -80,8 +80,7 @@ def causes_of(daemon: Daemon) -> list[dict[str, Any]]:
 def test_log_recording_report_and_doctor_name_the_same_cause(tmp_path: Path) -> None:
     directory = tmp_path / "record"
     config = {"record": {"directory": str(directory)}}
-    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=config) as (daemon, _):
         os.sched_setaffinity(daemon.pid, {0})
         with hog() as busy:
             spin(busy, 5)

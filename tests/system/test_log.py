@@ -18,7 +18,7 @@ from acsard import __version__
 from acsard.client import connect
 from acsard.core.messages.signature import public_name
 from acsard.host.own_identity import own_name
-from tests.system.harness import Bus, Daemon, Peer, acsard, until
+from tests.system.harness import Bus, Daemon, Peer, acsard, running, until
 
 
 def by(daemon: Daemon, name: str) -> list[Any]:
@@ -57,8 +57,7 @@ def test_a_put_on_stop_is_reported_with_the_session_that_stamped_it(
 
 @pytest.mark.slow
 def test_a_day_is_described_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) -> None:
-    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, peer.path) as (daemon, bus):
         bus.put("cmd/app", {"linear": {"x": 0.5}})
         with bus.commanding(0.5):
             until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")

@@ -6,8 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
@@ -30,12 +28,11 @@ from tests.system.harness import (
     Tables,
     acsard,
     client_config,
-    environment,
     free_endpoint,
     until,
 )
 from tests.system.identities import free_tls_endpoint
-from tests.system.test_cli import ON_TERMINAL, Terminal, screens
+from tests.system.terminals import SCREEN, at_terminal, screens
 from tests.system.typed import typed
 
 pytestmark = pytest.mark.slow  # each starts two robots and a router
@@ -200,32 +197,25 @@ def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> No
         "ros": {"namespace": "robot3"},
         "bus": {"listen": [free_endpoint()], "connect": [robots.endpoint]},
     }
-    env = environment(TERM="xterm-256color", COLUMNS="100", LINES="24")
-    words = [sys.executable, "-c", ON_TERMINAL, "fleet", "--connect", robots.endpoint]
-    with Terminal() as terminal:
-        with Program(
-            words,
-            robots.where,
-            env,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
+    words = ("fleet", "--connect", robots.endpoint)
+    with at_terminal(robots.where, *words, term=SCREEN, columns=100, piped="stderr") as (
+        terminal,
+        program,
+    ):
 
-            def line(of: str, says: str) -> bool:
-                rows = screens(terminal)[-1:]
-                return any(re.search(rf"{of} .*{says}", row) for row in "".join(rows).splitlines())
+        def line(of: str, says: str) -> bool:
+            rows = screens(terminal)[-1:]
+            return any(re.search(rf"{of} .*{says}", row) for row in "".join(rows).splitlines())
 
-            waits = "waiting for a command"
-            until(lambda: line(ONE, waits) and line(TWO, waits), 10.0, "both")
-            with Daemon(robots.where, config=third, name="third") as daemon:
-                until(lambda: line("robot3", "ready"), 10.0, "the third, that came later")
-                daemon.signal(signal.SIGKILL)
-                until(lambda: line("robot3", "GONE, was: "), 10.0, "that it has gone")
-            terminal.press("q")
-            assert program.ended(3.0) == 0
-        assert "Traceback" not in terminal.screen + program.stderr
+        waits = "waiting for a command"
+        until(lambda: line(ONE, waits) and line(TWO, waits), 10.0, "both")
+        with Daemon(robots.where, config=third, name="third") as daemon:
+            until(lambda: line("robot3", "ready"), 10.0, "the third, that came later")
+            daemon.signal(signal.SIGKILL)
+            until(lambda: line("robot3", "GONE, was: "), 10.0, "that it has gone")
+        terminal.press("q")
+        assert program.ended(3.0) == 0
+    assert "Traceback" not in terminal.screen + program.stderr
 
 
 def test_fleet_marks_the_robot_whose_settings_differ_from_its_file(robots: Robots) -> None:

@@ -11,16 +11,14 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.system.harness import ROOT, Bus, Daemon, Program, acsard, finish, until
-from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.terminals import Terminal, at_terminal
 from tests.system.typed import typed
 
 CHECK_S = 200.0
@@ -70,22 +68,6 @@ def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s() -> None:
     assert "--wheels-are-lifted" in ended.err
 
 
-@contextmanager
-def at_terminal(where: Path, *words: str) -> Iterator[tuple[Terminal, Program]]:
-    """Run a check at a terminal of its own."""
-    with Terminal() as terminal:
-        command = [sys.executable, "-c", ON_TERMINAL, "mcu", "check", *words]
-        with Program(
-            command,
-            where,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=terminal.slave,
-            start_new_session=True,
-        ) as program:
-            yield terminal, program
-
-
 def answer(terminal: Terminal, question: str, word: str, times: int, within: float) -> None:
     """Wait until the question has been asked this number of times, then type."""
     until(lambda: terminal.screen.count(question) >= times, within, f"{question}, {times} times")
@@ -101,7 +83,7 @@ def answer_all(terminal: Terminal, wheels: tuple[str, ...], ways: str, within: f
 
 def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path) -> None:
     (tmp_path / "acsard.toml").write_text("# mine\n")
-    with at_terminal(tmp_path, "--port", "sim", "--write") as (terminal, program):
+    with at_terminal(tmp_path, "mcu", "check", "--port", "sim", "--write") as (terminal, program):
         answer(terminal, 'then type "lifted"', "yes", 1, 10.0)
         until(lambda: "please type lifted" in terminal.screen, 5.0, "what to type")
         answer_all(terminal, ("fl", "fr", "rl", "rr"), "ffbf", 10.0)
@@ -115,7 +97,7 @@ def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path
 
 
 def test_ctrl_c_at_the_first_question_ends_it_with_130(tmp_path: Path) -> None:
-    with at_terminal(tmp_path, "--port", "sim") as (terminal, program):
+    with at_terminal(tmp_path, "mcu", "check", "--port", "sim") as (terminal, program):
         until(lambda: "lifted" in terminal.screen, 10.0, "the question")
         terminal.press("\x03")
         assert program.ended(5.0) == 130
@@ -246,7 +228,7 @@ def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: sign
 def test_a_person_at_a_real_port_is_asked_after_each_motor(tmp_path: Path) -> None:
     with Program(acsard("sim", "--fault", "reversed_wheel=c"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
-        with at_terminal(tmp_path, "--port", port) as (terminal, program):
+        with at_terminal(tmp_path, "mcu", "check", "--port", port) as (terminal, program):
             answer_all(terminal, WHEELS, "ffbf", 20.0)
             assert program.ended(CHECK_S) == 1
             until(lambda: 'rear_left = "-c"' in terminal.screen, 5.0, "the line")

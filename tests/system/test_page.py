@@ -23,7 +23,7 @@ from acsard.web.limits import CONNECTIONS_HERE
 from acsard.web.viewer import HEARTBEAT_S
 from tests import pictures
 from tests.pictures import VIEWS
-from tests.system.browser import NAME, TRUSTING, Hands, Page, answer, hands, run
+from tests.system.browser import NAME, TRUSTING, Hands, Page, answer, hands
 from tests.system.bystander import lost
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import Bus, Daemon, Peer, Program, until
@@ -769,15 +769,9 @@ def test_somebody_else_who_drives_is_named(page: Phone) -> None:
     page.shows("hint", "Hold and push to drive")
 
 
-def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(page: Phone) -> None:
-    async def story() -> None:
-        async with hands(page.server) as other:
-            await other.say(subscribe="state", rate=10)
-            await other.until_driving(0.1)
-            driving = asyncio.create_task(other.hold(0.1, 30.0))
-            await asyncio.to_thread(look)
-            driving.cancel()
-
+async def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(
+    page: Phone,
+) -> None:
     def look() -> None:
         browser = page.browser
         page.shows("reason", "Driven by another page on the robot itself.")
@@ -790,7 +784,12 @@ def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(page: 
         browser.touch("End")
         assert held is False
 
-    run(story)
+    async with hands(page.server) as other:
+        await other.say(subscribe="state", rate=10)
+        await other.until_driving(0.1)
+        driving = asyncio.create_task(other.hold(0.1, 30.0))
+        await asyncio.to_thread(look)
+        driving.cancel()
 
 
 @alone
@@ -898,17 +897,7 @@ def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) 
 
 
 @alone
-def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            left = CONNECTIONS_HERE
-            while left:  # the page that was open here disappears once the server notices
-                with suppress(aiohttp.WSServerHandshakeError):
-                    other = await stack.enter_async_context(hands(page.server))
-                    reading.append(asyncio.create_task(read(other)))
-                    left -= 1
-            await asyncio.to_thread(look)
-
+async def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
     reading: list[asyncio.Task[None]] = []
 
     async def read(other: Hands) -> None:
@@ -923,7 +912,14 @@ def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
         until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops all the same")
 
     page.browser.open("about:blank")
-    run(story)
+    async with AsyncExitStack() as stack:
+        left = CONNECTIONS_HERE
+        while left:  # the page that was open here disappears once the server notices
+            with suppress(aiohttp.WSServerHandshakeError):
+                other = await stack.enter_async_context(hands(page.server))
+                reading.append(asyncio.create_task(read(other)))
+                left -= 1
+        await asyncio.to_thread(look)
 
 
 def test_nothing_stands_in_the_way_of_a_screen_reader(page: Phone) -> None:

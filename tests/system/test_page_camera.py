@@ -21,7 +21,7 @@ from acsard.web.camera import SEND_S
 from tests.system.browser import NAME, Page
 from tests.system.camera_stream import Stream
 from tests.system.chromium import CHROMIUM, PHONE, browsing
-from tests.system.harness import Bus, Daemon, free_endpoint, resident_kb, until
+from tests.system.harness import Daemon, free_endpoint, resident_kb, running, until
 
 pytestmark = pytest.mark.slow
 
@@ -36,10 +36,8 @@ def filmed(tmp_path: Path) -> Iterator[Filmed]:
     stream = Stream()
     Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
     seen = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
-    with Daemon(tmp_path, config=seen) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, tmp_path) as server:
-            yield Filmed(stream, server)
+    with running(tmp_path, config=seen) as (daemon, _), Page(daemon, tmp_path) as server:
+        yield Filmed(stream, server)
     stream.close()
 
 
@@ -91,56 +89,48 @@ def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_withi
         until(lambda: filmed.stream.clients == 0, 15.0, "nobody reads the stream any more")
 
 
-def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None:
+async def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None:
     server = filmed.server
-
-    async def story() -> None:
-        async with server.client() as stranger, stranger.get(f"{server.away}/api/camera") as told:
-            assert told.status == 401
-        async with server.client(server.invite("viewer", "tv")) as viewer:
-            url = f"{server.away}/api/camera"
-            first = await got(viewer, url)
-            assert first.status == 200
-            assert first.content_type == "image/jpeg"
-            assert int(first.headers["Age-Ms"]) < 1000
-            second = await got(viewer, url, first.headers["ETag"])
-            assert second.status == 200
-            assert second.headers["ETag"] != first.headers["ETag"]
-            filmed.stream.silent = True
-            await asyncio.sleep(0.3)
-            last = await got(viewer, url)
-            assert (await got(viewer, url, last.headers["ETag"])).status == 304
-            server.vault.revoke("tv")
-            assert (await got(viewer, url)).status == 401
-
-    asyncio.run(story())
+    async with server.client() as stranger, stranger.get(f"{server.away}/api/camera") as told:
+        assert told.status == 401
+    async with server.client(server.invite("viewer", "tv")) as viewer:
+        url = f"{server.away}/api/camera"
+        first = await got(viewer, url)
+        assert first.status == 200
+        assert first.content_type == "image/jpeg"
+        assert int(first.headers["Age-Ms"]) < 1000
+        second = await got(viewer, url, first.headers["ETag"])
+        assert second.status == 200
+        assert second.headers["ETag"] != first.headers["ETag"]
+        filmed.stream.silent = True
+        await asyncio.sleep(0.3)
+        last = await got(viewer, url)
+        assert (await got(viewer, url, last.headers["ETag"])).status == 304
+        server.vault.revoke("tv")
+        assert (await got(viewer, url)).status == 401
 
 
-def test_pictures_that_nobody_reads_cost_little_memory(filmed: Filmed) -> None:
+async def test_pictures_that_nobody_reads_cost_little_memory(filmed: Filmed) -> None:
     """Before, each of these clients cost a picture of its own."""
     server, pid = filmed.server, filmed.server.pid
     filmed.stream.more = 900_000
-
-    async def story() -> None:
-        url, clients = f"{server.away}/api/camera", []
-        tokens = [server.invite("viewer", f"tv{n}") for n in range(12)]
-        async with AsyncExitStack() as stack:
-            for token in tokens * 2:
-                clients.append(await stack.enter_async_context(server.client(token)))
-            assert (await got(clients[0], url)).status == 200
-            before = resident_kb(pid)
-            # The streams of these answers are opened and not read.
-            asking = [asyncio.create_task(one.get(url)) for one in clients]
-            most, end = 0, time.monotonic() + 3.0
-            while time.monotonic() < end:
-                most = max(most, resident_kb(pid) - before)
-                await asyncio.sleep(0.05)
-            for task in asking:
-                task.cancel()
-            print(f"\n24 clients that read no pictures: {most / 1000:+.1f} MB")
-            assert most < 15_000
-
-    asyncio.run(story())
+    url, clients = f"{server.away}/api/camera", []
+    tokens = [server.invite("viewer", f"tv{n}") for n in range(12)]
+    async with AsyncExitStack() as stack:
+        for token in tokens * 2:
+            clients.append(await stack.enter_async_context(server.client(token)))
+        assert (await got(clients[0], url)).status == 200
+        before = resident_kb(pid)
+        # The streams of these answers are opened and not read.
+        asking = [asyncio.create_task(one.get(url)) for one in clients]
+        most, end = 0, time.monotonic() + 3.0
+        while time.monotonic() < end:
+            most = max(most, resident_kb(pid) - before)
+            await asyncio.sleep(0.05)
+        for task in asking:
+            task.cancel()
+        print(f"\n24 clients that read no pictures: {most / 1000:+.1f} MB")
+        assert most < 15_000
 
 
 @pytest.mark.nightly
@@ -165,20 +155,16 @@ def test_a_client_that_reads_a_picture_too_slowly_is_cut_off(filmed: Filmed) -> 
     assert "Traceback" not in server.stderr
 
 
-def test_three_pages_with_one_token_get_pictures_and_answers(filmed: Filmed) -> None:
+async def test_three_pages_with_one_token_get_pictures_and_answers(filmed: Filmed) -> None:
     server = filmed.server
+    async with server.client(server.invite("viewer", "tv")) as viewer:
 
-    async def story() -> None:
-        async with server.client(server.invite("viewer", "tv")) as viewer:
+        async def page() -> None:
+            for _ in range(100):
+                assert (await got(viewer, f"{server.away}/api/camera")).status == 200
 
-            async def page() -> None:
-                for _ in range(100):
-                    assert (await got(viewer, f"{server.away}/api/camera")).status == 200
-
-            await asyncio.gather(page(), page(), page())
-            assert (await got(viewer, f"{server.away}/api/state")).status == 200
-
-    asyncio.run(story())
+        await asyncio.gather(page(), page(), page())
+        assert (await got(viewer, f"{server.away}/api/state")).status == 200
 
 
 async def got(viewer: aiohttp.ClientSession, url: str, tag: str = "") -> Any:

@@ -17,7 +17,7 @@ from tests.system.browser import Page
 from tests.system.bystander import lost
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.guided import NoDaemon, commands, none_left
-from tests.system.harness import Bus, Daemon, until
+from tests.system.harness import Bus, Daemon, running, until
 from tests.system.test_calibrate import RIDES_S, SKIDDING
 
 pytestmark = [
@@ -139,10 +139,8 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
 
 @pytest.fixture
 def skidding(tmp_path: Path) -> Iterator[tuple[Daemon, Bus, Page]]:
-    with Daemon(tmp_path, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, tmp_path) as server:
-            yield daemon, bus, server
+    with running(tmp_path, config=SKIDDING) as (daemon, bus), Page(daemon, tmp_path) as server:
+        yield daemon, bus, server
 
 
 def drives(person: Person, bus: Bus) -> None:

@@ -10,7 +10,7 @@ import pytest
 from acsard.machine.authority import Authority
 from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
-from tests.system.harness import Bus, Daemon, until
+from tests.system.harness import running, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -52,10 +52,8 @@ class Stranger:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     where = tmp_path_factory.mktemp("invited")
     Authority.make(where / "tls", "test", 1, [NAME]).issue(where / "tls", "robot", [NAME], 1)
-    with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, where) as server:
-            yield server
+    with running(where) as (daemon, _), Page(daemon, where) as server:
+        yield server
 
 
 @pytest.fixture(scope="module")

@@ -407,18 +407,23 @@ def tell(what: str, rounds: list[Round]) -> None:
     assert sum(one.obeyed for one in rounds) == 0
 
 
-@pytest.mark.network
-@pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
-def test_whoever_lets_go_in_whatever_way_the_robot_brakes(field: Field, way: Way) -> None:
-    tell(way.__name__, [field.lets_go(way, number) for number in range(1)])
+TIMES = pytest.mark.parametrize(
+    "times",
+    [
+        pytest.param(1, marks=pytest.mark.network),
+        pytest.param(100, marks=[pytest.mark.soak, pytest.mark.timeout(10800)]),
+    ],
+)
 
 
-@pytest.mark.soak
-@pytest.mark.timeout(10800)
+@TIMES
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
-def test_a_hundred_times(field: Field, way: Way) -> None:
-    field.longest_s = 30.0
-    tell(way.__name__, [field.lets_go(way, number) for number in range(100)])
+def test_whoever_lets_go_in_whatever_way_the_robot_brakes(
+    field: Field, way: Way, times: int
+) -> None:
+    if times > 1:
+        field.longest_s = 30.0
+    tell(way.__name__, [field.lets_go(way, number) for number in range(times)])
 
 
 class Program:
@@ -472,13 +477,10 @@ def goes_on(field: Field, number: int) -> Round:
     return Round(took, allowed, sum(wheels(line)[0] < 0.0 for line in lines))
 
 
-@pytest.mark.network
-def test_what_a_program_said_without_a_network_is_not_obeyed_later(field: Field) -> None:
-    tell("program_goes_on", [goes_on(field, number) for number in range(1)])
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(10800)
-def test_a_program_goes_on_a_hundred_times(field: Field) -> None:
-    field.longest_s = 30.0
-    tell("program_goes_on", [goes_on(field, number) for number in range(100)])
+@TIMES
+def test_what_a_program_said_without_a_network_is_not_obeyed_later(
+    field: Field, times: int
+) -> None:
+    if times > 1:
+        field.longest_s = 30.0
+    tell("program_goes_on", [goes_on(field, number) for number in range(times)])

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
 from acsard.web.answers import INLINED, PAGE
 from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
-from tests.system.harness import Bus, Daemon, until
+from tests.system.harness import Bus, running, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -70,13 +71,11 @@ class Robot:
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     where = tmp_path_factory.mktemp("stop")
-    with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, where) as page, browsing() as browser:
-            browser.size(*PHONE)
-            browser.ask("Network.enable")
-            browser.ask("Network.setCacheDisabled", cacheDisabled=True)
-            yield Robot(bus, page, browser)
+    with running(where) as (daemon, bus), Page(daemon, where) as page, browsing() as browser:
+        browser.size(*PHONE)
+        browser.ask("Network.enable")
+        browser.ask("Network.setCacheDisabled", cacheDisabled=True)
+        yield Robot(bus, page, browser)
 
 
 @pytest.fixture
@@ -86,13 +85,21 @@ def impatient(robot: Robot) -> Iterator[Robot]:
     robot.browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
 
 
-@pytest.mark.parametrize("name", FILES)
+def half(names: Sequence[str], which: int) -> list[Any]:
+    """Leave one half of the files to the nightly job; halves 0 and 1 have each module in one."""
+    return [
+        pytest.param(name, marks=() if FILES.index(name) % 2 == which else pytest.mark.nightly)
+        for name in names
+    ]
+
+
+@pytest.mark.parametrize("name", half(FILES, 0))
 def test_stop_latches_as_soon_as_it_is_red_without_this_file(impatient: Robot, name: str) -> None:
     with impatient.without(name):
         until(lambda: impatient.mode == "stopped", 5.0, f"stopped without {name}")
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", half(MODULES, 1))
 def test_a_page_without_this_module_says_reload_and_its_stick_is_grey(
     robot: Robot, name: str
 ) -> None:

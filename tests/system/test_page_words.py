@@ -13,7 +13,7 @@ from acsard.machine.authority import Authority
 from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.camera_stream import Stream
 from tests.system.chromium import CHROMIUM, PHONE, SIDEWAYS, Browser, browsing
-from tests.system.harness import PLAIN, Bus, Daemon, Peer, until
+from tests.system.harness import PLAIN, Bus, Daemon, Peer, running, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -38,8 +38,7 @@ def shows(browser: Browser, name: str, words: str) -> None:
 
 def test_a_page_that_has_shown_no_stop_releases_none(tmp_path: Path, browser: Browser) -> None:
     """Another person may have stopped the robot while this page had no connection."""
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path) as (daemon, bus):
         with Page(daemon, tmp_path) as page:
             browser.open(page.here)
             shows(browser, "mode", "READY")
@@ -261,29 +260,27 @@ def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_
     stream = Stream()
     Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
     config = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
-    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, tmp_path) as page:
-            browser.open(f"{page.away}/#token={page.invite('viewer', 'tv')}")
-            shows(browser, "role", "viewer")
-            bus.get("srv/deactivate")
-            shows(browser, "reason", "an operator switches it on")
-            bus.get("srv/activate")
-            shows(browser, "mode", "READY")
-            page.vault.revoke("tv")
-            shows(browser, "mode", "NO CONNECTION")
-            shows(browser, "hint", "No connection.")
-            red = "getComputedStyle(document.getElementById('stop')).backgroundColor"
-            until(lambda: browser.js(red) != "rgb(196, 18, 10)", 5.0, "STOP is grey")
-            time.sleep(1.0)
-            before = sum(page.refused().values())
-            time.sleep(2.0)
-            assert sum(page.refused().values()) - before <= 1.0
-            browser.tap("stop")
-            shows(browser, "alarm", "STOP needs an invitation to this page")
-            browser.open(f"{page.away}/#token={page.invite('operator', 'phone')}")
-            shows(browser, "role", "operator")
-            assert browser.js(red) == "rgb(196, 18, 10)"
-            browser.tap("tab-set")
-            shows(browser, "guide-note", "checks and calibrations are for maintainers")
+    with running(tmp_path, config=config) as (daemon, bus), Page(daemon, tmp_path) as page:
+        browser.open(f"{page.away}/#token={page.invite('viewer', 'tv')}")
+        shows(browser, "role", "viewer")
+        bus.get("srv/deactivate")
+        shows(browser, "reason", "an operator switches it on")
+        bus.get("srv/activate")
+        shows(browser, "mode", "READY")
+        page.vault.revoke("tv")
+        shows(browser, "mode", "NO CONNECTION")
+        shows(browser, "hint", "No connection.")
+        red = "getComputedStyle(document.getElementById('stop')).backgroundColor"
+        until(lambda: browser.js(red) != "rgb(196, 18, 10)", 5.0, "STOP is grey")
+        time.sleep(1.0)
+        before = sum(page.refused().values())
+        time.sleep(2.0)
+        assert sum(page.refused().values()) - before <= 1.0
+        browser.tap("stop")
+        shows(browser, "alarm", "STOP needs an invitation to this page")
+        browser.open(f"{page.away}/#token={page.invite('operator', 'phone')}")
+        shows(browser, "role", "operator")
+        assert browser.js(red) == "rgb(196, 18, 10)"
+        browser.tap("tab-set")
+        shows(browser, "guide-note", "checks and calibrations are for maintainers")
     stream.close()

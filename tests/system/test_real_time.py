@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.real_time import DOZE
-from tests.system.harness import Bus, Daemon
+from tests.system.harness import Daemon, running
 
 POLICY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 
@@ -34,8 +34,7 @@ def held(pid: int) -> set[str]:
 
 @needs_permission
 def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path) as (daemon, _):
         policies = {
             int(task.name): os.sched_getscheduler(int(task.name))
             for task in Path(f"/proc/{daemon.pid}/task").iterdir()
@@ -60,8 +59,7 @@ def test_it_can_be_switched_off(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can take root's permissions away")
 def test_without_permission_it_runs_all_the_same_and_says_so_in_one_line(tmp_path: Path) -> None:
     without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
-    with Daemon(tmp_path, before=without) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, before=without) as (daemon, _):
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
         (event,) = daemon.events("real_time")
     assert "no permission for real-time scheduling, locked memory" in event["text"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.bystander import lost
-from tests.system.harness import ZERO, ZERO_LINE, Bus, Daemon, Peer, twist, until, wheels
+from tests.system.harness import ZERO, ZERO_LINE, Peer, running, twist, until, wheels
 
 SEEN_S = 0.02
 """SAFETY: an unplugged port is seen this fast."""
@@ -21,91 +21,64 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
     tmp_path: Path, peer: Peer
 ) -> None:
     with (
-        Daemon(tmp_path, peer.path) as daemon,
-        Bus(daemon.endpoint) as bus,
+        running(tmp_path, peer.path) as (daemon, bus),
         bus.follow("state") as states,
+        bus.commanding(0.5) as commander,
     ):
-        bus.linked()
-        with bus.commanding(0.5) as commander:
-            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
-            moved = bus.state()["x"]
+        until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+        moved = bus.state()["x"]
 
-            pulled = peer.unplug()
-            down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
-            print(f"unplug -> link down in state: {(down.at - pulled) * 1e3:.1f} ms")
-            assert down.at - pulled < SEEN_S + SLACK_S + lost(pulled, down.at)
-            assert str(peer.path) in down.value["reason"], "lost, or by now not there"
-            assert down.value["mode"] == "waiting"
-            assert bus.state()["link"] == "down"
-            assert until(lambda: daemon.events("port_lost"), 2.0, "a log line")
+        pulled = peer.unplug()
+        down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
+        print(f"unplug -> link down in state: {(down.at - pulled) * 1e3:.1f} ms")
+        assert down.at - pulled < SEEN_S + SLACK_S + lost(pulled, down.at)
+        assert str(peer.path) in down.value["reason"], "lost, or by now not there"
+        assert down.value["mode"] == "waiting"
+        assert bus.state()["link"] == "down"
+        assert until(lambda: daemon.events("port_lost"), 2.0, "a log line")
 
-            peer.plug()
-            up = states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
-            first = peer.session.raw[0].at - peer.session.plugged
-            print(f"replug -> first bytes {first:.3f} s, up {up.at - peer.session.plugged:.3f} s")
-            assert first < 0.5 + SLACK_S + lost(down.at, up.at)
-            assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
+        peer.plug()
+        up = states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
+        first = peer.session.raw[0].at - peer.session.plugged
+        print(f"replug -> first bytes {first:.3f} s, up {up.at - peer.session.plugged:.3f} s")
+        assert first < 0.5 + SLACK_S + lost(down.at, up.at)
+        assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
 
-            # The commander has never stopped sending, and never sent a zero.
-            waiting = states.find(
-                lambda state: "send a zero first" in state["reason"], 5.0, "why", after=up.at
-            )
-            assert "app must send a zero" in waiting.value["reason"]
-            peer.await_lines(100)
-            assert set(peer.session.said()[1:]) == {ZERO_LINE}
+        # The commander has never stopped sending, and never sent a zero.
+        waiting = states.find(
+            lambda state: "send a zero first" in state["reason"], 5.0, "why", after=up.at
+        )
+        assert "app must send a zero" in waiting.value["reason"]
+        peer.await_lines(100)
+        assert set(peer.session.said()[1:]) == {ZERO_LINE}
 
-            commander.wish = ZERO
-            until(
-                lambda: "send a zero first" not in bus.state()["reason"], 5.0, "the zero was heard"
-            )
-            assert set(peer.session.said()[1:]) == {ZERO_LINE}
-            zeros = 1
+        commander.wish = ZERO
+        until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "the zero was heard")
+        assert set(peer.session.said()[1:]) == {ZERO_LINE}
+        zeros = 1
 
-            def drives() -> bool:
-                """The daemon waits for another zero if the machine stood still for a second."""
-                nonlocal zeros
-                before = commander.wish
-                commander.wish = (
-                    ZERO if "send a zero first" in bus.state()["reason"] else twist(0.5)
-                )
-                zeros += commander.wish == ZERO != before
-                return peer.lines[-1].line.startswith(b"ap10.00")
+        def drives() -> bool:
+            """The daemon waits for another zero if the machine stood still for a second."""
+            nonlocal zeros
+            before = commander.wish
+            commander.wish = ZERO if "send a zero first" in bus.state()["reason"] else twist(0.5)
+            zeros += commander.wish == ZERO != before
+            return peer.lines[-1].line.startswith(b"ap10.00")
 
-            until(drives, 5.0, "driving again")
-            ramp = [wheels(line)[0] for line in peer.session.said()[1:]]
-            # The exception is a kernel thread, which carries bytes through a pty, that had no core
-            # for that time.
-            if zeros == 1 and not any(event["text"] for event in daemon.events("link_stale")):
-                assert ramp == sorted(ramp), "it grew from zero by its ramp"
-            assert bus.state()["x"] > moved, "odometry went on from where it was"
-
-
-@pytest.mark.slow
-def test_the_port_can_be_lost_and_found_many_times(tmp_path: Path, peer: Peer) -> None:
-    with (
-        Daemon(tmp_path, peer.path) as daemon,
-        Bus(daemon.endpoint) as bus,
-        bus.follow("state") as states,
-    ):
-        bus.linked()
-        for _ in range(3):
-            pulled = peer.unplug()
-            down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
-            peer.plug()
-            states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
-            assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
-            assert set(peer.session.said()[1:]) == {ZERO_LINE}
-        with bus.commanding(0.5):
-            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "driving at last")
+        until(drives, 5.0, "driving again")
+        ramp = [wheels(line)[0] for line in peer.session.said()[1:]]
+        # The exception is a kernel thread, which carries bytes through a pty, that had no core
+        # for that time.
+        if zeros == 1 and not any(event["text"] for event in daemon.events("link_stale")):
+            assert ramp == sorted(ramp), "it grew from zero by its ramp"
+        assert bus.state()["x"] > moved, "odometry went on from where it was"
 
 
 def test_a_stop_stays_latched_over_a_replug(tmp_path: Path, peer: Peer) -> None:
     with (
-        Daemon(tmp_path, peer.path) as daemon,
-        Bus(daemon.endpoint) as bus,
+        running(tmp_path, peer.path) as (_, bus),
         bus.follow("state") as states,
     ):
-        bus.linked()
         assert bus.get("srv/stop")["success"]
         pulled = peer.unplug()
         states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)

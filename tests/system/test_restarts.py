@@ -28,6 +28,7 @@ from tests.system.harness import (
     environment,
     finish,
     free_endpoint,
+    running,
     until,
     write_config,
 )
@@ -255,8 +256,7 @@ def test_a_state_directory_that_takes_no_file_starts_the_robot_stopped_and_says_
     tmp_path: Path, peer: Peer
 ) -> None:
     config = {"control": {"state_directory": "/sys/acsard"}}
-    with Daemon(tmp_path, peer.path, config) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, peer.path, config) as (daemon, bus):
         state = bus.state()
         assert state["mode"] == "stopped"
         assert "a stop cannot be kept over a restart: /sys/acsard/" in state["reason"]

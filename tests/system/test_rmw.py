@@ -6,7 +6,7 @@ import queue
 import struct
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
-from tests.system.harness import Bus, Daemon, Program, Tables, client_config, free_endpoint, until
+from tests.system.harness import Bus, Daemon, client_config, free_endpoint, running, until
 from tests.system.ros_clients import (
     EMPTY_REQUEST,
     GET,
@@ -34,10 +34,10 @@ from tests.system.ros_clients import (
     WHEELS,
     Attached,
     BridgeHalf,
-    Client,
     RmwClient,
     Samples,
     Sdk,
+    ZenohClient,
     behind,
     changes,
     decode,
@@ -46,16 +46,20 @@ from tests.system.ros_clients import (
     joints,
     listed,
     make,
+    over_router,
     refused_without_motion,
     rmw_key,
     settled,
     stamped,
     twist,
+    two_robots,
+    undisturbed,
     unharmed,
 )
-from tests.system.strangers import ROUTER, words
 
 pytestmark = pytest.mark.network
+
+CONFIG = QUICK
 
 COMMANDS = (
     ("/cmd_vel", TWIST, 0.3),
@@ -87,35 +91,13 @@ class Fleet(NamedTuple):
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     where = tmp_path_factory.mktemp("fleet")
-    meeting = free_endpoint()
-
-    def robot(name: str, mode: str) -> Daemon:
-        config: Tables = {
-            "robot": {"id": name},
-            "bus": {"connect": [meeting], "mode": mode},
-            "ros": {"namespace": name},
-            **QUICK,
-        }
-        return Daemon(where, config=config, name=name, ready=False)
-
-    with Program(words(ROUTER, meeting), where) as router:
-        router.says("routing")
-        with (
-            robot("one", "peer") as first,
-            robot("two", "client") as second,
-            Sdk(meeting, where) as sdk,
-            Bus(meeting, "one") as one,
-            Bus(meeting, "two") as two,
-        ):
-            for daemon, bus in ((first, one), (second, two)):
-                daemon.says("bus ")
-                _known(bus)
-                bus.linked()
-            yield Fleet({"one": first, "two": second}, one, two, sdk)
-
-
-def _known(bus: Bus) -> None:
-    until(lambda: bus.ask("info"), 5.0, "the robot over the router")
+    with (
+        two_robots(where, "one", "two") as (meeting, daemons),
+        Sdk(meeting, where) as sdk,
+        over_router(meeting, "one") as one,
+        over_router(meeting, "two") as two,
+    ):
+        yield Fleet(daemons, one, two, sdk)
 
 
 class Ground(NamedTuple):
@@ -141,11 +123,9 @@ def ground(
         return
     where = tmp_path_factory.mktemp("ground")
     with (
-        Daemon(where, config=QUICK) as daemon,
-        Bus(daemon.endpoint) as bus,
+        running(where, config=QUICK) as (daemon, bus),
         Sdk(daemon.endpoint, where) as sdk,
     ):
-        bus.linked()
         yield Ground(daemon, bus, sdk, commands, "")
 
 
@@ -243,13 +223,6 @@ def test_nothing_of_that_was_an_exception(ground: Ground) -> None:
 
 
 # the protocol to the letter
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """The usual limits, but quick to drive and to stand."""
-    with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
-        yield daemon
 
 
 @pytest.fixture
@@ -356,21 +329,6 @@ def test_a_reply_names_its_request(bus: Bus, ros: RmwClient) -> None:
         assert asked.stamp_ns <= answered.stamp_ns <= time.time_ns()
         assert reply.key == rmw_key("acsard/reset_odometry", TRIGGER)
         assert called.seconds < 1.0
-
-
-@pytest.mark.parametrize("name", SERVICES)
-def test_every_service_is_asked_as_rmw_zenoh_asks_and_answers_once(
-    bus: Bus, ros: RmwClient, name: str
-) -> None:
-    # Zero bytes more than all the requests need: empty sequences, a depth of 0.
-    request = EMPTY_REQUEST + bytes(31)
-    called = ros.call(name, SERVICES[name], request)
-    try:
-        assert (len(called.replies), called.errors) == (1, 0)
-        assert Attached.read(called.replies[0].attachment).gid == ros.gid
-    finally:
-        for verb in ("clear", "activate"):
-            bus.get(f"srv/{verb}")
 
 
 # bad attachments, keys and requests are refused and counted, and disturb no other client
@@ -515,13 +473,6 @@ def test_a_parameter_request_that_is_none_is_counted_and_answered_by_nothing(
     assert changes(before, bus.state()) == {"command_malformed": 1}
 
 
-def test_parameters_can_be_asked_for_by_hand(ros: RmwClient) -> None:
-    request = encode(make("rcl_interfaces/msg/GetRequest", names=["commands.sources.nav.priority"]))
-    called = ros.call("acsard/get_parameters", GET, request)
-    reply = decode("rcl_interfaces/msg/GetReply", called.replies[0].payload)
-    assert [(value.type, value.integer_value) for value in reply.values] == [(2, 10)]
-
-
 def test_more_names_than_there_are_parameters_are_answered(ros: RmwClient) -> None:
     for count, answered in ((128, 128), (129, 129), (256, 256), (300, 0), (1000, 0)):
         names = ["commands.sources.nav.priority"] * count
@@ -575,26 +526,19 @@ def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
 
 # two robots
 
+TREES: dict[str, type[ZenohClient]] = {"bridge": BridgeHalf, "rmw": RmwClient}
+
 
 @pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
 def test_a_command_to_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) -> None:
-    driven, other = fleet.one, fleet.two
-    before = other.at_rest()
-    with driven.follow("state") as states:
-        client: Client = BridgeHalf(driven.session, "one")
-        if tree == "rmw":
-            client = RmwClient(driven.session, "one")
-        drive = (
-            driven.commanding(0.3)
-            if tree == "native"
-            else client.driving(driven, "cmd_vel", TWIST, 0.3)
-        )
-        with drive:
-            states.find(lambda s: (s["linear"] or 0.0) > 0.1, 3.0, "it drives")
-    after = other.state()
-    assert changes(before, after) == {}
-    for key in ("x", "mode", "wheels"):
-        assert after[key] == before[key], key
+    driven = fleet.one
+    drive: AbstractContextManager[object]
+    if tree == "native":
+        drive = driven.commanding(0.3)
+    else:
+        drive = TREES[tree](driven.session, "one").driving(driven, "cmd_vel", TWIST, 0.3)
+    with undisturbed(fleet.two), driven.follow("state") as states, drive:
+        states.find(lambda s: (s["linear"] or 0.0) > 0.1, 3.0, "it drives")
 
 
 @pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
@@ -603,10 +547,7 @@ def test_a_stop_of_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) 
     if tree == "native":
         assert one.get("srv/stop")["success"]
     else:
-        client = BridgeHalf(one.session, "one") if tree == "bridge" else RmwClient(
-            one.session, "one"
-        )  # fmt: skip
-        assert client.call("acsard/stop").trigger()[0]
+        assert TREES[tree](one.session, "one").call("acsard/stop").trigger()[0]
     assert (one.state()["mode"], two.state()["mode"] != "stopped") == ("stopped", True)
     assert one.get("srv/clear")["success"]
 

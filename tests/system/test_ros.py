@@ -56,28 +56,14 @@ from tests.system.ros_clients import (
 )
 
 if TYPE_CHECKING:
-    from tests.system.dds import DdsDomain, NewDomain
+    from tests.system.dds import DdsDomain
+
+CONFIG = QUICK
 
 EMULATED: dict[str, type[ZenohClient]] = {"rmw": RmwClient, "bridge": BridgeHalf}
 
 NETWORK = [pytest.param(name, marks=pytest.mark.network) for name in EMULATED]
 REAL = pytest.param("real bridge", marks=[pytest.mark.bridge, pytest.mark.timeout(BUILD_S)])
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """The usual limits, but quick to drive and to stand."""
-    with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
-        yield daemon
-
-
-@pytest.fixture(scope="module")
-def domain(
-    shared: Daemon, dds: NewDomain, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[DdsDomain]:
-    """A DDS domain with a bridge to `shared`."""
-    with dds(tmp_path_factory.mktemp("dds")) as domain, domain.bridge(shared.endpoint):
-        yield domain
 
 
 @pytest.fixture(params=[*NETWORK, REAL])

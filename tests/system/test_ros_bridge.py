@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.system.harness import Bus, Daemon, until
+from tests.system.harness import Bus, Daemon, running, until
 from tests.system.ros_clients import (
     HASHES,
     JOINTS,
@@ -37,12 +36,7 @@ from tests.system.ros_clients import (
 
 pytestmark = pytest.mark.network
 
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """The usual limits, but quick to drive and to stand."""
-    with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
-        yield daemon
+CONFIG = QUICK
 
 
 @pytest.fixture
@@ -174,8 +168,7 @@ def test_nothing_is_announced_unless_asked_for(tmp_path: Path) -> None:
 
 def test_a_tree_that_is_switched_off_does_not_exist(tmp_path: Path) -> None:
     config = {"ros": {"bridge": False, "rmw": False}}
-    with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=config) as (_, bus):
         before = bus.state()
         for client in (BridgeHalf(bus.session), RmwClient(bus.session)):
             client.put("cmd_vel", TWIST, b"")

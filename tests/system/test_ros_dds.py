@@ -21,12 +21,11 @@ import pytest
 
 from tests.system import rclpy_stand_in
 from tests.system.builds import BUILD_S
-from tests.system.harness import ROOT, Bus, Daemon, Program, Tables, free_endpoint, until
+from tests.system.harness import ROOT, Bus, Daemon, Program, free_endpoint, until
 from tests.system.ros_clients import (
     BRIDGE_FILE,
     ODOMETRY,
     PUBLISHED,
-    QUICK,
     ROUTE_S,
     SERVICES,
     STAMPED,
@@ -40,28 +39,21 @@ from tests.system.ros_clients import (
     decode,
     encode,
     make,
+    over_router,
     refused_without_motion,
     released,
     stamped,
     twist,
+    two_robots,
+    undisturbed,
     unharmed,
 )
-from tests.system.strangers import ROUTER, words
 from tests.system.test_ros_drive import LINE
 
 if TYPE_CHECKING:
     from tests.system.dds import DdsDomain, DdsNode, NewDomain
 
 pytestmark = [pytest.mark.bridge, pytest.mark.timeout(BUILD_S)]
-
-
-@pytest.fixture(scope="module")
-def domain(
-    shared: Daemon, dds: NewDomain, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[DdsDomain]:
-    """A DDS domain with a bridge to `shared`."""
-    with dds(tmp_path_factory.mktemp("dds")) as domain, domain.bridge(shared.endpoint):
-        yield domain
 
 
 @pytest.fixture
@@ -262,24 +254,8 @@ class Robot(NamedTuple):
 @pytest.fixture(scope="module")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, Daemon]]]:
     """The address of a router, and two robots that meet there, by name."""
-    where = tmp_path_factory.mktemp("robots")
-    meeting = free_endpoint()
-
-    def robot(name: str, mode: str) -> Daemon:
-        config: Tables = {
-            "robot": {"id": name},
-            "bus": {"connect": [meeting], "mode": mode},
-            "ros": {"namespace": name},
-            **QUICK,
-        }
-        return Daemon(where, config=config, name=name, ready=False)
-
-    with Program(words(ROUTER, meeting), where) as router:
-        router.says("routing")
-        with robot("robot1", "peer") as first, robot("robot2", "client") as second:
-            for daemon in (first, second):
-                daemon.says("bus ")
-            yield meeting, {"robot1": first, "robot2": second}
+    with two_robots(tmp_path_factory.mktemp("robots"), "robot1", "robot2") as robots:
+        yield robots
 
 
 def one_domain_each(
@@ -321,9 +297,7 @@ def fleet(
         nodes = WAYS[request.param](stack, dds, tmp_path_factory.mktemp("fleet"), meeting)
         found = []
         for name, daemon in daemons.items():
-            bus = stack.enter_context(Bus(meeting, name))
-            until(lambda: bus.ask("info"), 5.0, f"{name} over the router")  # noqa: B023
-            bus.linked()
+            bus = stack.enter_context(over_router(meeting, name))
             found.append(Robot(daemon, bus, nodes[name]))
         one, two = found
         yield one, two
@@ -331,8 +305,8 @@ def fleet(
 
 def test_a_command_to_one_robot_drives_only_that_one(fleet: tuple[Robot, Robot]) -> None:
     driven, other = fleet
-    before = other.bus.at_rest()
     with (
+        undisturbed(other.bus),
         driven.node.follow("odom", ODOMETRY) as moving,
         other.node.follow("odom", ODOMETRY) as standing,
         driven.node.driving(driven.bus, "cmd_vel", TWIST, 0.3),
@@ -340,10 +314,6 @@ def test_a_command_to_one_robot_drives_only_that_one(fleet: tuple[Robot, Robot])
         moving.first("motion", lambda s: decode(ODOMETRY, s.payload).twist.twist.linear.x > 0.2)
         standing.first("odometry of the other")
         assert {decode(ODOMETRY, s.payload).twist.twist.linear.x for s in standing.seen} == {0.0}
-    after = other.bus.state()
-    assert changes(before, after) == {}
-    for key in ("x", "mode", "wheels"):
-        assert after[key] == before[key], key
     driven.bus.at_rest()
 
 

@@ -13,11 +13,11 @@ import pytest
 from tests.system.bystander import lost
 from tests.system.harness import (
     ZERO_LINE,
-    Bus,
     Daemon,
     Heard,
     Peer,
     Program,
+    running,
     silence,
     until,
     wheels,
@@ -48,14 +48,12 @@ def last_speed(ramp: list[Heard]) -> float:
 def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
     tmp_path: Path, peer: Peer, number: signal.Signals
 ) -> None:
-    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with bus.commanding(0.5):
-            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
-            sent = time.monotonic()
-            daemon.signal(number)
-            code = daemon.ended(5.0)
-            seconds = time.monotonic() - sent
+    with running(tmp_path, peer.path) as (daemon, bus), bus.commanding(0.5):
+        until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+        sent = time.monotonic()
+        daemon.signal(number)
+        code = daemon.ended(5.0)
+        seconds = time.monotonic() - sent
     last = peer.last_line()
     ramp = [wheels(heard.line)[0] for heard in ramp_after(peer, sent)]
     print(f"{number.name} at 0.5 m/s: exit {code} after {seconds:.3f} s, ramp of {len(ramp)} lines")
@@ -70,8 +68,7 @@ def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
 
 
 def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, peer: Peer) -> None:
-    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, peer.path) as (daemon, _):
         sent = time.monotonic()
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(5.0) == 0
@@ -83,14 +80,12 @@ def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, pee
 
 def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, peer: Peer) -> None:
     config = {"limits": SLOW_STOP}
-    with Daemon(tmp_path, peer.path, config) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with bus.commanding(2.0):
-            until(lambda: peer.lines[-1].line.startswith(b"ap40.00"), 5.0, "2 m/s")
-            sent = time.monotonic()
-            daemon.signal(signal.SIGTERM)
-            code = daemon.ended(5.0)
-            seconds = time.monotonic() - sent
+    with running(tmp_path, peer.path, config) as (daemon, bus), bus.commanding(2.0):
+        until(lambda: peer.lines[-1].line.startswith(b"ap40.00"), 5.0, "2 m/s")
+        sent = time.monotonic()
+        daemon.signal(signal.SIGTERM)
+        code = daemon.ended(5.0)
+        seconds = time.monotonic() - sent
     last = peer.last_line()
     ramp = ramp_after(peer, sent)
     print(f"SIGTERM at 2 m/s with a slow ramp: {seconds:.3f} s")
@@ -119,17 +114,15 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
 )
 def test_a_second_signal_cuts_the_ramp(tmp_path: Path, peer: Peer, second: signal.Signals) -> None:
     config = {"limits": SLOW_STOP}
-    with Daemon(tmp_path, peer.path, config) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with bus.commanding(2.0):
-            until(lambda: peer.lines[-1].line.startswith(b"ap40.00"), 5.0, "2 m/s")
-            sent = time.monotonic()
-            daemon.signal(signal.SIGTERM)
-            until(lambda: wheels(peer.lines[-1].line)[0] < 39.0, 5.0, "the ramp has begun")
-            hurried = time.monotonic()
-            daemon.signal(second)
-            code = daemon.ended(5.0)
-            ended = time.monotonic()
+    with running(tmp_path, peer.path, config) as (daemon, bus), bus.commanding(2.0):
+        until(lambda: peer.lines[-1].line.startswith(b"ap40.00"), 5.0, "2 m/s")
+        sent = time.monotonic()
+        daemon.signal(signal.SIGTERM)
+        until(lambda: wheels(peer.lines[-1].line)[0] < 39.0, 5.0, "the ramp has begun")
+        hurried = time.monotonic()
+        daemon.signal(second)
+        code = daemon.ended(5.0)
+        ended = time.monotonic()
     last = peer.last_line()
     ramp = ramp_after(peer, sent)
     print(f"second signal {hurried - sent:.3f} s after the first -> exit {ended - hurried:.3f} s")
@@ -159,21 +152,22 @@ def test_a_signal_while_the_peer_is_silent_ends_with_stop_and_exits_0(
 def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
     tmp_path: Path, peer: Peer
 ) -> None:
-    with Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Program(words(STUCK, daemon.endpoint), tmp_path) as client:
-            client.says("listening")
-            client.signal(signal.SIGSTOP)
-            try:
-                with bus.commanding(0.5):
-                    # This is enough odometry to fill every queue towards the stopped client.
-                    until(lambda: bus.state()["x"] > 0.8, 10.0, "it drives on")
-                    sent = time.monotonic()
-                    daemon.signal(signal.SIGTERM)
-                    code = daemon.ended(5.0)
-                    seconds = time.monotonic() - sent
-            finally:
-                client.signal(signal.SIGCONT)
+    with (
+        running(tmp_path, peer.path) as (daemon, bus),
+        Program(words(STUCK, daemon.endpoint), tmp_path) as client,
+    ):
+        client.says("listening")
+        client.signal(signal.SIGSTOP)
+        try:
+            with bus.commanding(0.5):
+                # This is enough odometry to fill every queue towards the stopped client.
+                until(lambda: bus.state()["x"] > 0.8, 10.0, "it drives on")
+                sent = time.monotonic()
+                daemon.signal(signal.SIGTERM)
+                code = daemon.ended(5.0)
+                seconds = time.monotonic() - sent
+        finally:
+            client.signal(signal.SIGCONT)
     print(f"SIGTERM with a stopped subscriber: {seconds:.3f} s")
     assert code == 0
     assert peer.last_line() == ZERO_LINE

@@ -16,7 +16,7 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Imu, Quaternion, Vector3
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.names import rmw_key
-from tests.system.harness import Bus, Daemon, Peer, acsard, finish, seconds, until
+from tests.system.harness import Bus, Daemon, Peer, acsard, finish, running, seconds, until
 
 SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
 
@@ -25,8 +25,7 @@ SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
 def skidding(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
     """A client of a daemon whose simulated robot turns less than its wheels say."""
     where = tmp_path_factory.mktemp("skidding")
-    with Daemon(where, config=SKIDDING) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(where, config=SKIDDING) as (_, bus):
         yield bus
 
 
@@ -94,8 +93,7 @@ def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -
 @pytest.mark.slow
 def test_a_drive_is_recorded_as_calibrate_reads_it(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
-    with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, config=tables) as (daemon, _):
         words = ("echo", "wheel_states", "imu", "--csv", "-n", "300")
         ended = finish(acsard(*words, "--config", str(daemon.config)), tmp_path)
         assert ended.code == 0, ended
@@ -128,8 +126,7 @@ def test_a_gyro_on_the_bus_is_heard_and_what_is_no_sample_is_counted(
     tmp_path: Path, peer: Peer
 ) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
-    with Daemon(tmp_path, port=peer.path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path, port=peer.path, config=tables) as (daemon, bus):
         assert bus.state()["gyro"] == "silent"
 
         def used() -> bool:

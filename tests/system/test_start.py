@@ -26,6 +26,7 @@ from tests.system.harness import (
     client_config,
     finish,
     free_endpoint,
+    running,
     until,
     wheels,
     write_config,
@@ -48,8 +49,7 @@ def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path
 
 @pytest.mark.slow
 def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path) as (daemon, bus):
         begun = time.monotonic()
         driven = finish(words(DRIVE, daemon.endpoint, 0.5, 2.0), tmp_path)
         late = lost(begun)

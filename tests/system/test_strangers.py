@@ -25,6 +25,7 @@ from tests.system.harness import (
     finish,
     free_endpoint,
     resident_kb,
+    running,
     until,
 )
 from tests.system.hosts import Hosts, inside, on
@@ -337,8 +338,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
 @pytest.fixture(scope="module")
 def calm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
     """Provide a client of a daemon that is not attacked."""
-    with Daemon(tmp_path_factory.mktemp("calm")) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
+    with running(tmp_path_factory.mktemp("calm")) as (_, bus):
         yield bus
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.harness import Bus, Daemon, Program, acsard, environment, finish, until
-from tests.system.test_cli import Terminal, at_terminal
+from tests.system.terminals import SCREEN, Terminal, at_terminal
 
 SIZE = 80, 24
 
@@ -22,7 +22,8 @@ FRAME = "\x1b[H"
 @contextmanager
 def top(daemon: Daemon) -> Iterator[tuple[Terminal, Program]]:
     """`acsard top` at a terminal of 80x24 of its own."""
-    with at_terminal(daemon, "top", "xterm-256color", SIZE[0]) as found:
+    words = ("top", "--config", str(daemon.config))
+    with at_terminal(daemon.config.parent, *words, term=SCREEN, piped="stderr") as found:
         yield found
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from acsard.web.openapi import KEYS
 from tests import described
-from tests.system.browser import Page, answer, hands, run, text
+from tests.system.browser import Page, answer, hands, text
 from tests.system.harness import (
     PATIENCE_S,
     ROOT,
@@ -32,6 +32,7 @@ from tests.system.harness import (
     environment,
     finish,
     free_endpoint,
+    running,
     until,
     write_config,
 )
@@ -42,33 +43,28 @@ def bus(standing: Bus) -> Bus:
     return standing
 
 
-def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> None:
-    async def story() -> None:
-        async with hands(page) as ours:
-            hello = (await ours.find(lambda said: "hello" in said))["hello"]
-            assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
-            assert hello["limits"] == {"linear": 1.0, "angular": 4.0}
-            assert hello["simulated"] is True
-            assert hello["state_rate"] == 10.0
-            assert "path" in await ours.find(lambda said: "path" in said)
-            await ours.say(ping=12.5)
-            assert (await ours.find(lambda said: "pong" in said))["pong"] == 12.5
-            await ours.say(subscribe="odom", rate=50)
-            odom = await ours.find(lambda said: said.get("key") == "odom")
-            assert odom["value"]["child_frame_id"] == "base_link"
-            assert 0 <= odom["age"] < 1000 * PATIENCE_S
-            await ours.say(subscribe="fleet")
-            await ours.find(lambda said: [r["robot"] for r in said.get("fleet", ())] == ["acsar"])
-
-    run(story)
+async def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> None:
+    async with hands(page) as ours:
+        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
+        assert hello["limits"] == {"linear": 1.0, "angular": 4.0}
+        assert hello["simulated"] is True
+        assert hello["state_rate"] == 10.0
+        assert "path" in await ours.find(lambda said: "path" in said)
+        await ours.say(ping=12.5)
+        assert (await ours.find(lambda said: "pong" in said))["pong"] == 12.5
+        await ours.say(subscribe="odom", rate=50)
+        odom = await ours.find(lambda said: said.get("key") == "odom")
+        assert odom["value"]["child_frame_id"] == "base_link"
+        assert 0 <= odom["age"] < 1000 * PATIENCE_S
+        await ours.say(subscribe="fleet")
+        await ours.find(lambda said: [r["robot"] for r in said.get("fleet", ())] == ["acsar"])
 
 
-def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_looked(
+async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_looked(
     daemon: Daemon, bus: Bus, tmp_path: Path
 ) -> None:
-    kept: list[Any] = []
-
-    async def story() -> None:
+    with Page(daemon, tmp_path) as page:
         async with hands(page) as ours:
             async with hands(page) as first:
                 alone = await first.find(lambda said: "minute" in said)
@@ -80,11 +76,7 @@ def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_loo
             await ours.drive(0.0)
             await asyncio.to_thread(bus.at_rest)
             async with hands(page) as later:
-                kept.append((await later.find(lambda said: "minute" in said))["minute"])
-
-    with Page(daemon, tmp_path) as page:
-        run(story)
-    (minute,) = kept
+                minute = (await later.find(lambda said: "minute" in said))["minute"]
     assert max(minute["linear"]) > 0.25
     assert max(one or 0.0 for one in minute["wished_linear"]) == pytest.approx(0.3)
     assert minute["age"] == sorted(minute["age"], reverse=True)
@@ -94,12 +86,20 @@ def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_loo
 
 
 @pytest.mark.network
-def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_said(
+async def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_said(
     tmp_path: Path,
 ) -> None:
     heard: list[Any] = []
-
-    async def story(daemon: Daemon, page: Page) -> None:
+    (tmp_path / "robot.urdf").write_text('<robot name="acsar"/>')
+    config: dict[str, dict[str, object]] = {
+        "odometry": {"gyro": True},
+        "ros": {"urdf": str(tmp_path / "robot.urdf")},
+        "sim": {"faults": ["battery=80:600"]},
+    }
+    with (
+        running(tmp_path, config=config) as (daemon, _),
+        Page(daemon, tmp_path) as page,
+    ):
         async with hands(page) as ours:
             await ours.find(lambda said: "minute" in said)
             for key in KEYS:
@@ -123,20 +123,6 @@ def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_sa
             finally:
                 daemon.signal(signal.SIGCONT)
             heard.extend(ours.heard)
-
-    (tmp_path / "robot.urdf").write_text('<robot name="acsar"/>')
-    config: dict[str, dict[str, object]] = {
-        "odometry": {"gyro": True},
-        "ros": {"urdf": str(tmp_path / "robot.urdf")},
-        "sim": {"faults": ["battery=80:600"]},
-    }
-    with (
-        Daemon(tmp_path, config=config) as daemon,
-        Bus(daemon.endpoint) as bus,
-        Page(daemon, tmp_path) as page,
-    ):
-        bus.linked()
-        run(lambda: story(daemon, page))
     found = described.kinds(heard)
     assert found >= set(described.FRAMES), set(described.FRAMES) - found
     assert found >= {"Running", "Subject", "Question", "Ended"}
@@ -145,56 +131,45 @@ def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_sa
 
 
 @pytest.mark.network
-def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
+async def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
     page: Page, bus: Bus
 ) -> None:
-    commands: list[Any] = []
-
-    async def story() -> None:
-        with bus.follow("cmd/teleop") as heard:
-            async with hands(page) as ours:
-                await ours.say(subscribe="state", rate=50)
-                await ours.until_driving(0.3)
-            bus.at_rest()
-            commands.extend(seen.value for seen in heard.seen)
-
-    run(story)
+    with bus.follow("cmd/teleop") as heard:
+        async with hands(page) as ours:
+            await ours.say(subscribe="state", rate=50)
+            await ours.until_driving(0.3)
+        bus.at_rest()
+        commands = [seen.value for seen in heard.seen]
     assert [one for one in commands[-3:-1] if one["linear"]["x"] == 0] == []
     assert commands[-1]["linear"]["x"] == 0
 
 
-def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus) -> None:
-    async def story() -> None:
-        async with hands(page) as ours:
-            for n in range(450):
-                await ours.say(ping=n)
-            assert (await ours.call("stop"))["ok"]
-
-    run(story)
+async def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus) -> None:
+    async with hands(page) as ours:
+        for n in range(450):
+            await ours.say(ping=n)
+        assert (await ours.call("stop"))["ok"]
     assert bus.state()["mode"] == "stopped"
 
 
-def test_programs_query_call_and_list_the_interface(page: Page, bus: Bus) -> None:
-    async def story() -> None:
-        async with aiohttp.ClientSession(page.here) as session:
-            async with session.get("/api/state") as answer:
-                assert (await answer.json())["mode"] == "ready"
-            async with session.post("/api/srv/stop") as answer:
-                assert (answer.status, (await answer.json())["success"]) == (200, True)
-            async with session.post("/api/srv/clear") as answer:
-                assert answer.status == 409
-                assert "look at the robot" in (await answer.json())["message"]
-            async with session.get("/api/state") as answer:
-                latch = (await answer.json())["latch"]
-            async with session.post("/api/srv/clear", json={"latch": latch}) as answer:
-                assert answer.status == 200
-            wish = {"settings": {"limits.linear_speed": 99.0}}
-            async with session.post("/api/srv/set", json=wish) as answer:
-                assert (answer.status, (await answer.json())["success"]) == (409, False)
-            async with session.get("/api") as answer:
-                assert (await answer.json())["openapi"] == "3.1.0"
-
-    run(story)
+async def test_programs_query_call_and_list_the_interface(page: Page, bus: Bus) -> None:
+    async with aiohttp.ClientSession(page.here) as session:
+        async with session.get("/api/state") as answer:
+            assert (await answer.json())["mode"] == "ready"
+        async with session.post("/api/srv/stop") as answer:
+            assert (answer.status, (await answer.json())["success"]) == (200, True)
+        async with session.post("/api/srv/clear") as answer:
+            assert answer.status == 409
+            assert "look at the robot" in (await answer.json())["message"]
+        async with session.get("/api/state") as answer:
+            latch = (await answer.json())["latch"]
+        async with session.post("/api/srv/clear", json={"latch": latch}) as answer:
+            assert answer.status == 200
+        wish = {"settings": {"limits.linear_speed": 99.0}}
+        async with session.post("/api/srv/set", json=wish) as answer:
+            assert (answer.status, (await answer.json())["success"]) == (409, False)
+        async with session.get("/api") as answer:
+            assert (await answer.json())["openapi"] == "3.1.0"
 
 
 TYPED = ("/api/state", "/api/whoami", "/api/settings", "/api/guide", "/api/recordings", "/api/info")
@@ -213,64 +188,51 @@ async def first_recording(session: aiohttp.ClientSession) -> str:
             await asyncio.sleep(0.1)
 
 
-def test_each_answer_to_a_program_is_as_it_is_described(page: Page, bus: Bus) -> None:
+async def test_each_answer_to_a_program_is_as_it_is_described(page: Page, bus: Bus) -> None:
     seen: dict[tuple[str, str], int] = {}
-
-    async def story() -> None:
-        async with aiohttp.ClientSession(page.here) as session:
-            name = await first_recording(session)
-            for path, operations in described.DOCUMENT["paths"].items():
-                asked = path.replace("{name}", name).replace("{type}", "Twist")
-                for method in operations:
-                    async with session.request(method, asked) as answer:
-                        media = answer.content_type
-                        body = await answer.json() if media == "application/json" else None
-                    seen[method, path] = answer.status
-                    told = path, method, answer.status, media, body
-                    assert described.answers(*told), told
-                    if path in TYPED:
-                        assert not described.answers(*told[:4], {"of": "nothing"}), path
-
-    run(story)
+    async with aiohttp.ClientSession(page.here) as session:
+        name = await first_recording(session)
+        for path, operations in described.DOCUMENT["paths"].items():
+            asked = path.replace("{name}", name).replace("{type}", "Twist")
+            for method in operations:
+                async with session.request(method, asked) as answer:
+                    media = answer.content_type
+                    body = await answer.json() if media == "application/json" else None
+                seen[method, path] = answer.status
+                told = path, method, answer.status, media, body
+                assert described.answers(*told), told
+                if path in TYPED:
+                    assert not described.answers(*told[:4], {"of": "nothing"}), path
     assert {one for one in seen if seen[one] == 200} > {("get", path) for path in TYPED}
     assert seen["post", "/api/recordings/{name}/report"] == 202
     assert seen["post", "/api/srv/stop"] == 200
     assert seen["post", "/api/srv/set"] == 409
 
 
-def test_a_path_with_another_method_says_which_it_takes(page: Page) -> None:
-    async def story() -> None:
-        async with aiohttp.ClientSession(page.here) as session:
-            async with session.get("/api/srv/stop") as answer:
-                assert (answer.status, answer.headers["Allow"]) == (405, "POST")
-                assert (await answer.json())["error"] == "this path accepts only POST"
-            async with session.post("/api/nothing") as answer:
-                assert answer.status == 404
-
-    run(story)
+async def test_a_path_with_another_method_says_which_it_takes(page: Page) -> None:
+    async with aiohttp.ClientSession(page.here) as session:
+        async with session.get("/api/srv/stop") as answer:
+            assert (answer.status, answer.headers["Allow"]) == (405, "POST")
+            assert (await answer.json())["error"] == "this path accepts only POST"
+        async with session.post("/api/nothing") as answer:
+            assert answer.status == 404
 
 
-def test_no_other_page_holds_ours_in_a_frame_or_lends_it_scripts(page: Page) -> None:
-    async def story() -> None:
-        async with aiohttp.ClientSession(page.here) as session:
-            for place in ("/", "/page/main.js", "/api/state", "/nothing"):
-                async with session.get(place) as answer:
-                    policy = answer.headers["Content-Security-Policy"].split("; ")
-                    assert {"default-src 'self'", "frame-ancestors 'none'"} <= set(policy)
-                    assert answer.headers["X-Frame-Options"] == "DENY"
-                    assert answer.headers["X-Content-Type-Options"] == "nosniff"
-
-    run(story)
+async def test_no_other_page_holds_ours_in_a_frame_or_lends_it_scripts(page: Page) -> None:
+    async with aiohttp.ClientSession(page.here) as session:
+        for place in ("/", "/page/main.js", "/api/state", "/nothing"):
+            async with session.get(place) as answer:
+                policy = answer.headers["Content-Security-Policy"].split("; ")
+                assert {"default-src 'self'", "frame-ancestors 'none'"} <= set(policy)
+                assert answer.headers["X-Frame-Options"] == "DENY"
+                assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemon) -> None:
-    async def story() -> None:
-        async with aiohttp.ClientSession(page.here) as session:
-            name = await first_recording(session)
-            async with session.get(f"/api/recordings/{name}") as answer:
-                assert (await answer.read()).startswith(b"\x89MCAP")
-
-    run(story)
+async def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemon) -> None:
+    async with aiohttp.ClientSession(page.here) as session:
+        name = await first_recording(session)
+        async with session.get(f"/api/recordings/{name}") as answer:
+            assert (await answer.read()).startswith(b"\x89MCAP")
 
 
 async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
@@ -287,43 +249,36 @@ async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_a_recording_is_drawn_as_a_page_that_has_nothing_to_do_with_ours(
+async def test_a_recording_is_drawn_as_a_page_that_has_nothing_to_do_with_ours(
     page: Page, bus: Bus
 ) -> None:
-    async def story() -> None:
-        async with aiohttp.ClientSession(page.here) as session:
-            name, told = await drawn(session)
-            assert told == {"status": 200, "report": "ready", "href": f"report/{name}"}
-            bodies = set()
-            for packing in ("gzip", "identity"):
-                asked = {"Accept-Encoding": packing}
-                async with session.get(f"/report/{name}", headers=asked) as answer:
-                    policy = answer.headers["Content-Security-Policy"]
-                    bodies.add(await answer.text())
-            (body,) = bodies
-            assert body.startswith("<!DOCTYPE html>")
-            assert "Plotly" in body
-            assert "sandbox allow-scripts;" in policy
-            assert "allow-same-origin" not in policy
-            assert "default-src 'none'" in policy
-
-    run(story)
+    async with aiohttp.ClientSession(page.here) as session:
+        name, told = await drawn(session)
+        assert told == {"status": 200, "report": "ready", "href": f"report/{name}"}
+        bodies = set()
+        for packing in ("gzip", "identity"):
+            asked = {"Accept-Encoding": packing}
+            async with session.get(f"/report/{name}", headers=asked) as answer:
+                policy = answer.headers["Content-Security-Policy"]
+                bodies.add(await answer.text())
+        (body,) = bodies
+        assert body.startswith("<!DOCTYPE html>")
+        assert "Plotly" in body
+        assert "sandbox allow-scripts;" in policy
+        assert "allow-same-origin" not in policy
+        assert "default-src 'none'" in policy
 
 
 @pytest.mark.slow
-def test_without_its_library_a_report_is_refused_with_what_to_type(
+async def test_without_its_library_a_report_is_refused_with_what_to_type(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     (tmp_path / "plotly.py").write_text("raise ImportError('not installed')")
-
-    async def story() -> None:
+    with Page(daemon, tmp_path, PYTHONPATH=str(tmp_path)) as without:
         async with aiohttp.ClientSession(without.here) as session:
             _, told = await drawn(session)
             assert (told["status"], told["report"]) == (503, "failed")
             assert re.search("needs the library plotly; run: .*pip install.*report", told["text"])
-
-    with Page(daemon, tmp_path, PYTHONPATH=str(tmp_path)) as without:
-        run(story)
 
 
 @pytest.mark.slow

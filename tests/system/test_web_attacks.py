@@ -15,7 +15,7 @@ import time
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +34,7 @@ from acsard.web.limits import (
     STOPS,
     STRANGERS,
 )
-from tests.system.browser import NAME, Hands, Page, hands, run
+from tests.system.browser import NAME, Hands, Page, hands
 from tests.system.harness import (
     PATIENCE_S,
     Bus,
@@ -202,27 +202,23 @@ ASKS: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
 
 
 @pytest.mark.parametrize("what", ASKS)
-def test_who_asks_for_what_he_may_not_have_is_refused(
+async def test_who_asks_for_what_he_may_not_have_is_refused(
     table: Table, bus: Bus, tokens: dict[str, str], what: str
 ) -> None:
     where, path, how, status, reason = ASKS[what]
-
-    async def asked() -> int:
+    with table.attack(what, str(status), reason):
         method, data = how.get("method", "GET"), how.get("data")
         async with table.page.client(tokens[how.get("token", "")]) as session:
             url = URL(f"{getattr(table.page, where)}{path}", encoded=True)
             headers = how.get("headers", {})
             async with session.request(method, url, headers=headers, data=data) as answer:
-                return answer.status
-
-    with table.attack(what, str(status), reason):
-        assert asyncio.run(asked()) == status
+                assert answer.status == status
 
 
-def test_who_asks_without_end_is_slowed_down_and_may_stop(
+async def test_who_asks_without_end_is_slowed_down_and_may_stop(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
-    async def asked() -> tuple[set[int], int]:
+    with table.attack("800 questions at once", "429", "too_fast", 100):
         async with table.page.client(tokens["viewer"]) as session:
 
             async def one(_: int) -> int:
@@ -235,10 +231,7 @@ def test_who_asks_without_end_is_slowed_down_and_may_stop(
             async with session.get(f"{table.page.away}/api/whoami") as answer:
                 assert answer.status == 200  # a page that reconnects is not locked out
             async with session.post(f"{table.page.away}/api/srv/stop") as answer:
-                return seen, answer.status
-
-    with table.attack("800 questions at once", "429", "too_fast", 100):
-        seen, stopped = asyncio.run(asked())
+                stopped = answer.status
         assert bus.get("srv/clear")["success"]
     assert seen <= {200, 429, 503}
     assert {200, 429} <= seen
@@ -276,12 +269,11 @@ def _opened(page: Page) -> socket.socket:
     return socket.create_connection(("127.0.0.1", int(page.here.rpartition(":")[2])), 30.0)
 
 
-def test_who_only_looks_drives_nothing_whatever_he_sends(
+async def test_who_only_looks_drives_nothing_whatever_he_sends(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
     commands = bus.count("commands")
-
-    async def story() -> None:
+    with table.attack("a viewer who drives", "told that he may not", "role", 21):
         async with hands(table.page, tokens["viewer"]) as theirs:
             for _ in range(20):
                 await theirs.drive(0.5)
@@ -289,9 +281,6 @@ def test_who_only_looks_drives_nothing_whatever_he_sends(
             refused = await theirs.find(lambda said: said.get("refused") == "cmd")
             assert "viewer" in refused["reason"]
             assert not (await theirs.call("set", settings={"limits.linear_speed": 9.0}))["ok"]
-
-    with table.attack("a viewer who drives", "told that he may not", "role", 21):
-        run(story)
     assert bus.count("commands") == commands
 
 
@@ -310,31 +299,26 @@ async def _known(ours: Hands, bus: Bus) -> None:
         ("20 stamps of tomorrow", -86400.0, "robot", "command_stale"),
     ],
 )
-def test_nobody_obeys_a_stamp_that_is_not_of_now(
+async def test_nobody_obeys_a_stamp_that_is_not_of_now(
     table: Table, bus: Bus, what: str, late_s: float, by: str, reason: str
 ) -> None:
     number = int(what.split()[0])
-
-    async def story() -> None:
-        async with hands(table.page) as ours:
-            await _known(ours, bus)
-            answer = "not handed on" if by == "page" else "not obeyed"
-            with table.attack(what, answer, reason, number, by):
-                for _ in range(number):
-                    await ours.drive(0.5, late_ms=1000 * late_s)
-                    await asyncio.sleep(0.01)
-                await asyncio.sleep(0.3)
-
-    run(story)
+    async with hands(table.page) as ours:
+        await _known(ours, bus)
+        answer = "not handed on" if by == "page" else "not obeyed"
+        with table.attack(what, answer, reason, number, by):
+            for _ in range(number):
+                await ours.drive(0.5, late_ms=1000 * late_s)
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0.3)
 
 
 @pytest.mark.parametrize("size", [100_000, 10_000_000])
-def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
+async def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
     table: Table, bus: Bus, size: int
 ) -> None:
     page = table.page
-
-    async def story() -> None:
+    with table.attack(f"a message of {size / 1e6:g} MB", "its connection ends", "too_big"):
         async with hands(page) as ours, hands(page) as theirs:
             before = resident_kb(page.pid)
             with suppress(ConnectionError):  # closed while it is still being sent
@@ -346,14 +330,11 @@ def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
             await ours.find(lambda said: "pong" in said)
             assert resident_kb(page.pid) < before + 5_000
 
-    with table.attack(f"a message of {size / 1e6:g} MB", "its connection ends", "too_big"):
-        run(story)
 
-
-def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flood_ends(
+async def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flood_ends(
     table: Table, bus: Bus
 ) -> None:
-    async def story() -> None:
+    with table.attack("1200 messages that are none", "its connection ends", "malformed", 600):
         async with hands(table.page) as ours:
             for _ in range(1200):
                 await ours.socket.send_str("{}")
@@ -364,36 +345,31 @@ def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flood_end
             assert ours.socket.close_code == 1008
             assert sum("refused" in one for one in told) < 50  # limited by the send rate
 
-    with table.attack("1200 messages that are none", "its connection ends", "malformed", 600):
-        run(story)
 
-
-def test_a_thousand_connections_leave_the_one_who_drives_his_page(table: Table, bus: Bus) -> None:
+async def test_a_thousand_connections_leave_the_one_who_drives_his_page(
+    table: Table, bus: Bus
+) -> None:
     page = table.page
     place = page.here.removeprefix("http://").split(":")
-
-    async def story() -> None:
-        async with hands(page) as ours:
-            await ours.say(subscribe="state", rate=50)
-            few = 1000 - SOCKETS_OF_ONE
-            with table.attack("1000 connections", "64 have places", "crowded", few, stands=False):
-                await ours.until_driving(0.3)
-                holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
-                idle = await _idle(place[0], int(place[1]), 1000)
-                await ours.say(ping=7)
-                await ours.find(lambda said: said.get("pong") == 7)
-                await ours.state(lambda s: s["mode"] == "driving")
-                async with asyncio.timeout(PATIENCE_S):
-                    while (left := sum(map(_waits, idle))) > SOCKETS_OF_ONE:
-                        await asyncio.sleep(0.01)
-                assert left == SOCKETS_OF_ONE
-                holding.cancel()
-                for one in idle:
-                    one.close()
-                await ours.drive(0.0)
-                bus.at_rest()
-
-    run(story)
+    async with hands(page) as ours:
+        await ours.say(subscribe="state", rate=50)
+        few = 1000 - SOCKETS_OF_ONE
+        with table.attack("1000 connections", "64 have places", "crowded", few, stands=False):
+            await ours.until_driving(0.3)
+            holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
+            idle = await _idle(place[0], int(place[1]), 1000)
+            await ours.say(ping=7)
+            await ours.find(lambda said: said.get("pong") == 7)
+            await ours.state(lambda s: s["mode"] == "driving")
+            async with asyncio.timeout(PATIENCE_S):
+                while (left := sum(map(_waits, idle))) > SOCKETS_OF_ONE:
+                    await asyncio.sleep(0.01)
+            assert left == SOCKETS_OF_ONE
+            holding.cancel()
+            for one in idle:
+                one.close()
+            await ours.drive(0.0)
+            bus.at_rest()
 
 
 async def _idle(host: str, port: int, number: int) -> list[socket.socket]:
@@ -415,21 +391,6 @@ def _waits(one: socket.socket) -> bool:
         return True
     except ConnectionError:
         return False
-
-
-def test_an_address_has_room_for_twenty_pages(table: Table, bus: Bus) -> None:
-    where = f"{table.page.here}/ws"
-
-    async def story() -> None:
-        async with aiohttp.ClientSession() as session, AsyncExitStack() as stack:
-            for _ in range(20):
-                await stack.enter_async_context(session.ws_connect(where))
-            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-                await session.ws_connect(where)
-            assert caught.value.status == 503
-
-    with table.attack("the 21st page of an address", "503", "too_many"):
-        run(story)
 
 
 def test_a_browser_with_many_cookies_of_other_ports_gets_the_page(table: Table) -> None:
@@ -486,19 +447,16 @@ def test_answers_that_nobody_reads_cost_little_memory(table: Table, bus: Bus, he
     assert most < 15_000
 
 
-def test_a_viewer_that_floods_with_pings_is_cut_off(
+async def test_a_viewer_that_floods_with_pings_is_cut_off(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
-    async def story() -> None:
+    with table.attack("a flood of pings", "cut off", "too_fast"):
         async with hands(table.page, tokens["viewer"]) as theirs:
             with suppress(ConnectionError):
                 for _ in range(30_000):
                     await theirs.socket.ping()
             await asyncio.wait_for(_drained(theirs), PATIENCE_S)
             assert theirs.socket.closed
-
-    with table.attack("a flood of pings", "cut off", "too_fast"):
-        run(story)
 
 
 @pytest.mark.nightly
@@ -563,7 +521,7 @@ ENDLESS: dict[str, tuple[str, int, Rate, str]] = {
 
 
 @pytest.mark.parametrize("what", ENDLESS)
-def test_a_client_that_asks_without_end_waits_and_is_not_refused(
+async def test_a_client_that_asks_without_end_waits_and_is_not_refused(
     table: Table, bus: Bus, tokens: dict[str, str], what: str
 ) -> None:
     said, clients, rate, status = ENDLESS[what]
@@ -593,56 +551,50 @@ def test_a_client_that_asks_without_end_waits_and_is_not_refused(
                 await reader.readexactly(int(length[1]) if length else 0)
             writer.transport.abort()
 
-    async def story() -> None:
-        end = time.monotonic() + lasts_s
-        await asyncio.gather(*(asks(end) for _ in range(clients)))
-
-    run(story)
+    end = time.monotonic() + lasts_s
+    await asyncio.gather(*(asks(end) for _ in range(clients)))
     print(f"\n{what}: {answers.total() / lasts_s:.0f} answers a second to {clients} clients")
     assert set(answers) == {status}
     lasts_s += HOLD_S  # an answer may come after the end
     assert answers.total() <= rate.most + (rate.hz + clients / HOLD_S) * lasts_s
 
 
-def test_a_stop_beyond_the_rate_is_sent_at_once_and_only_its_answer_waits(
+async def test_a_stop_beyond_the_rate_is_sent_at_once_and_only_its_answer_waits(
     page: Page, bus: Bus, tokens: dict[str, str]
 ) -> None:
-    async def story() -> None:
-        async with page.client(tokens["viewer"]) as session:
+    async with page.client(tokens["viewer"]) as session:
 
-            async def asks() -> None:
-                while True:
-                    async with session.get(f"{page.away}/api/whoami") as answer:
-                        await answer.read()
+        async def asks() -> None:
+            while True:
+                async with session.get(f"{page.away}/api/whoami") as answer:
+                    await answer.read()
 
-            async def stop() -> float:
-                begun = time.monotonic()
-                async with session.post(f"{page.away}/api/srv/stop") as answer:
-                    assert answer.status == 200
-                return time.monotonic() - begun
+        async def stop() -> float:
+            begun = time.monotonic()
+            async with session.post(f"{page.away}/api/srv/stop") as answer:
+                assert answer.status == 200
+            return time.monotonic() - begun
 
-            # These clients have the same rate, and take almost all of it.
-            others = [asyncio.create_task(asks()) for _ in range(50)]
-            await asyncio.sleep(2.0)
-            took = 0.0
-            for _ in range(20):
-                await asyncio.to_thread(bus.ask, "srv/clear")
-                asking = asyncio.create_task(stop())
-                await asyncio.to_thread(
-                    until, lambda: bus.state()["mode"] == "stopped", PATIENCE_S, "it stops"
-                )
-                early = not asking.done()
-                if (took := await asking) >= HOLD_S:
-                    assert early
-                    break
-            assert took >= HOLD_S
-            for one in others:
-                one.cancel()
-
-    run(story)
+        # These clients have the same rate, and take almost all of it.
+        others = [asyncio.create_task(asks()) for _ in range(50)]
+        await asyncio.sleep(2.0)
+        took = 0.0
+        for _ in range(20):
+            await asyncio.to_thread(bus.ask, "srv/clear")
+            asking = asyncio.create_task(stop())
+            await asyncio.to_thread(
+                until, lambda: bus.state()["mode"] == "stopped", PATIENCE_S, "it stops"
+            )
+            early = not asking.done()
+            if (took := await asking) >= HOLD_S:
+                assert early
+                break
+        assert took >= HOLD_S
+        for one in others:
+            one.cancel()
 
 
-def test_handshakes_of_one_network_wait_beyond_their_rate(table: Table, bus: Bus) -> None:
+async def test_handshakes_of_one_network_wait_beyond_their_rate(table: Table, bus: Bus) -> None:
     place, lasts_s, done = URL(table.page.away), 3.0, 0
 
     async def shakes(end: float) -> None:
@@ -657,21 +609,17 @@ def test_handshakes_of_one_network_wait_beyond_their_rate(table: Table, bus: Bus
                 done += 1
                 writer.transport.abort()
 
-    async def story() -> None:
-        end = time.monotonic() + lasts_s
-        await asyncio.gather(*(shakes(end) for _ in range(30)))
-
-    run(story)
+    end = time.monotonic() + lasts_s
+    await asyncio.gather(*(shakes(end) for _ in range(30)))
     print(f"\n{done / lasts_s:.0f} handshakes a second")
     assert done <= HANDSHAKES.most + HANDSHAKES.hz * lasts_s + 5
 
 
-def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
+async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
     place, trusting = URL(table.page.away), ssl._create_unverified_context()
-
-    async def story() -> None:
+    with table.attack("a crowd around a phone that loads", "it loads", "crowded", 10):
         async with table.page.client() as phone:
             form = {"token": tokens["viewer"]}
             async with phone.post(
@@ -699,9 +647,6 @@ def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
             one.close()
         writer.transport.abort()
 
-    with table.attack("a crowd around a phone that loads", "it loads", "crowded", 10):
-        run(story)
-
 
 TICK_S = 0.01
 VIEWERS, A_SECOND, LASTS_S = 6, 190, 3.0
@@ -718,7 +663,7 @@ class Cost(NamedTuple):
     """Periods for which the control loop waited for a core."""
 
 
-def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings_and_no_periods(
+async def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings_and_no_periods(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
     """The viewers are quiet, send pings and send stops in turns, as much as their limit allows."""
@@ -744,22 +689,19 @@ def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings_and_no_period
         waited = waited_for_a_core(daemon) - waited
         return Cost(spent, Periods.between(before, bus.state()).missed, waited / TICK_S)
 
-    async def story() -> None:
-        kinds = ("nothing", "pings", "stops")
-        waves = [(kind, await wave(kind)) for kind in kinds * 2]
-        quiet, pings, stops = (
-            Cost(*map(sum, zip(*(cost for kind, cost in waves if kind == wanted), strict=True)))
-            for wanted in kinds
-        )
-        for kind, cost in zip(kinds, (quiet, pings, stops), strict=True):
-            print(f"\nviewers send {kind}: {50 * cost.cpu_s / LASTS_S:.0f} % of a core, "
-                  f"{cost.missed} periods missed, {cost.waited:.1f} waited for a core")  # fmt: skip
-        assert stops.cpu_s < 2 * pings.cpu_s
-        assert stops.missed <= pings.missed + 2
-        # Other work on the machine may come in one wave and not in the other.
-        assert stops.missed <= quiet.missed + stops.waited + 2
-
-    run(story)
+    kinds = ("nothing", "pings", "stops")
+    waves = [(kind, await wave(kind)) for kind in kinds * 2]
+    quiet, pings, stops = (
+        Cost(*map(sum, zip(*(cost for kind, cost in waves if kind == wanted), strict=True)))
+        for wanted in kinds
+    )
+    for kind, cost in zip(kinds, (quiet, pings, stops), strict=True):
+        print(f"\nviewers send {kind}: {50 * cost.cpu_s / LASTS_S:.0f} % of a core, "
+              f"{cost.missed} periods missed, {cost.waited:.1f} waited for a core")  # fmt: skip
+    assert stops.cpu_s < 2 * pings.cpu_s
+    assert stops.missed <= pings.missed + 2
+    # Other work on the machine may come in one wave and not in the other.
+    assert stops.missed <= quiet.missed + stops.waited + 2
 
 
 async def _drained(ours: Hands) -> None:

@@ -74,40 +74,38 @@ def bus(robot: Daemon) -> Iterator[Bus]:
         yield bus
 
 
-def test_a_page_of_another_origin_sends_its_token_and_no_cookie(server: Page, origin: str) -> None:
+async def test_a_page_of_another_origin_sends_its_token_and_no_cookie(
+    server: Page, origin: str
+) -> None:
     token, told = server.invite("operator", "panel"), {"Origin": origin}
-
-    async def story() -> None:
-        async with server.client() as browser:
-            url = f"{server.away}/token"
-            async with browser.post(url, data={"token": token}, allow_redirects=False) as answer:
-                assert answer.status == 303
-            for headers, status in [({}, 200), (told, 401)]:
-                async with browser.get(f"{server.away}/api/state", headers=headers) as answer:
-                    assert answer.status == status
-            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-                await browser.ws_connect(f"{server.away}/ws", headers=told)
-            assert caught.value.status == 401
-            shown = {**told, "Authorization": f"Bearer {token}"}
-            async with browser.get(f"{server.away}/api/state", headers=shown) as answer:
-                assert answer.status == 200
-            mine = f"acsard.token.{token}"
-            opening = browser.ws_connect(
-                f"{server.away}/ws", headers=told, protocols=("acsard", mine)
-            )
-            async with opening as opened:
-                assert opened.protocol == "acsard"
-                assert json.loads((await opened.receive()).data)["hello"]["role"] == "operator"
-            for names in [["acsard", "acsard.token.wrong"], [mine]]:
-                with pytest.raises(aiohttp.WSServerHandshakeError):
-                    await browser.ws_connect(f"{server.away}/ws", headers=told, protocols=names)
-
-    run(story)
+    async with server.client() as browser:
+        url = f"{server.away}/token"
+        async with browser.post(url, data={"token": token}, allow_redirects=False) as answer:
+            assert answer.status == 303
+        for headers, status in [({}, 200), (told, 401)]:
+            async with browser.get(f"{server.away}/api/state", headers=headers) as answer:
+                assert answer.status == status
+        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+            await browser.ws_connect(f"{server.away}/ws", headers=told)
+        assert caught.value.status == 401
+        shown = {**told, "Authorization": f"Bearer {token}"}
+        async with browser.get(f"{server.away}/api/state", headers=shown) as answer:
+            assert answer.status == 200
+        mine = f"acsard.token.{token}"
+        opening = browser.ws_connect(f"{server.away}/ws", headers=told, protocols=("acsard", mine))
+        async with opening as opened:
+            assert opened.protocol == "acsard"
+            assert json.loads((await opened.receive()).data)["hello"]["role"] == "operator"
+        for names in [["acsard", "acsard.token.wrong"], [mine]]:
+            with pytest.raises(aiohttp.WSServerHandshakeError):
+                await browser.ws_connect(f"{server.away}/ws", headers=told, protocols=names)
     assert token not in server.stdout + server.stderr
 
 
 @pytest.mark.skipif(NODE is None, reason="needs node")
-def test_the_proxy_of_the_manual_makes_requests_look_like_the_page_s_own(server: Page) -> None:
+async def test_the_proxy_of_the_manual_makes_requests_look_like_the_page_s_own(
+    server: Page,
+) -> None:
     dumped = block("js") + "\nconst none = JSON.stringify;\n"
     dumped = dumped.replace("export default", "const config =") + "console.log(none(config));"
     done = finish([str(NODE), "--input-type=module", "-e", dumped], ROOT)
@@ -115,20 +113,16 @@ def test_the_proxy_of_the_manual_makes_requests_look_like_the_page_s_own(server:
     proxies: dict[str, Any] = json.loads(done.out)["server"]["proxy"]
     assert set(proxies) == {"/api", "/ws"}
     assert proxies["/ws"]["ws"] is True
-
-    async def story() -> None:
-        async with aiohttp.ClientSession() as session:
-            for told in proxies.values():
-                assert told["changeOrigin"] is True
-                written = json.dumps(told).replace("http://127.0.0.1:8080", server.here)
-                headers = {"Sec-Fetch-Site": "same-origin", **json.loads(written)["headers"]}
-                place = f"{server.here}/api/srv/stop"
-                async with session.post(place, headers=headers) as answer:
-                    assert answer.status == 200
-                async with session.ws_connect(f"{server.here}/ws", headers=headers) as opened:
-                    assert "hello" in (await opened.receive()).data
-
-    run(story)
+    async with aiohttp.ClientSession() as session:
+        for told in proxies.values():
+            assert told["changeOrigin"] is True
+            written = json.dumps(told).replace("http://127.0.0.1:8080", server.here)
+            headers = {"Sec-Fetch-Site": "same-origin", **json.loads(written)["headers"]}
+            place = f"{server.here}/api/srv/stop"
+            async with session.post(place, headers=headers) as answer:
+                assert answer.status == 200
+            async with session.ws_connect(f"{server.here}/ws", headers=headers) as opened:
+                assert "hello" in (await opened.receive()).data
 
 
 def test_a_finger_takes_over_from_a_program_that_names_no_source(server: Page, bus: Bus) -> None:
@@ -151,15 +145,12 @@ def test_a_finger_takes_over_from_a_program_that_names_no_source(server: Page, b
     bus.at_rest()
 
 
-def test_a_program_that_names_an_unknown_source_is_refused(server: Page) -> None:
-    async def story() -> None:
-        async with hands(server) as program:
-            program.source = "nobody"
-            await program.drive(0.1)
-            refused = await program.find(lambda said: said.get("refused") == "cmd")
-            assert "nobody is not one of the robot's sources: teleop, app" in refused["reason"]
-
-    run(story)
+async def test_a_program_that_names_an_unknown_source_is_refused(server: Page) -> None:
+    async with hands(server) as program:
+        program.source = "nobody"
+        await program.drive(0.1)
+        refused = await program.find(lambda said: said.get("refused") == "cmd")
+        assert "nobody is not one of the robot's sources: teleop, app" in refused["reason"]
 
 
 class _Silent(SimpleHTTPRequestHandler):

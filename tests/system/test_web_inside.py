@@ -27,7 +27,7 @@ from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
-from tests.system.browser import Hands, run
+from tests.system.browser import Hands
 from tests.system.harness import PATIENCE_S, Daemon, seconds
 
 pytestmark = pytest.mark.network
@@ -76,119 +76,104 @@ async def eventually(look: Callable[[], Any]) -> None:
             await asyncio.sleep(0.01)
 
 
-def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside) -> None:
-    async def story() -> None:
-        async with inside.hands() as ours:
-            await ours.find(lambda said: "hello" in said)
-            await ours.drive(0.0)
-            await eventually(lambda: inside.counts.all().get("commands_dropped"))
-            (viewer,) = inside.page._viewers
-            wire = cast(Any, ours.socket)._response.connection.transport
-            wire.pause_reading()
-            viewer._out.say({"more than a kernel holds": "x" * 20_000_000})
-            inside.page.end_all("your token has expired")
-            before = inside.counts.all()
-            for _ in range(20):
-                await ours.drive(0.5)
-                await asyncio.sleep(0.01)
-            await ours.say(ping=1)
-            await asyncio.sleep(0.2)
-            inside.parts.hand.outbox.flush(PATIENCE_S)
-            assert inside.counts.all() == before
-            wire.abort()
-
-    run(story)
+async def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside) -> None:
+    async with inside.hands() as ours:
+        await ours.find(lambda said: "hello" in said)
+        await ours.drive(0.0)
+        await eventually(lambda: inside.counts.all().get("commands_dropped"))
+        (viewer,) = inside.page._viewers
+        wire = cast(Any, ours.socket)._response.connection.transport
+        wire.pause_reading()
+        viewer._out.say({"more than a kernel holds": "x" * 20_000_000})
+        inside.page.end_all("your token has expired")
+        before = inside.counts.all()
+        for _ in range(20):
+            await ours.drive(0.5)
+            await asyncio.sleep(0.01)
+        await ours.say(ping=1)
+        await asyncio.sleep(0.2)
+        inside.parts.hand.outbox.flush(PATIENCE_S)
+        assert inside.counts.all() == before
+        wire.abort()
 
 
-def test_who_does_not_read_gets_the_newest_when_he_does_and_nothing_in_between(
+async def test_who_does_not_read_gets_the_newest_when_he_does_and_nothing_in_between(
     inside: Inside, tmp_path: Path
 ) -> None:
     def left_out() -> int:
         return inside.counts.all().get("frames_left_out", 0)
 
-    async def story(daemon: Daemon) -> None:
-        with client_session(daemon.endpoint, "") as session:
-            inside.robots.client = Client(session, "acsar", "teleop")
-            async with inside.hands() as ours:
-                await ours.say(subscribe="odom", rate=50)
-                await ours.find(lambda said: "key" in said)
-                assert left_out() == 0
-                wire = cast(Any, ours.socket)._response.connection.transport
-                wire.pause_reading()
-                (viewer,) = inside.page._viewers
-                while viewer._out._unread() <= UNREAD_BYTES:  # more than the kernels hold
-                    viewer._out.say("x" * 4096)
-                    await asyncio.sleep(0)
-                await eventually(lambda: left_out() >= MISSED)
-                wire.resume_reading()
-                stamps = [0.0]
-
-                def leaps(said: Any) -> bool:
-                    """Return whether a message skips over most of those that were not read."""
-                    if "key" not in said:
-                        return False
-                    stamps.append(seconds(said["value"]["header"]["stamp"]))
-                    return 0 < stamps[-2] < stamps[-1] - 0.5 * MISSED / 50
-
-                news = await ours.find(leaps)
-                assert news["age"] < 1000 * (stamps[-1] - stamps[-2]) / 2  # it is the newest one
-
-    with Daemon(tmp_path) as daemon:
-        run(lambda: story(daemon))
-
-
-def test_a_stamp_that_no_signature_holds_is_refused_and_the_hand_lives(inside: Inside) -> None:
-    async def story() -> None:
+    with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
+        inside.robots.client = Client(session, "acsar", "teleop")
         async with inside.hands() as ours:
-            wish = {"linear_x": 0.2, "angular_z": 0.0}
-            await ours.say(cmd=wish, stamp=MOST / 1e6)
-            refused = await ours.find(lambda said: said.get("refused") == "cmd")
-            assert "ms since 1970" in refused["reason"]
-            await ours.drive(0.0)
-            await eventually(lambda: inside.counts.all().get("commands_dropped"))
+            await ours.say(subscribe="odom", rate=50)
+            await ours.find(lambda said: "key" in said)
+            assert left_out() == 0
+            wire = cast(Any, ours.socket)._response.connection.transport
+            wire.pause_reading()
+            (viewer,) = inside.page._viewers
+            while viewer._out._unread() <= UNREAD_BYTES:  # more than the kernels hold
+                viewer._out.say("x" * 4096)
+                await asyncio.sleep(0)
+            await eventually(lambda: left_out() >= MISSED)
+            wire.resume_reading()
+            stamps = [0.0]
 
-    run(story)
+            def leaps(said: Any) -> bool:
+                """Return whether a message skips over most of those that were not read."""
+                if "key" not in said:
+                    return False
+                stamps.append(seconds(said["value"]["header"]["stamp"]))
+                return 0 < stamps[-2] < stamps[-1] - 0.5 * MISSED / 50
+
+            news = await ours.find(leaps)
+            assert news["age"] < 1000 * (stamps[-1] - stamps[-2]) / 2  # it is the newest one
 
 
-def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
-    async def story() -> None:
-        async with inside.hands() as ours:
-            for n in range(3 * OVERRUNS):
-                await ours.say(call="stop", id=n)
-            async with asyncio.timeout(PATIENCE_S):
-                while (await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
-                    pass
-            assert ours.socket.close_code == 1008
+async def test_a_stamp_that_no_signature_holds_is_refused_and_the_hand_lives(
+    inside: Inside,
+) -> None:
+    async with inside.hands() as ours:
+        wish = {"linear_x": 0.2, "angular_z": 0.0}
+        await ours.say(cmd=wish, stamp=MOST / 1e6)
+        refused = await ours.find(lambda said: said.get("refused") == "cmd")
+        assert "ms since 1970" in refused["reason"]
+        await ours.drive(0.0)
+        await eventually(lambda: inside.counts.all().get("commands_dropped"))
 
-    run(story)
+
+async def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
+    async with inside.hands() as ours:
+        for n in range(3 * OVERRUNS):
+            await ours.say(call="stop", id=n)
+        async with asyncio.timeout(PATIENCE_S):
+            while (await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
+                pass
+        assert ours.socket.close_code == 1008
 
 
-def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
+async def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
     inside: Inside, tmp_path: Path
 ) -> None:
-    async def story(daemon: Daemon) -> None:
-        with client_session(daemon.endpoint, "") as session:
-            inside.robots.client = Client(session, "acsar", "teleop")
-            async with inside.hands() as ours:
+    with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
+        inside.robots.client = Client(session, "acsar", "teleop")
+        async with inside.hands() as ours:
+            await ours.say(subscribe="state", rate=10)
+            await ours.state(lambda state: state["mode"])
+            for _ in range(20):
+                await ours.say(unsubscribe="state")
                 await ours.say(subscribe="state", rate=10)
-                await ours.state(lambda state: state["mode"])
-                for _ in range(20):
-                    await ours.say(unsubscribe="state")
-                    await ours.say(subscribe="state", rate=10)
-                await ours.say(ping=1)
-                await ours.find(lambda said: "pong" in said)
-                await ours.state(lambda state: state["mode"])
-                (viewer,) = inside.page._viewers
-                assert list(viewer._out.following) == [("acsar", "state")]
-
-    with Daemon(tmp_path) as daemon:
-        run(lambda: story(daemon))
+            await ours.say(ping=1)
+            await ours.find(lambda said: "pong" in said)
+            await ours.state(lambda state: state["mode"])
+            (viewer,) = inside.page._viewers
+            assert list(viewer._out.following) == [("acsar", "state")]
 
 
-def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
+async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
     inside: Inside, tmp_path: Path
 ) -> None:
-    async def story(daemon: Daemon) -> None:
+    with Daemon(tmp_path) as daemon:
         closed = client_session(daemon.endpoint, "")
         closed.close()
         inside.robots.client = Client(closed, "acsar", "teleop")
@@ -200,14 +185,11 @@ def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
                 inside.robots.client = Client(session, "acsar", "teleop")
                 await ours.state(lambda state: state["mode"])
 
-    with Daemon(tmp_path) as daemon:
-        run(lambda: story(daemon))
 
-
-def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
+async def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
     inside: Inside, tmp_path: Path
 ) -> None:
-    async def story(daemon: Daemon) -> None:
+    with Daemon(tmp_path) as daemon:
         closed = client_session(daemon.endpoint, "")
         closed.close()
         way = Client(closed, "acsar", "teleop")
@@ -217,34 +199,23 @@ def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
         assert not running.done()
         running.cancel()
 
-    with Daemon(tmp_path) as daemon:
-        run(lambda: story(daemon))
 
-
-def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
+async def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
     address = Address("tcp/127.0.0.1:1", "acsar", "")
     wanted = Wanted(Config(), address, (), "", tmp_path)
-
-    async def story() -> None:
-        inside.parts.hand.outbox.dead.set_exception(MemoryError("no room"))
-        with pytest.raises(MemoryError):
-            await _until(asyncio.Event(), inside.parts, inside.page, wanted)
-
-    run(story)
+    inside.parts.hand.outbox.dead.set_exception(MemoryError("no room"))
+    with pytest.raises(MemoryError):
+        await _until(asyncio.Event(), inside.parts, inside.page, wanted)
 
 
-def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
+async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
     inside = Inside(tmp_path, WebConfig(local="operator"))
-
-    async def story() -> None:
-        async with inside.hands() as ours:
-            hello = (await ours.find(lambda said: "hello" in said))["hello"]
-            assert hello["role"] == "operator"
-            assert {"set", "begin"} <= hello["barred"].keys()
-            assert not (await ours.call("set", settings={}))["ok"]
-        assert inside.counts.refused() == {"role": 1}
-
-    run(story)
+    async with inside.hands() as ours:
+        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        assert hello["role"] == "operator"
+        assert {"set", "begin"} <= hello["barred"].keys()
+        assert not (await ours.call("set", settings={}))["ok"]
+    assert inside.counts.refused() == {"role": 1}
 
 
 DASHBOARD = "http://127.0.0.1:5173"
@@ -255,64 +226,58 @@ def shared(tmp_path: Path) -> Inside:
     return Inside(tmp_path, WebConfig(origins=(DASHBOARD,)))
 
 
-def test_a_page_of_a_listed_origin_may_ask_and_read_and_any_other_may_not(shared: Inside) -> None:
+async def test_a_page_of_a_listed_origin_may_ask_and_read_and_any_other_may_not(
+    shared: Inside,
+) -> None:
     """Another page of this machine, and the robot's own, are tried as well."""
-
-    async def story() -> None:
-        async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
-            place, own = server.make_url("/api/srv/stop"), f"http://127.0.0.1:{server.port}"
-            for origin, status, readable in [
-                (DASHBOARD, 409, DASHBOARD),  # there is no robot to stop
-                ("http://127.0.0.1:5174", 403, None),
-                ("http://localhost:5173", 403, None),
-                ("https://127.0.0.1:5173", 403, None),
-                ("null", 403, None),
-                (own, 409, None),
-            ]:
-                told = {"Origin": origin, "Sec-Fetch-Site": "same-site"}
-                if origin == own:
-                    told["Sec-Fetch-Site"] = "same-origin"
-                async with session.post(place, headers=told) as answer:
-                    assert answer.status == status, origin
-                    assert answer.headers.get("Access-Control-Allow-Origin") == readable
-                    assert "Access-Control-Allow-Credentials" not in answer.headers
-                    assert answer.headers["Vary"] == "Origin"
-
-    run(story)
+    async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
+        place, own = server.make_url("/api/srv/stop"), f"http://127.0.0.1:{server.port}"
+        for origin, status, readable in [
+            (DASHBOARD, 409, DASHBOARD),  # there is no robot to stop
+            ("http://127.0.0.1:5174", 403, None),
+            ("http://localhost:5173", 403, None),
+            ("https://127.0.0.1:5173", 403, None),
+            ("null", 403, None),
+            (own, 409, None),
+        ]:
+            told = {"Origin": origin, "Sec-Fetch-Site": "same-site"}
+            if origin == own:
+                told["Sec-Fetch-Site"] = "same-origin"
+            async with session.post(place, headers=told) as answer:
+                assert answer.status == status, origin
+                assert answer.headers.get("Access-Control-Allow-Origin") == readable
+                assert "Access-Control-Allow-Credentials" not in answer.headers
+                assert answer.headers["Vary"] == "Origin"
 
 
-def test_a_browser_learns_what_a_page_of_a_listed_origin_may_send(shared: Inside) -> None:
-    async def story() -> None:
-        async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
-            place = server.make_url("/api/srv/clear")
-            asked = {"Access-Control-Request-Method": "POST"}
-            async with session.options(place, headers=asked | {"Origin": DASHBOARD}) as answer:
-                assert answer.status == 204
-                assert answer.headers["Access-Control-Allow-Origin"] == DASHBOARD
-                assert "Authorization" in answer.headers["Access-Control-Allow-Headers"]
-            for strange in ({"Origin": "http://evil.example"}, {}):
-                async with session.options(place, headers=asked | strange) as answer:
-                    assert answer.status in (403, 405)
-                    assert "Access-Control-Allow-Origin" not in answer.headers
-            evil = asked | {"Origin": DASHBOARD, "Host": "evil.example"}
-            async with session.options(place, headers=evil) as answer:
-                assert answer.status == 403
-
-    run(story)
+async def test_a_browser_learns_what_a_page_of_a_listed_origin_may_send(shared: Inside) -> None:
+    async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
+        place = server.make_url("/api/srv/clear")
+        asked = {"Access-Control-Request-Method": "POST"}
+        async with session.options(place, headers=asked | {"Origin": DASHBOARD}) as answer:
+            assert answer.status == 204
+            assert answer.headers["Access-Control-Allow-Origin"] == DASHBOARD
+            assert "Authorization" in answer.headers["Access-Control-Allow-Headers"]
+        for strange in ({"Origin": "http://evil.example"}, {}):
+            async with session.options(place, headers=asked | strange) as answer:
+                assert answer.status in (403, 405)
+                assert "Access-Control-Allow-Origin" not in answer.headers
+        evil = asked | {"Origin": DASHBOARD, "Host": "evil.example"}
+        async with session.options(place, headers=evil) as answer:
+            assert answer.status == 403
 
 
-def test_a_page_of_a_listed_origin_opens_the_socket_and_exchanges_no_link(shared: Inside) -> None:
-    async def story() -> None:
-        async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
-            place, told = server.make_url("/ws"), {"Origin": DASHBOARD}
-            async with session.ws_connect(place, headers=told) as opened:
-                assert "hello" in (await opened.receive()).data
-            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-                await session.ws_connect(place, headers={"Origin": "http://127.0.0.1:5174"})
-            assert caught.value.status == 403
-            url = server.make_url("/token")
-            async with session.post(url, json={"token": "x"}, headers=told) as answer:
-                assert answer.status == 403
-                assert "another site" in (await answer.json())["error"]
-
-    run(story)
+async def test_a_page_of_a_listed_origin_opens_the_socket_and_exchanges_no_link(
+    shared: Inside,
+) -> None:
+    async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
+        place, told = server.make_url("/ws"), {"Origin": DASHBOARD}
+        async with session.ws_connect(place, headers=told) as opened:
+            assert "hello" in (await opened.receive()).data
+        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+            await session.ws_connect(place, headers={"Origin": "http://127.0.0.1:5174"})
+        assert caught.value.status == 403
+        url = server.make_url("/token")
+        async with session.post(url, json={"token": "x"}, headers=told) as answer:
+            assert answer.status == 403
+            assert "another site" in (await answer.json())["error"]

@@ -80,32 +80,28 @@ def let_go(daemon: Daemon, page: Page, way: Way) -> None:
         run(story)
 
 
-@pytest.mark.network
+TIMES = pytest.mark.parametrize(
+    "times",
+    [
+        pytest.param(1, marks=pytest.mark.network),
+        pytest.param(100, marks=[pytest.mark.soak, pytest.mark.timeout(3600)]),
+    ],
+)
+
+
+@TIMES
 @pytest.mark.parametrize("way", OF_THE_BROWSER, ids=lambda way: way.__name__)
-def test_who_lets_go_drives_no_more(daemon: Daemon, page: Page, way: Way) -> None:
-    let_go(daemon, page, way)
-
-
-@pytest.mark.network
-@pytest.mark.parametrize("way", OF_THE_SERVER, ids=lambda way: way.__name__)
-def test_whose_page_ends_drives_no_more(daemon: Daemon, tmp_path: Path, way: Way) -> None:
-    with Page(daemon, tmp_path) as page:
+def test_who_lets_go_drives_no_more(daemon: Daemon, page: Page, way: Way, times: int) -> None:
+    for _ in range(times):
         let_go(daemon, page, way)
 
 
-@pytest.mark.soak
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize("way", OF_THE_BROWSER, ids=lambda way: way.__name__)
-def test_a_hundred_times(daemon: Daemon, page: Page, way: Way) -> None:
-    for _ in range(100):
-        let_go(daemon, page, way)
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(3600)
+@TIMES
 @pytest.mark.parametrize("way", OF_THE_SERVER, ids=lambda way: way.__name__)
-def test_a_hundred_ends_of_the_server(daemon: Daemon, tmp_path: Path, way: Way) -> None:
-    for n in range(100):
+def test_whose_page_ends_drives_no_more(
+    daemon: Daemon, tmp_path: Path, way: Way, times: int
+) -> None:
+    for n in range(times):
         where = tmp_path / str(n)
         where.mkdir()
         with Page(daemon, where) as page:

@@ -11,7 +11,7 @@ import aiohttp
 import pytest
 import zenoh
 
-from tests.system.browser import Page, hands, run
+from tests.system.browser import Page, hands
 from tests.system.chromium import CHROMIUM, PHONE, browsing
 from tests.system.harness import Bus, Daemon, Tables, client_config, free_endpoint, until
 
@@ -55,67 +55,55 @@ def cleared(two: Two) -> None:
         bus.at_rest()
 
 
-def test_another_robot_is_followed_and_stopped_and_only_that(two: Two) -> None:
-    async def story() -> None:
-        async with hands(two.page) as ours:
-            await ours.say(subscribe="fleet")
-            seen = await ours.find(lambda said: len(said.get("fleet", ())) == 2)
-            assert [one["robot"] for one in seen["fleet"]] == [OURS, THEIRS]
-            assert seen["note"] == ""
-            await ours.say(subscribe="state", robot=THEIRS)
-            state = await ours.find(lambda said: said.get("robot") == THEIRS)
-            assert state["value"]["mode"] == "ready"
-            await ours.say(call="stop", id=1, robot=THEIRS)
-            assert (await ours.find(lambda said: said.get("answer") == 1))["ok"]
-            await ours.say(call="clear", id=2, robot=THEIRS)
-            refused = await ours.find(lambda said: said.get("answer") == 2)
-            assert not refused["ok"]
-            assert "its own page" in refused["text"]
-
-    run(story)
+async def test_another_robot_is_followed_and_stopped_and_only_that(two: Two) -> None:
+    async with hands(two.page) as ours:
+        await ours.say(subscribe="fleet")
+        seen = await ours.find(lambda said: len(said.get("fleet", ())) == 2)
+        assert [one["robot"] for one in seen["fleet"]] == [OURS, THEIRS]
+        assert seen["note"] == ""
+        await ours.say(subscribe="state", robot=THEIRS)
+        state = await ours.find(lambda said: said.get("robot") == THEIRS)
+        assert state["value"]["mode"] == "ready"
+        await ours.say(call="stop", id=1, robot=THEIRS)
+        assert (await ours.find(lambda said: said.get("answer") == 1))["ok"]
+        await ours.say(call="clear", id=2, robot=THEIRS)
+        refused = await ours.find(lambda said: said.get("answer") == 2)
+        assert not refused["ok"]
+        assert "its own page" in refused["text"]
     assert two.theirs.state()["mode"] == "stopped"
     assert two.ours.state()["mode"] == "ready"
     (stopped,) = [one for one in two.theirs.get("events")["events"] if one["name"] == "stop"][-1:]
     assert stopped["by"].startswith("here@page")
 
 
-def test_a_page_without_a_connection_stops_another_robot_too(two: Two) -> None:
-    async def story() -> None:
-        async with aiohttp.ClientSession(two.page.here) as session:
-            wishes = ((THEIRS, "stop", 200), (THEIRS, "clear", 403), (3, "stop", 400))
-            for robot, verb, status in wishes:
-                async with session.post(f"/api/srv/{verb}", json={"robot": robot}) as answer:
-                    assert answer.status == status, await answer.text()
-
-    run(story)
+async def test_a_page_without_a_connection_stops_another_robot_too(two: Two) -> None:
+    async with aiohttp.ClientSession(two.page.here) as session:
+        wishes = ((THEIRS, "stop", 200), (THEIRS, "clear", 403), (3, "stop", 400))
+        for robot, verb, status in wishes:
+            async with session.post(f"/api/srv/{verb}", json={"robot": robot}) as answer:
+                assert answer.status == status, await answer.text()
     assert two.theirs.state()["mode"] == "stopped"
     assert two.ours.state()["mode"] == "ready"
 
 
-def test_a_robot_that_is_not_there_or_cannot_be_is_not_said_to_be_stopped(two: Two) -> None:
-    async def story() -> None:
-        async with hands(two.page) as ours:
-            names = {"robot3": "no answer", "a/**": "not a robot's id"}
-            for name, why in names.items():
-                await ours.say(call="stop", robot=name)
-                answer = await ours.find(lambda said: "answer" in said)
-                assert not answer["ok"]
-                assert why in answer["text"]
-
-    run(story)
+async def test_a_robot_that_is_not_there_or_cannot_be_is_not_said_to_be_stopped(two: Two) -> None:
+    async with hands(two.page) as ours:
+        names = {"robot3": "no answer", "a/**": "not a robot's id"}
+        for name, why in names.items():
+            await ours.say(call="stop", robot=name)
+            answer = await ours.find(lambda said: "answer" in said)
+            assert not answer["ok"]
+            assert why in answer["text"]
 
 
-def test_beside_a_daemon_it_says_why_it_sees_no_others(two: Two, tmp_path: Path) -> None:
-    async def story() -> None:
+async def test_beside_a_daemon_it_says_why_it_sees_no_others(two: Two, tmp_path: Path) -> None:
+    with Page(two.daemon, tmp_path) as beside:
         async with hands(beside) as ours:
             await ours.say(subscribe="fleet")
             seen = await ours.find(lambda said: said.get("fleet"))
             assert [one["robot"] for one in seen["fleet"]] == [OURS]
             assert "daemons forward no messages" in seen["note"]
             assert f"acsard web --connect ROUTER --id {OURS}" in seen["note"]
-
-    with Page(two.daemon, tmp_path) as beside:
-        run(story)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")

@@ -26,7 +26,6 @@ from acsard.web.limits import (
     CONNECTIONS_ALIKE,
     CONNECTIONS_HERE,
     CONNECTIONS_OF_ONE,
-    CONNECTIONS_OF_TOKEN,
 )
 from acsard.web.server import TIDY_S
 from tests.system.browser import NAME, Page, hands, run
@@ -54,135 +53,118 @@ def bus(standing: Bus) -> Bus:
     return standing
 
 
-def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
+async def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
     page: Page, bus: Bus, operator: str, viewer: str
 ) -> None:
-    async def story() -> None:
-        async with hands(page, operator) as ours, hands(page, viewer) as theirs:
-            await ours.say(subscribe="state", rate=50)
-            sender = (await ours.find(lambda said: "hello" in said))["hello"]["sender"]
-            assert sender.startswith("phone/")
-            await ours.until_driving(0.3)
-            state = bus.state()
-            assert (state["source"], state["sender"]) == ("teleop", sender)
-            holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
-            answer = await theirs.call("stop")
-            assert answer["ok"], answer
-            state = await ours.state(lambda s: s["mode"] == "stopped" and s["linear"] == 0)
-            holding.cancel()
-            refused = await theirs.call("clear")
-            assert not refused["ok"]
-            assert "operator" in refused["text"]
-            plain = await ours.call("clear")
-            assert not plain["ok"]
-            assert "look at the robot" in plain["text"]
-            assert (await ours.call("clear", latch=state["latch"]))["ok"]
-
-    run(story)
+    async with hands(page, operator) as ours, hands(page, viewer) as theirs:
+        await ours.say(subscribe="state", rate=50)
+        sender = (await ours.find(lambda said: "hello" in said))["hello"]["sender"]
+        assert sender.startswith("phone/")
+        await ours.until_driving(0.3)
+        state = bus.state()
+        assert (state["source"], state["sender"]) == ("teleop", sender)
+        holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
+        answer = await theirs.call("stop")
+        assert answer["ok"], answer
+        state = await ours.state(lambda s: s["mode"] == "stopped" and s["linear"] == 0)
+        holding.cancel()
+        refused = await theirs.call("clear")
+        assert not refused["ok"]
+        assert "operator" in refused["text"]
+        plain = await ours.call("clear")
+        assert not plain["ok"]
+        assert "look at the robot" in plain["text"]
+        assert (await ours.call("clear", latch=state["latch"]))["ok"]
 
 
-def test_an_invitation_is_a_link_and_a_code_and_lets_in(page: Page) -> None:
+async def test_an_invitation_is_a_link_and_a_code_and_lets_in(page: Page) -> None:
     told = page.tokens("--invite", "operator", "--name", "guest", "--days", "30")
     assert "guest is operator until" in told
     assert any(char in told for char in "▀▄█")  # the code
     (link,) = re.findall(r"https://\S+:\d+/#token=(\S+)", told)
-
-    async def story() -> None:
-        async with hands(page, link) as ours:
-            hello = (await ours.find(lambda said: "hello" in said))["hello"]
-            assert hello["role"] == "operator"
-
-    run(story)
+    async with hands(page, link) as ours:
+        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        assert hello["role"] == "operator"
     assert re.search(r"^guest +operator ", page.tokens("--tokens"), re.M)
 
 
-def test_a_new_certificate_is_used_and_open_connections_stay(page: Page, operator: str) -> None:
+async def test_a_new_certificate_is_used_and_open_connections_stay(
+    page: Page, operator: str
+) -> None:
     endpoint = page.away.replace("https://", "tls/").replace(NAME, "127.0.0.1")
     before_ns = peer_ends_ns(endpoint, str(page.tls))
     assert before_ns is not None
-
-    async def story() -> None:
-        async with hands(page, operator) as ours:
-            await ours.find(lambda said: "hello" in said)
-            names = [NAME, "renamed.local"]
-            Authority.load(page.tls, str).issue(page.tls, "robot", names, 0.5)
-            while (peer_ends_ns(endpoint, str(page.tls)) or 0) >= before_ns:
-                await asyncio.sleep(0.2)
-            await ours.say(subscribe="state", rate=50)
-            await ours.state(lambda state: True)
-        async with page.client() as session:
-            for host, status in (("renamed.local", 401), ("another.local", 403)):
-                header = {"Host": host}
-                async with session.get(f"{page.away}/api/whoami", headers=header) as answer:
-                    # The page knows the new name, and asks only there for a token.
-                    assert answer.status == status
-
-    run(story)
+    async with hands(page, operator) as ours:
+        await ours.find(lambda said: "hello" in said)
+        names = [NAME, "renamed.local"]
+        Authority.load(page.tls, str).issue(page.tls, "robot", names, 0.5)
+        while (peer_ends_ns(endpoint, str(page.tls)) or 0) >= before_ns:
+            await asyncio.sleep(0.2)
+        await ours.say(subscribe="state", rate=50)
+        await ours.state(lambda state: True)
+    async with page.client() as session:
+        for host, status in (("renamed.local", 401), ("another.local", 403)):
+            header = {"Host": host}
+            async with session.get(f"{page.away}/api/whoami", headers=header) as answer:
+                # The page knows the new name, and asks only there for a token.
+                assert answer.status == status
 
 
-def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(page: Page) -> None:
+async def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(
+    page: Page,
+) -> None:
     token = page.invite("operator", "lent")
-
-    async def story() -> None:
-        async with page.client() as session:
-            form = {"token": token}
-            async with session.post(
-                f"{page.away}/token", data=form, allow_redirects=False
-            ) as answer:
-                assert answer.status == 303
-                cookie = answer.headers["Set-Cookie"]
-            for word in ("__Host-acsard-", "HttpOnly", "Secure", "SameSite=Strict", "Path=/"):
-                assert word in cookie
-            async with session.get(f"{page.away}/api/whoami") as answer:
-                assert await answer.json() == {"role": "operator", "name": "lent", "full": ""}
-            async with session.ws_connect(f"{page.away}/ws") as ours:
-                page.tokens("--revoke", "lent")
-                async with asyncio.timeout(PATIENCE_S):
-                    while (await ours.receive()).type == aiohttp.WSMsgType.TEXT:
-                        pass
-            async with session.get(f"{page.away}/api/state") as answer:
-                assert answer.status == 401
-
-    run(story)
+    async with page.client() as session:
+        form = {"token": token}
+        async with session.post(f"{page.away}/token", data=form, allow_redirects=False) as answer:
+            assert answer.status == 303
+            cookie = answer.headers["Set-Cookie"]
+        for word in ("__Host-acsard-", "HttpOnly", "Secure", "SameSite=Strict", "Path=/"):
+            assert word in cookie
+        async with session.get(f"{page.away}/api/whoami") as answer:
+            assert await answer.json() == {"role": "operator", "name": "lent", "full": ""}
+        async with session.ws_connect(f"{page.away}/ws") as ours:
+            page.tokens("--revoke", "lent")
+            async with asyncio.timeout(PATIENCE_S):
+                while (await ours.receive()).type == aiohttp.WSMsgType.TEXT:
+                    pass
+        async with session.get(f"{page.away}/api/state") as answer:
+            assert answer.status == 401
     assert "lent" not in page.tokens("--tokens")
     assert token not in page.stdout + page.stderr
 
 
-def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(page: Page) -> None:
+async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(page: Page) -> None:
     token = {role: page.invite(role, f"my-{role}") for role in ROLES}
+    async with page.client() as phone:
 
-    async def story() -> None:
-        async with page.client() as phone:
+        async def opens(role: Role, replace: bool = False) -> tuple[int, str]:
+            """Return the status and whose cookie the browser has then."""
+            form = {"token": token[role], "replace": replace}
+            url = f"{page.away}/token"
+            async with phone.post(url, json=form, allow_redirects=False) as answer:
+                status, told = answer.status, await answer.text()
+            assert status == 303 or "my-operator (operator) here" in told
+            async with phone.get(f"{page.away}/api/whoami") as answer:
+                return status, (await answer.json())["role"]
 
-            async def opens(role: Role, replace: bool = False) -> tuple[int, str]:
-                """Return the status and whose cookie the browser has then."""
-                form = {"token": token[role], "replace": replace}
-                url = f"{page.away}/token"
-                async with phone.post(url, json=form, allow_redirects=False) as answer:
-                    status, told = answer.status, await answer.text()
-                assert status == 303 or "my-operator (operator) here" in told
-                async with phone.get(f"{page.away}/api/whoami") as answer:
-                    return status, (await answer.json())["role"]
-
-            assert await opens("operator") == (303, "operator")
-            assert await opens("viewer") == (409, "operator")
-            assert await opens("operator") == (303, "operator")
-            assert await opens("maintainer") == (303, "maintainer")
-            assert await opens("operator", replace=True) == (303, "operator")
-            assert await opens("viewer", replace=True) == (303, "viewer")
-            page.vault.revoke("my-viewer")
-            assert await opens("operator") == (303, "operator")
-
-    run(story)
+        assert await opens("operator") == (303, "operator")
+        assert await opens("viewer") == (409, "operator")
+        assert await opens("operator") == (303, "operator")
+        assert await opens("maintainer") == (303, "maintainer")
+        assert await opens("operator", replace=True) == (303, "operator")
+        assert await opens("viewer", replace=True) == (303, "viewer")
+        page.vault.revoke("my-viewer")
+        assert await opens("operator") == (303, "operator")
 
 
-def test_two_pages_on_one_host_leave_each_other_s_phones_in(
+async def test_two_pages_on_one_host_leave_each_other_s_phones_in(
     page: Page, daemon: Daemon, tmp_path: Path
 ) -> None:
     """A browser's cookies do not depend on ports."""
     shutil.copytree(page.tls, tmp_path / "tls")
-
-    async def story() -> None:
+    with Page(daemon, tmp_path) as other:
+        rooms = [(page, "first"), (other, "second")]
         invited = [(one, one.invite("operator", name)) for one, name in rooms]
         async with page.client() as phone:
             for one, token in invited:
@@ -195,41 +177,33 @@ def test_two_pages_on_one_host_leave_each_other_s_phones_in(
                 async with phone.get(f"{one.away}/api/whoami") as answer:
                     assert (await answer.json()).get("name") == name
 
-    with Page(daemon, tmp_path) as other:
-        rooms = [(page, "first"), (other, "second")]
-        run(story)
 
-
-def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_stops(
+async def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_stops(
     page: Page, bus: Bus
 ) -> None:
     token = page.invite("operator", "trusted")
-
-    async def story() -> None:
-        async with hands(page, token) as ours:
-            await ours.say(subscribe="state", rate=10)
-            await ours.until_driving(0.3)
-            holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
-            page.vault.revoke("trusted")
-            begun = time.monotonic()
-            async with asyncio.timeout(PATIENCE_S):
-                while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
-                    pass
-            ended = time.monotonic()
-            assert (message.type, message.extra) == (
-                aiohttp.WSMsgType.CLOSE,
-                "your token has expired",
-            )
-            # The server looks it up that often, and may wait for a core as this process does.
-            assert ended - begun < TIDY_S + PASSES_S + 4 * lost(begun, ended)
-            bus.at_rest()
-            with suppress(ConnectionError):
-                await holding
-
-    run(story)
+    async with hands(page, token) as ours:
+        await ours.say(subscribe="state", rate=10)
+        await ours.until_driving(0.3)
+        holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
+        page.vault.revoke("trusted")
+        begun = time.monotonic()
+        async with asyncio.timeout(PATIENCE_S):
+            while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
+                pass
+        ended = time.monotonic()
+        assert (message.type, message.extra) == (
+            aiohttp.WSMsgType.CLOSE,
+            "your token has expired",
+        )
+        # The server looks it up that often, and may wait for a core as this process does.
+        assert ended - begun < TIDY_S + PASSES_S + 4 * lost(begun, ended)
+        bus.at_rest()
+        with suppress(ConnectionError):
+            await holding
 
 
-def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(page: Page) -> None:
+async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(page: Page) -> None:
     names = [f"{name}-{time.time_ns()}" for name in ("borrowed", "owned")]
     tokens = [page.invite("viewer", name) for name in names]
     port = int(page.away.rpartition(":")[2])
@@ -246,41 +220,19 @@ def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(page: Pa
         await reader.readuntil(b"}")
         return reader, writer
 
-    async def story() -> None:
-        (borrowed, first), (owned, second) = [await opened(one) for one in tokens]
-        page.vault.revoke(names[0])
-        with suppress(ConnectionError):
-            assert await asyncio.wait_for(borrowed.read(), 3 * TIDY_S + PATIENCE_S) == b""
-        with pytest.raises(TimeoutError):
-            await asyncio.wait_for(owned.read(1), 2 * TIDY_S)
-        for writer in (first, second):
-            writer.transport.abort()
-
-    run(story)
+    (borrowed, first), (owned, second) = [await opened(one) for one in tokens]
+    page.vault.revoke(names[0])
+    with suppress(ConnectionError):
+        assert await asyncio.wait_for(borrowed.read(), 3 * TIDY_S + PATIENCE_S) == b""
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(owned.read(1), 2 * TIDY_S)
+    for writer in (first, second):
+        writer.transport.abort()
 
 
-def test_a_token_has_a_share_of_the_pages_from_however_many_addresses(
-    page: Page, bus: Bus, operator: str
+async def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(
+    page: Page, bus: Bus
 ) -> None:
-    shared = page.invite("viewer", "class")
-
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            opened = 0
-            for n in range(CONNECTIONS_OF_TOKEN + 5):
-                session = page.client(shared, f"127.0.0.{2 + n % 5}")
-                await stack.enter_async_context(session)
-                with suppress(aiohttp.WSServerHandshakeError):
-                    await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
-                    opened += 1
-            assert opened == CONNECTIONS_OF_TOKEN
-            async with hands(page, operator) as ours:
-                assert (await ours.call("stop"))["ok"]
-
-    run(story)
-
-
-def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(page: Page, bus: Bus) -> None:
     """All of them come from 127.0.0.1, including the robot's own browser."""
     few = CONNECTIONS_OF_ONE // CONNECTIONS_ALIKE + 1
     broken, *others = (page.invite("viewer", f"one{n}") for n in range(few))
@@ -298,45 +250,39 @@ def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(page: Page, b
             assert "close some" in (await answer.json())["full"]
         return got
 
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            assert await taken(stack, broken) == CONNECTIONS_ALIKE
-            rest = [await taken(stack, one) for one in others]
-            assert rest[:-1] == [CONNECTIONS_ALIKE] * (few - 2)
-            assert sum(rest) == CONNECTIONS_OF_ONE - CONNECTIONS_ALIKE
-            for _ in range(CONNECTIONS_HERE):
-                ours = await stack.enter_async_context(hands(page))
-            assert (await ours.call("stop"))["ok"]
-
-    run(story)
+    async with AsyncExitStack() as stack:
+        assert await taken(stack, broken) == CONNECTIONS_ALIKE
+        rest = [await taken(stack, one) for one in others]
+        assert rest[:-1] == [CONNECTIONS_ALIKE] * (few - 2)
+        assert sum(rest) == CONNECTIONS_OF_ONE - CONNECTIONS_ALIKE
+        for _ in range(CONNECTIONS_HERE):
+            ours = await stack.enter_async_context(hands(page))
+        assert (await ours.call("stop"))["ok"]
     refused = few * CONNECTIONS_OF_ONE - CONNECTIONS_OF_ONE
     assert page.refused()["too_many"] == counted + refused
 
 
-def test_one_who_follows_all_that_he_can_leaves_others_theirs(
+async def test_one_who_follows_all_that_he_can_leaves_others_theirs(
     page: Page, bus: Bus, viewer: str, operator: str
 ) -> None:
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            refused = 0
-            for n in range(CONNECTIONS_ALIKE):
-                greedy = await stack.enter_async_context(hands(page, viewer))
-                for k in range(30):
-                    await greedy.say(subscribe="state", robot=f"r{n}_{k}", rate=1)
-                await greedy.say(subscribe="state")
-                await greedy.say(ping=n)
-                await greedy.find(lambda said: "pong" in said)
-                refused += any(one.get("refused") == "subscribe" for one in greedy.heard)
-            assert refused == CONNECTIONS_ALIKE - 1  # of 50, the second connection had the last 20
-            ours = await stack.enter_async_context(hands(page, operator))
-            await ours.say(subscribe="state", robot="r9")
-            await ours.say(subscribe="state")
-            await ours.state(lambda state: state["mode"])
-            await ours.say(ping=1)
-            await ours.find(lambda said: "pong" in said)
-            assert not [one for one in ours.heard if "refused" in one]
-
-    run(story)
+    async with AsyncExitStack() as stack:
+        refused = 0
+        for n in range(CONNECTIONS_ALIKE):
+            greedy = await stack.enter_async_context(hands(page, viewer))
+            for k in range(30):
+                await greedy.say(subscribe="state", robot=f"r{n}_{k}", rate=1)
+            await greedy.say(subscribe="state")
+            await greedy.say(ping=n)
+            await greedy.find(lambda said: "pong" in said)
+            refused += any(one.get("refused") == "subscribe" for one in greedy.heard)
+        assert refused == CONNECTIONS_ALIKE - 1  # of 50, the second connection had the last 20
+        ours = await stack.enter_async_context(hands(page, operator))
+        await ours.say(subscribe="state", robot="r9")
+        await ours.say(subscribe="state")
+        await ours.state(lambda state: state["mode"])
+        await ours.say(ping=1)
+        await ours.find(lambda said: "pong" in said)
+        assert not [one for one in ours.heard if "refused" in one]
 
 
 def test_what_is_no_request_is_refused_in_words_like_the_rest(page: Page, bus: Bus) -> None:
@@ -406,7 +352,9 @@ def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
     assert not told(operator)
 
 
-def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(page: Page, bus: Bus) -> None:
+async def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(
+    page: Page, bus: Bus
+) -> None:
     """A connection that ends before the close was answered is equivalent to a lost radio link."""
     vault = page.vault
     trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
@@ -444,8 +392,5 @@ def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(page: Page
                 await send(next(wishes))
                 await asyncio.sleep(0.01)
 
-    async def story() -> None:
-        told = await asyncio.gather(plain("trusted2"), other("trusted3"))
-        assert set(told) == {(1008, "your token has expired")}
-
-    run(story)
+    told = await asyncio.gather(plain("trusted2"), other("trusted3"))
+    assert set(told) == {(1008, "your token has expired")}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread, Timer
@@ -26,7 +25,7 @@ from tests.system.harness import (
     until,
 )
 from tests.system.identities import Certificates, Identity, free_tls_endpoint
-from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.terminals import at_terminal
 from tests.system.viewer import Viewer
 
 pytestmark = pytest.mark.network
@@ -269,18 +268,9 @@ def test_the_keyboard_of_who_may_not_drive_is_told_before_a_key_is_pressed(
     robot: Robot, who: Identity, code: int, told: str
 ) -> None:
     link = ["--connect", robot.tls, "--tls", robot.own(who)]
-    with Terminal() as terminal:
-        words = [sys.executable, "-c", ON_TERMINAL, "drive", *link]
-        where = robot.daemon.config.parent
-        with Program(
-            words,
-            where,
-            stdin=terminal.slave,
-            stdout=terminal.slave,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        ) as program:
-            assert program.ended(10.0) == code
+    where = robot.daemon.config.parent
+    with at_terminal(where, "drive", *link, piped="stderr") as (_, program):
+        assert program.ended(10.0) == code
     assert told in program.stderr
 
 

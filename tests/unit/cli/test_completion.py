@@ -15,7 +15,7 @@ from acsard.cli.completion import SHELLS
 from acsard.host.errors import Exit
 from tests.each import each
 from tests.system.harness import Program, environment, until
-from tests.system.test_cli import Terminal
+from tests.system.terminals import Terminal
 from tests.system.typed import typed
 
 ASK = """\

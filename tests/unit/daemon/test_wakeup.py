@@ -125,33 +125,30 @@ def test_what_went_off_before_it_was_set_anew_wakes_nobody(kernel: Kernel) -> No
     assert one.take(kernel.now_ns).expired == 0
 
 
-def test_a_flood_of_stops_gets_one_step_before_the_period_takes_the_rest() -> None:
-    async def story() -> None:
-        wakeup, waiting, steps = Wakeup(), 0, list[int]()
-        ends = False
+async def test_a_flood_of_stops_gets_one_step_before_the_period_takes_the_rest() -> None:
+    wakeup, waiting, steps = Wakeup(), 0, list[int]()
+    ends = False
 
-        def step() -> Next | None:
-            """Take the stops that wait; `Next` says whether the period has ended."""
-            nonlocal waiting
-            steps.append(waiting)
-            waiting = 0
-            return None if len(steps) > 3 else Next(False, None, ends)
+    def step() -> Next | None:
+        """Take the stops that wait; `Next` says whether the period has ended."""
+        nonlocal waiting
+        steps.append(waiting)
+        waiting = 0
+        return None if len(steps) > 3 else Next(False, None, ends)
 
-        running = asyncio.create_task(wakeup.run(step))
-        await asyncio.sleep(0)
-        for _ in range(100):
-            waiting += 1
-            wakeup.stop()
-            await asyncio.sleep(0)
-        assert (len(steps), sum(steps) + waiting) == (1, 100)
-        ends = True
-        wakeup()  # the period
-        assert (len(steps), sum(steps)) == (2, 100)
+    running = asyncio.create_task(wakeup.run(step))
+    await asyncio.sleep(0)
+    for _ in range(100):
         waiting += 1
         wakeup.stop()
-        await asyncio.sleep(0.01)
-        assert steps[2:] == [1], "the next stop gets a step at once again"
-        wakeup()
-        await running
-
-    asyncio.run(story())
+        await asyncio.sleep(0)
+    assert (len(steps), sum(steps) + waiting) == (1, 100)
+    ends = True
+    wakeup()  # the period
+    assert (len(steps), sum(steps)) == (2, 100)
+    waiting += 1
+    wakeup.stop()
+    await asyncio.sleep(0.01)
+    assert steps[2:] == [1], "the next stop gets a step at once again"
+    wakeup()
+    await running

@@ -15,11 +15,23 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from acsard.core.values import NS_PER_S
 from acsard.host import child as module
 from acsard.host import clock
-from acsard.host.child import Child, Limits, Parent, acsard, end, environment, how_it_ended, running
+from acsard.host.child import (
+    Child,
+    Limits,
+    Parent,
+    Silence,
+    acsard,
+    end,
+    environment,
+    how_it_ended,
+    running,
+)
 
 WAIT_S = 20.0
 
@@ -138,14 +150,11 @@ def test_the_command_runs_the_installed_package() -> None:
 # a child in the event loop
 
 
-def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
-    async def story() -> int | None:
-        with suppress(ValueError):
-            async with running(program("import time; time.sleep(100)")) as child:
-                raise ValueError
-        return child.returncode
-
-    assert asyncio.run(story()) == -signal.SIGKILL
+async def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
+    with suppress(ValueError):
+        async with running(program("import time; time.sleep(100)")) as child:
+            raise ValueError
+    assert child.returncode == -signal.SIGKILL
 
 
 def test_a_child_is_collected_although_nobody_reads_its_output() -> None:
@@ -161,26 +170,19 @@ def test_a_child_is_collected_although_nobody_reads_its_output() -> None:
     assert asyncio.run(asyncio.wait_for(story(), 20)) == -signal.SIGKILL
 
 
-def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> None:
-    async def story() -> tuple[bytes, int | None]:
-        async with running(program("print(1); raise SystemExit(3)"), stdout=PIPE) as child:
-            out, _ = await child.communicate()
-        return out, child.returncode
-
-    assert asyncio.run(story()) == (b"1\n", 3)
+async def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> None:
+    async with running(program("print(1); raise SystemExit(3)"), stdout=PIPE) as child:
+        out, _ = await child.communicate()
+    assert (out, child.returncode) == (b"1\n", 3)
 
 
-def test_a_child_gets_its_limits_and_one_that_has_ended_needs_none() -> None:
+async def test_a_child_gets_its_limits_and_one_that_has_ended_needs_none() -> None:
     limits = Limits(nice=19, memory_bytes=64 << 20)
-
-    async def story() -> bytes:
-        text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
-        async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
-            assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
-            _, said = await child.communicate(b"go")
-        return said
-
-    assert b"MemoryError" in asyncio.run(story())
+    text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
+    async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
+        assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
+        _, said = await child.communicate(b"go")
+    assert b"MemoryError" in said
     ended = subprocess.Popen(program(""))
     ended.wait(WAIT_S)
     module.limit(ended.pid, limits)
@@ -271,3 +273,28 @@ def test_the_end_of_a_pipe_is_the_end_of_the_parent() -> None:
     os.close(writes)
     assert parent.gone()
     os.close(reads)
+
+
+# the silence of a child
+
+
+S = 10**9
+MOST = 3 * S
+
+
+def test_it_is_too_long_when_it_is_longer() -> None:
+    silence = Silence(MOST)
+    assert [silence.too_long(False, S // 2) for _ in range(7)] == [False] * 6 + [True]
+
+
+def test_who_says_something_has_all_the_time_again() -> None:
+    silence = Silence(MOST)
+    for _ in range(5):
+        assert not any(silence.too_long(False, S // 2) for _ in range(6))
+        assert not silence.too_long(True, S // 2)
+
+
+@given(st.lists(st.integers(0, 10**13), max_size=6))
+def test_however_long_the_machine_stands_still_that_is_nobodys_silence(stalls: list[int]) -> None:
+    silence = Silence(MOST)
+    assert not any(silence.too_long(False, stall) for stall in stalls)

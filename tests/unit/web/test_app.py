@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -43,19 +42,16 @@ class Phone:
 
 
 @each("error", [NoThreadError("no thread"), TimeoutError()])
-def test_a_phone_stays_if_no_thread_can_read_the_tokens_and_leaves_if_the_disk_hangs(
+async def test_a_phone_stays_if_no_thread_can_read_the_tokens_and_leaves_if_the_disk_hangs(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def story() -> list[str]:
-        counts, ends = Counts(), list[str]()
-        parts = Parts(robots(None), Guide(Reach("", "", "", ""), ""), counts)
-        page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))
-        page._viewers.add(Phone(ends))  # type: ignore[arg-type]
-        monkeypatch.setattr(app, "in_thread", fails(error))
-        await page.tidy()
-        return ends
-
-    assert bool(asyncio.run(story())) != isinstance(error, NoThreadError)
+    counts, ends = Counts(), list[str]()
+    parts = Parts(robots(None), Guide(Reach("", "", "", ""), ""), counts)
+    page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))
+    page._viewers.add(Phone(ends))  # type: ignore[arg-type]
+    monkeypatch.setattr(app, "in_thread", fails(error))
+    await page.tidy()
+    assert bool(ends) != isinstance(error, NoThreadError)
 
 
 ROWS = {row.key: row for row in settings_in(effective(Config()))}

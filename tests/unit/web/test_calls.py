@@ -49,7 +49,7 @@ def calls_of(
     return Calls(known, ends, sees)
 
 
-def test_stops_beyond_the_room_wait_for_one_asked_after_them_and_none_is_said_to_be_done() -> None:
+async def test_stops_beyond_the_room_wait_for_one_that_is_asked_after_them() -> None:
     asked: Counter[str] = Counter()
     go = threading.Event()
 
@@ -62,23 +62,20 @@ def test_stops_beyond_the_room_wait_for_one_asked_after_them_and_none_is_said_to
         asked["later"] += 1
         return ServiceReply(False, "not stopped")
 
-    async def story() -> list[ServiceReply]:
-        stops = Stops()
-        first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
-        await asyncio.sleep(0)
-        later = [asyncio.create_task(stops.ask(refused)) for _ in range(100)]
-        done, _ = await asyncio.wait(later, timeout=0.1)
-        assert not done
-        go.set()
-        async with asyncio.timeout(PATIENCE_S):
-            assert all(reply.success for reply in await asyncio.gather(*first))
-            return await asyncio.gather(*later)
-
-    assert asyncio.run(story()) == [ServiceReply(False, "not stopped")] * 100
+    stops = Stops()
+    first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
+    await asyncio.sleep(0)
+    later = [asyncio.create_task(stops.ask(refused)) for _ in range(100)]
+    done, _ = await asyncio.wait(later, timeout=0.1)
+    assert not done
+    go.set()
+    async with asyncio.timeout(PATIENCE_S):
+        assert all(reply.success for reply in await asyncio.gather(*first))
+        assert (await asyncio.gather(*later)) == [ServiceReply(False, "not stopped")] * 100
     assert asked == {"first": STOPS_AT_ONCE, "later": 1}
 
 
-def test_one_that_fails_fails_those_who_wait_for_it_and_not_the_next() -> None:
+async def test_one_that_fails_fails_those_who_wait_for_it_and_not_the_next() -> None:
     go = threading.Event()
 
     def held() -> ServiceReply:
@@ -88,35 +85,29 @@ def test_one_that_fails_fails_those_who_wait_for_it_and_not_the_next() -> None:
     def fails() -> ServiceReply:
         raise ConnectionError("gone")
 
-    async def story() -> None:
-        stops = Stops()
-        first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
-        await asyncio.sleep(0)
-        later = [asyncio.create_task(stops.ask(fails)) for _ in range(3)]
-        await asyncio.sleep(0)
-        go.set()
-        async with asyncio.timeout(PATIENCE_S):
-            told = await asyncio.gather(*later, return_exceptions=True)
-            assert [str(one) for one in told] == ["gone"] * 3
-            assert (await stops.ask(held)).success
-            await asyncio.gather(*first)
-
-    asyncio.run(story())
+    stops = Stops()
+    first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
+    await asyncio.sleep(0)
+    later = [asyncio.create_task(stops.ask(fails)) for _ in range(3)]
+    await asyncio.sleep(0)
+    go.set()
+    async with asyncio.timeout(PATIENCE_S):
+        told = await asyncio.gather(*later, return_exceptions=True)
+        assert [str(one) for one in told] == ["gone"] * 3
+        assert (await stops.ask(held)).success
+        await asyncio.gather(*first)
 
 
-def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_have() -> None:
-    async def story() -> None:
-        calls = calls_of(robots(None))
-        with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as told:
-            await calls.call(MAINTAINER, "clear", {}, "r2")
-        assert told.value.reason == "role"
-        with pytest.raises(RefusedError, match="not a robot's id") as told:
-            await calls.call(MAINTAINER, "stop", {}, "**")
-        assert told.value.reason == "malformed"
-        # Naming the page's own robot counts as its own.
-        assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
-
-    asyncio.run(story())
+async def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_have() -> None:
+    calls = calls_of(robots(None))
+    with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as told:
+        await calls.call(MAINTAINER, "clear", {}, "r2")
+    assert told.value.reason == "role"
+    with pytest.raises(RefusedError, match="not a robot's id") as told:
+        await calls.call(MAINTAINER, "stop", {}, "**")
+    assert told.value.reason == "malformed"
+    # Naming the page's own robot counts as its own.
+    assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
 
 
 @pytest.mark.parametrize("ended", [True, False])
@@ -147,11 +138,14 @@ def test_a_stop_ends_a_check_and_is_done_when_it_has_ended_and_the_daemon_says_s
     assert told.message == "the check of phone has ended; stopped"
 
 
-def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> None:
+async def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> None:
     held: list[zenoh.Query] = []
     told: list[str] = []
-
-    async def story(session: zenoh.Session) -> None:
+    with zenoh.open(quiet()) as session:
+        session.declare_queryable("acsard/r2/srv/stop", held.append)
+        session.declare_subscriber(
+            "acsard/*/stop", lambda sample: told.append(str(sample.key_expr))
+        )
         calls = calls_of(robots(Client(session, "acsar", "teleop")))
 
         async def stop(robot: str, client: int = 0) -> ServiceReply:
@@ -174,61 +168,50 @@ def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> 
                 query.reply(query.key_expr, answer, encoding=kind)
         assert all(reply.success for reply in await asyncio.gather(*first))
 
-    with zenoh.open(quiet()) as session:
-        session.declare_queryable("acsard/r2/srv/stop", held.append)
-        session.declare_subscriber(
-            "acsard/*/stop", lambda sample: told.append(str(sample.key_expr))
-        )
-        asyncio.run(story(session))
+
+async def test_stops_of_one_client_to_one_robot_share_the_next_one_and_none_is_lost() -> None:
+    merged, loop = Merged(), asyncio.get_running_loop()
+    sent: list[float] = []
+
+    async def stop() -> ServiceReply:
+        sent.append(loop.time())
+        return ServiceReply(True, str(len(sent)))
+
+    async def asked() -> None:
+        begun = loop.time()
+        reply = await merged.ask(("viewer", "r2"), stop)
+        assert sent[int(reply.message) - 1] >= begun
+
+    for _ in range(3):
+        await asyncio.gather(*(asked() for _ in range(100)))
+    assert len(sent) == 4
+    assert all(later - sooner >= MERGE_S for sooner, later in pairwise(sent))
+    await asyncio.gather(*(merged.ask((f"viewer {n}", "r2"), stop) for n in range(9)))
+    assert len(sent) == 13
+    await asyncio.sleep(2 * MERGE_S)
+    assert not merged._rests
 
 
-def test_stops_of_one_client_to_one_robot_share_the_next_one_and_none_is_lost() -> None:
-    async def story() -> None:
-        merged, loop = Merged(), asyncio.get_running_loop()
-        sent: list[float] = []
+async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_ones() -> None:
+    merged, sent = Merged(), 0
 
-        async def stop() -> ServiceReply:
-            sent.append(loop.time())
-            return ServiceReply(True, str(len(sent)))
+    async def stop() -> ServiceReply:
+        nonlocal sent
+        sent += 1
+        return ServiceReply(True, "stopped")
 
-        async def asked() -> None:
-            begun = loop.time()
-            reply = await merged.ask(("viewer", "r2"), stop)
-            assert sent[int(reply.message) - 1] >= begun
-
-        for _ in range(3):
-            await asyncio.gather(*(asked() for _ in range(100)))
-        assert len(sent) == 4
-        assert all(later - sooner >= MERGE_S for sooner, later in pairwise(sent))
-        await asyncio.gather(*(merged.ask((f"viewer {n}", "r2"), stop) for n in range(9)))
-        assert len(sent) == 13
-        await asyncio.sleep(2 * MERGE_S)
-        assert not merged._rests
-
-    asyncio.run(story())
+    await merged.ask("viewer", stop)
+    # The event loop is late, so it runs the next stop and the end of the pause in one turn.
+    time.sleep(2 * MERGE_S)
+    for _ in range(2):
+        async with asyncio.timeout(PATIENCE_S):
+            assert (await asyncio.create_task(merged.ask("viewer", stop))).success
+    assert sent == 3
 
 
-def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_ones() -> None:
-    async def story() -> None:
-        merged, sent = Merged(), 0
-
-        async def stop() -> ServiceReply:
-            nonlocal sent
-            sent += 1
-            return ServiceReply(True, "stopped")
-
-        await merged.ask("viewer", stop)
-        # The event loop is late, so it runs the next stop and the end of the pause in one turn.
-        time.sleep(2 * MERGE_S)
-        for _ in range(2):
-            async with asyncio.timeout(PATIENCE_S):
-                assert (await asyncio.create_task(merged.ask("viewer", stop))).success
-        assert sent == 3
-
-    asyncio.run(story())
-
-
-def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_stopped() -> None:
+async def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_stopped() -> (
+    None
+):
     told: Counter[str] = Counter()
 
     def served(query: zenoh.Query) -> None:
@@ -238,7 +221,8 @@ def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_
             kind = encoding_name("msgpack", "ServiceReply")
             query.reply(query.key_expr, answer, encoding=kind)
 
-    async def story(session: zenoh.Session) -> None:
+    with zenoh.open(quiet()) as session:
+        session.declare_queryable("acsard/r2/srv/stop", served)
         calls = calls_of(robots(Client(session, "acsar", "teleop")))
 
         async def stop(robot: str) -> bool:
@@ -255,13 +239,9 @@ def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_
         assert await stop("r2")
         assert told["r2"] == 2
 
+
+async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refused() -> None:
     with zenoh.open(quiet()) as session:
-        session.declare_queryable("acsard/r2/srv/stop", served)
-        asyncio.run(story(session))
-
-
-def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refused() -> None:
-    async def story(session: zenoh.Session) -> None:
         known = robots(Client(session, "acsar", "teleop"))
         fleet = Fleet(known)
         calls = calls_of(known, sees=fleet.sees)
@@ -300,6 +280,3 @@ def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refused() 
         await refused()
         assert await stop("r3") != "too_fast"
         await known.streams.leave("r3", "state")
-
-    with zenoh.open(quiet()) as session:
-        asyncio.run(story(session))

@@ -67,7 +67,7 @@ async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
             await asyncio.sleep(0.01)
 
 
-def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when_its_token_is(
+async def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when_its_token_is(
     session: zenoh.Session,
 ) -> None:
     def say() -> None:
@@ -81,47 +81,41 @@ def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when_its_t
         query.reply("acsard/r2/info", said, encoding=encoding_name("msgpack", "Info"))
         query.drop()
 
-    async def story() -> None:
-        fleet = Fleet(robots(Client(session, "acsar", "teleop")))
-        session.declare_queryable("acsard/r2/info", info)
-        token = session.liveliness().declare_token("acsard/r2/alive")
-        fleet.join(1)
-        silent = await row(fleet, lambda one: one.robot == "r2")
-        assert (silent.mode, silent.speed, silent.age) == (None, None, None)
-        say()
-        heard = await row(fleet, lambda one: one.mode == STATE.mode and one.version)
-        assert (heard.version, heard.speed) == ("1.2.3", STATE.linear)
-        say()
-        await asyncio.sleep(0.5)
-        (late,) = fleet.rows()
-        assert late.age is not None
-        assert 0.4 < late.age < PATIENCE_S
-        token.undeclare()
-        gone = await row(fleet, lambda one: one.mode == "gone")
-        assert STATE.mode in gone.reason
-        assert gone.version == ""
-        fleet.leave(1)
-
-    asyncio.run(story())
+    fleet = Fleet(robots(Client(session, "acsar", "teleop")))
+    session.declare_queryable("acsard/r2/info", info)
+    token = session.liveliness().declare_token("acsard/r2/alive")
+    fleet.join(1)
+    silent = await row(fleet, lambda one: one.robot == "r2")
+    assert (silent.mode, silent.speed, silent.age) == (None, None, None)
+    say()
+    heard = await row(fleet, lambda one: one.mode == STATE.mode and one.version)
+    assert (heard.version, heard.speed) == ("1.2.3", STATE.linear)
+    say()
+    await asyncio.sleep(0.5)
+    (late,) = fleet.rows()
+    assert late.age is not None
+    assert 0.4 < late.age < PATIENCE_S
+    token.undeclare()
+    gone = await row(fleet, lambda one: one.mode == "gone")
+    assert STATE.mode in gone.reason
+    assert gone.version == ""
+    fleet.leave(1)
 
 
-def test_it_is_looked_for_again_when_there_was_no_way_or_the_bus_failed(
+async def test_it_is_looked_for_again_when_there_was_no_way_or_the_bus_failed(
     session: zenoh.Session,
 ) -> None:
-    async def story() -> None:
-        with zenoh.open(quiet()) as ended:
-            pass
-        known = robots(None)
-        fleet = Fleet(known)
-        fleet.join(1)
-        assert fleet.rows() == []
-        known.client = Client(ended, "acsar", "teleop")
-        fleet.rows()
-        await asyncio.sleep(0.1)
-        known.client = Client(session, "acsar", "teleop")
-        token = session.liveliness().declare_token("acsard/r2/alive")
-        await row(fleet, lambda one: one.robot == "r2")
-        token.undeclare()
-        fleet.leave(1)
-
-    asyncio.run(story())
+    with zenoh.open(quiet()) as ended:
+        pass
+    known = robots(None)
+    fleet = Fleet(known)
+    fleet.join(1)
+    assert fleet.rows() == []
+    known.client = Client(ended, "acsar", "teleop")
+    fleet.rows()
+    await asyncio.sleep(0.1)
+    known.client = Client(session, "acsar", "teleop")
+    token = session.liveliness().declare_token("acsard/r2/alive")
+    await row(fleet, lambda one: one.robot == "r2")
+    token.undeclare()
+    fleet.leave(1)

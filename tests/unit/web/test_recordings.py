@@ -6,9 +6,7 @@ import asyncio
 import gzip
 import os
 import sys
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -51,58 +49,38 @@ async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> Re
     return told
 
 
-def run(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    async def whole() -> None:
-        await story()
-        # A drawing that was given up is ending its program. The end of the event loop would cancel
-        # that too, and the pipes of the program would outlive the loop.
-        ending = [task for task in asyncio.all_tasks() if task.cancelling()]
-        await asyncio.gather(*ending, return_exceptions=True)
-
-    asyncio.run(whole())
-
-
-def test_it_is_begun_by_who_asks_and_there_when_it_is_done() -> None:
-    async def story() -> None:
-        found = drawn_by(DRAWS)
-        assert found.ask(A, (1, 0)).report == "drawing"
-        assert found.drawn("a.mcap") is None
-        told = await become(found, A, "ready", "failed")
-        assert told == ReportState("ready", href="report/a.mcap")
-        body = found.drawn("a.mcap")
-        assert body is not None
-        assert gzip.decompress(body) == b"<html> /a.mcap\n"
-        assert found.drawn("b.mcap") is None
-
-    run(story)
+async def test_it_is_begun_by_who_asks_and_there_when_it_is_done() -> None:
+    found = drawn_by(DRAWS)
+    assert found.ask(A, (1, 0)).report == "drawing"
+    assert found.drawn("a.mcap") is None
+    told = await become(found, A, "ready", "failed")
+    assert told == ReportState("ready", href="report/a.mcap")
+    body = found.drawn("a.mcap")
+    assert body is not None
+    assert gzip.decompress(body) == b"<html> /a.mcap\n"
+    assert found.drawn("b.mcap") is None
 
 
-def test_it_says_how_far_it_is_and_another_one_waits() -> None:
-    async def story() -> None:
-        found = drawn_by(WAITS)
-        found.ask(A, (1, 0))
-        async with asyncio.timeout(PATIENCE_S):
-            while found.ask(A, (1, 0)).percent != 40:
-                await asyncio.sleep(0.01)
-        assert found.ask(B, (1, 0)).report == "busy"
-        assert "a.mcap" in found.ask(B, (1, 0)).text
-        found.end()
-        assert found.ask(B, (1, 0)).report == "drawing"
-        found.end()
-
-    run(story)
+async def test_it_says_how_far_it_is_and_another_one_waits() -> None:
+    found = drawn_by(WAITS)
+    found.ask(A, (1, 0))
+    async with asyncio.timeout(PATIENCE_S):
+        while found.ask(A, (1, 0)).percent != 40:
+            await asyncio.sleep(0.01)
+    assert found.ask(B, (1, 0)).report == "busy"
+    assert "a.mcap" in found.ask(B, (1, 0)).text
+    found.end()
+    assert found.ask(B, (1, 0)).report == "drawing"
+    found.end()
 
 
-def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() -> None:
-    async def story() -> None:
-        found = drawn_by(DRAWS)
-        await become(found, A, "ready")
-        assert found.ask(A, (1, 0)).report == "ready"
-        assert found.ask(A, (2, 0)).report == "drawing"
-        # The recording grows while it is drawn, so the report has the stamp that was requested.
-        await become(found, A, "ready", stamp=3)
-
-    run(story)
+async def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() -> None:
+    found = drawn_by(DRAWS)
+    await become(found, A, "ready")
+    assert found.ask(A, (1, 0)).report == "ready"
+    assert found.ask(A, (2, 0)).report == "drawing"
+    # The recording grows while it is drawn, so the report has the stamp that was requested.
+    await become(found, A, "ready", stamp=3)
 
 
 @each(
@@ -116,37 +94,27 @@ def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() 
         (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of it"),
     ],
 )
-def test_what_fails_says_why_and_is_tried_anew_when_it_is_asked_for_again(
+async def test_what_fails_says_why_and_is_tried_anew_when_it_is_asked_for_again(
     program: str, why: str
 ) -> None:
-    async def story() -> None:
-        found = drawn_by(program)
-        told = await become(found, A, "ready", "failed")
-        assert told.report == "failed"
-        assert why in told.text
-        assert "acsard: " not in told.text
-        assert found.ask(A, (1, 0)).report == "drawing"
-        found.end()
-
-    run(story)
+    found = drawn_by(program)
+    told = await become(found, A, "ready", "failed")
+    assert told.report == "failed"
+    assert why in told.text
+    assert "acsard: " not in told.text
+    assert found.ask(A, (1, 0)).report == "drawing"
+    found.end()
 
 
-def test_a_program_that_is_not_there_is_reported() -> None:
-    async def story() -> None:
-        told = await become(Reports(("/nowhere/acsard",)), A, "ready", "failed")
-        assert "No such file" in told.text
-
-    run(story)
+async def test_a_program_that_is_not_there_is_reported() -> None:
+    told = await become(Reports(("/nowhere/acsard",)), A, "ready", "failed")
+    assert "No such file" in told.text
 
 
-def test_it_takes_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_it_takes_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reports, "DRAW_S", 0.05)
-
-    async def story() -> None:
-        told = await become(drawn_by(WAITS), A, "ready", "failed")
-        assert "acsard recording report" in told.text
-
-    run(story)
+    told = await become(drawn_by(WAITS), A, "ready", "failed")
+    assert "acsard recording report" in told.text
 
 
 TELLS = """import os, resource, sys, time
@@ -158,56 +126,44 @@ print(os.getpriority(os.PRIO_PROCESS, 0), limit, last, flush=True)
 time.sleep(float(sys.argv[1].strip("/")))"""
 
 
-def test_it_has_the_lowest_priority_and_so_much_memory_and_is_the_first_to_go() -> None:
-    async def story() -> None:
-        found = drawn_by(TELLS)
-        await become(found, Path("/0"), "ready")
-        priority, memory, first = gzip.decompress(found.drawn("0") or b"").split()
-        assert (int(priority), int(memory)) == (max(NICE, os.nice(0)), reports.MEMORY)
-        assert first == b"1000"
-
-    run(story)
+async def test_it_has_the_lowest_priority_and_so_much_memory_and_is_the_first_to_go() -> None:
+    found = drawn_by(TELLS)
+    await become(found, Path("/0"), "ready")
+    priority, memory, first = gzip.decompress(found.drawn("0") or b"").split()
+    assert (int(priority), int(memory)) == (max(NICE, os.nice(0)), reports.MEMORY)
+    assert first == b"1000"
 
 
-def test_what_nobody_asks_for_any_more_is_given_up_and_its_process_ends(
+async def test_what_nobody_asks_for_any_more_is_given_up_and_its_process_ends(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     told = tmp_path / "pid"
     program = f"import os; open({str(told)!r}, 'w').write(str(os.getpid())); {WAITS}"
-
-    async def story() -> None:
-        found = drawn_by(program)
-        found.ask(A, (1, 0))
-        async with asyncio.timeout(PATIENCE_S):
-            while not (told.exists() and told.read_text()):
-                await asyncio.sleep(0.01)
-            found.tidy()
-            assert found.ask(A, (1, 0)).report == "drawing"
-            monkeypatch.setattr(reports, "ALONE_NS", -NS_PER_S)
-            found.tidy()
-            while Path(f"/proc/{told.read_text()}").exists():
-                await asyncio.sleep(0.01)
-        assert found.drawn("a.mcap") is None
-
-    run(story)
+    found = drawn_by(program)
+    found.ask(A, (1, 0))
+    async with asyncio.timeout(PATIENCE_S):
+        while not (told.exists() and told.read_text()):
+            await asyncio.sleep(0.01)
+        found.tidy()
+        assert found.ask(A, (1, 0)).report == "drawing"
+        monkeypatch.setattr(reports, "ALONE_NS", -NS_PER_S)
+        found.tidy()
+        while Path(f"/proc/{told.read_text()}").exists():
+            await asyncio.sleep(0.01)
+    assert found.drawn("a.mcap") is None
 
 
-def test_who_opens_a_report_keeps_it_for_another_quarter_of_an_hour(
+async def test_who_opens_a_report_keeps_it_for_another_quarter_of_an_hour(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_ns = 0
     monkeypatch.setattr("acsard.web.recordings.clock.mono_ns", lambda: now_ns)
-
-    async def story() -> None:
-        nonlocal now_ns
-        found = drawn_by(DRAWS)
-        await become(found, A, "ready")
-        for _ in range(3):
-            now_ns += KEEP_NS - NS_PER_S
-            found.tidy()
-            assert found.drawn("a.mcap")
-        now_ns += KEEP_NS + NS_PER_S
+    found = drawn_by(DRAWS)
+    await become(found, A, "ready")
+    for _ in range(3):
+        now_ns += KEEP_NS - NS_PER_S
         found.tidy()
-        assert found.drawn("a.mcap") is None
-
-    run(story)
+        assert found.drawn("a.mcap")
+    now_ns += KEEP_NS + NS_PER_S
+    found.tidy()
+    assert found.drawn("a.mcap") is None

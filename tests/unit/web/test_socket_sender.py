@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import msgspec
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
@@ -13,30 +11,24 @@ from acsard.web.socket_sender import Following, Outgoing
 from acsard.web.streams import Stream
 
 
-def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_before() -> None:
-    async def story() -> None:
-        out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
-        one = Following("acsar", "state", "acsar", 0.1)
-        one.stream = Stream()
-        due = await out._send_due(one, 100.03)
-        assert abs(due - 100.1) < 1e-6
-        woken = [await out._send_due(one, now) for now in (100.04, 100.07, 100.099)]
-        assert woken == [due] * 3
-        assert await out._send_due(one, due) > due
-
-    asyncio.run(story())
+async def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_before() -> None:
+    out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
+    one = Following("acsar", "state", "acsar", 0.1)
+    one.stream = Stream()
+    due = await out._send_due(one, 100.03)
+    assert abs(due - 100.1) < 1e-6
+    woken = [await out._send_due(one, now) for now in (100.04, 100.07, 100.099)]
+    assert woken == [due] * 3
+    assert await out._send_due(one, due) > due
 
 
-def test_a_refusal_is_reported_once_a_second_for_each_kind_of_message_and_reason() -> None:
-    async def story() -> None:
-        counts = Counts()
-        out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), counts, "")
-        for _ in range(3):
-            out.refuse("subscribe", "malformed", "no such key")
-            out.refuse("cmd", "malformed", "not a number")
-            out.refuse("cmd", "role", "for operators")
-        said = [msgspec.json.decode(one) for one in out._out]
-        assert [one["refused"] for one in said] == ["subscribe", "cmd", "cmd"]
-        assert counts.refused() == {"malformed": 6, "role": 3}
-
-    asyncio.run(story())
+async def test_a_refusal_is_reported_once_a_second_for_each_kind_of_message_and_reason() -> None:
+    counts = Counts()
+    out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), counts, "")
+    for _ in range(3):
+        out.refuse("subscribe", "malformed", "no such key")
+        out.refuse("cmd", "malformed", "not a number")
+        out.refuse("cmd", "role", "for operators")
+    said = [msgspec.json.decode(one) for one in out._out]
+    assert [one["refused"] for one in said] == ["subscribe", "cmd", "cmd"]
+    assert counts.refused() == {"malformed": 6, "role": 3}

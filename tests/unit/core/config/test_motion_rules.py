@@ -56,10 +56,6 @@ def mended(config: Config, line: str) -> Config:
     return replace(config, **{table: changed})
 
 
-def test_the_defaults_are_in_order() -> None:
-    assert problems(Config()) == []
-
-
 @given(
     drives,
     limits,

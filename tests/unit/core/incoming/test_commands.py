@@ -1,4 +1,7 @@
-"""A sample becomes a command or is refused whole, and `DecodeError` is the only error."""
+"""A sample becomes a command or is refused whole, and `DecodeError` is the only error.
+
+It says who sent it, and its sender is bound to a certificate.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,25 @@ from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.config.settings import CommandsConfig, DriveConfig, JointsConfig
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, sender
+from acsard.core.incoming.commands import (
+    BOUND_NS,
+    MAX_BOUND,
+    MAX_COMMAND_BYTES,
+    Arrival,
+    Bindings,
+    Receiver,
+    caller_name,
+    sender,
+)
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.core.messages.schema import JointState, TwistStamped
 from acsard.core.messages.schema import Twist as TwistMessage
-from acsard.core.messages.signature import public_name
+from acsard.core.messages.signature import DIGITS, MAX_NAME, public_name
 from acsard.core.motion.arbiter import Arbiter
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import Attachment
@@ -503,28 +517,11 @@ def test_no_reason_outweighs_another_refusal() -> None:
 # the clock of a stamp
 
 
-@pytest.mark.parametrize("stamp_ns", [None, 5])
-def test_the_stamp_of_the_header_counts_before_that_of_the_arrival(stamp_ns: int | None) -> None:
-    got = command(stamped(1_700_000_000, 500_000_000), stamp_ns=stamp_ns)
-    assert got.stamp_ns == 1_700_000_000_500_000_000
-
-
-@pytest.mark.parametrize("stamp_ns", [None, 5])
-def test_a_header_stamp_of_zero_is_none(stamp_ns: int | None) -> None:
-    assert command(stamped(0), stamp_ns=stamp_ns).stamp_ns == stamp_ns
-    assert command(twist(), stamp_ns=stamp_ns).stamp_ns == stamp_ns
-
-
 def test_wheel_commands_are_stamped_the_same_way() -> None:
     body = joints(1.0, 1.0, 1.0, 1.0)
     header = {"header": {"stamp": {"sec": 9, "nanosec": 1}}}
     assert wheels(body | header, stamp_ns=5).stamp_ns == 9_000_000_001
     assert wheels(body, stamp_ns=5).stamp_ns == 5
-
-
-def test_the_clock_is_the_one_of_the_arrival_s_sender_else_of_the_key() -> None:
-    assert command(twist(), sender="z1").clock == public_name("z1")
-    assert command(twist(), sender="").clock == "native/app"
 
 
 def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
@@ -721,15 +718,6 @@ def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
     )
 
 
-def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
-    command = RECEIVER.command(by_ros("rmw", stamped(12, 34)))
-    assert (command.stamp_ns, command.clock) == (
-        12_000_000_034,
-        f"gid {public_name(GID.hex())}, header on rmw/cmd/nav",
-    )
-    assert RECEIVER.command(by_ros("rmw", stamped(0))).stamp_ns == SENT_NS
-
-
 @pytest.mark.parametrize(
     ("attachment", "reason"),
     [
@@ -746,12 +734,6 @@ def test_by_a_bridge_any_attachment_is_ignored() -> None:
     command = RECEIVER.command(by_ros("bridge", twist(), attachment=b"rqh" + bytes(17)))
     assert command.twist == Twist(0.5, 0.2)
     assert command.stamp_ns is None
-
-
-def test_by_a_bridge_the_clock_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
-    assert RECEIVER.command(by_ros("bridge", twist())).clock == "bridge/nav"
-    seen = RECEIVER.command(by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"))
-    assert (seen.stamp_ns, seen.clock) == (SENT_NS, f"bridge/{public_name('router')}")
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
@@ -802,22 +784,6 @@ def test_the_sender_over_rmw_is_the_publisher() -> None:
     assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).sender != name
 
 
-def test_the_sender_of_a_stamped_sample_is_the_session_that_stamped_it() -> None:
-    assert command(twist(), sender="z1", stamp_ns=5).sender == public_name("z1")
-    bridged = RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5))
-    assert bridged.sender == f"bridge/{public_name('z2')}"
-
-
-def test_the_sender_of_an_unstamped_sample_is_its_source_in_its_tree() -> None:
-    assert command(twist()).sender == wheels(joints(1.0, 1.0, 1.0, 1.0)).sender == "native/app"
-    assert RECEIVER.command(by_ros("bridge", twist())).sender == "bridge/nav"
-
-
-def test_a_header_s_stamp_changes_no_sender() -> None:
-    assert command(stamped(12)).sender == "native/app"
-    assert RECEIVER.command(by_ros("rmw", stamped(12))).sender == f"gid {public_name(GID.hex())}"
-
-
 def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> None:
     good = arrival(written(twist(), "json"), sender="z1", stamp_ns=5)
     assert sender(replace(good, payload=b"hello")) == RECEIVER.command(good).sender
@@ -840,40 +806,6 @@ def signed(**told: Any) -> bytes:
     return msgspec.msgpack.encode({"sender": "joystick/s3cret"} | told)
 
 
-def test_our_attachment_says_who_sent_it_when_and_as_which() -> None:
-    told = command(twist(), attachment=signed(stamp=9, sequence=3), sender="z1", stamp_ns=5)
-    assert (told.sender, told.clock, told.stamp_ns) == (JOYSTICK, JOYSTICK, 9)
-    assert (told.sequence, told.shared) == (3, False)
-
-
-def test_a_message_s_own_stamp_goes_before_our_attachment_s() -> None:
-    told = command(stamped(12), attachment=signed(stamp=9))
-    assert told.stamp_ns == 12_000_000_000
-    assert told.clock == f"{JOYSTICK}, header on native/cmd/app"
-    assert told.sender == JOYSTICK
-
-
-def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
-    assert command(twist(), attachment=signed(), sender="z1", stamp_ns=5).stamp_ns == 5
-    assert command(twist(), attachment=signed()).stamp_ns is None
-
-
-def test_an_attachment_that_is_not_ours_changes_nothing() -> None:
-    for attachment in (b"trace", b"{}", b"\x80", signed()[:-1]):
-        assert command(twist(), attachment=attachment).sender == "native/app"
-
-
-def test_many_may_look_like_one_by_a_bridge_or_by_their_key_alone() -> None:
-    assert RECEIVER.command(by_ros("bridge", twist())).shared
-    assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).shared
-    assert RECEIVER.command(by_ros("bridge", twist(), attachment=signed())).shared
-    assert command(twist()).shared
-    assert command(stamped(12)).shared
-    assert not command(twist(), sender="z2", stamp_ns=5).shared
-    assert command(twist(), stamp_ns=5).shared  # the stamp of a router
-    assert not command(twist(), attachment=signed()).shared
-
-
 @pytest.mark.parametrize(
     ("ahead_ns", "replaced"), [(0, False), (500_000_000, False), (500_000_001, True)]
 )
@@ -886,6 +818,73 @@ def test_a_stamp_that_zenoh_replaced_is_known_by_how_far_ahead_the_sender_s_own_
     assert told.stamp_ns == SENT_NS + ahead_ns
     assert not command(twist(), attachment=attachment).stamp_replaced
     assert not command(twist(), received_ns=SENT_NS).stamp_replaced
+
+
+GID_NAME = f"gid {public_name(GID.hex())}"
+Z1, ROUTER = public_name("z1"), public_name("router")
+
+
+def ours(body: dict[str, Any], **changes: Any) -> Arrival:
+    return arrival(written(body, "json"), **changes)
+
+
+IDENTITIES: dict[str, tuple[Arrival, str, str, int | None, bool]] = {
+    "a key alone": (ours(twist()), "native/app", "native/app", None, True),
+    "wheels": (
+        ours(joints(1.0, 1.0, 1.0, 1.0), key="wheel_cmd/app"), "native/app", "native/app", None,
+        True,
+    ),
+    "the stamp of a router": (ours(twist(), stamp_ns=5), "native/app", "native/app", 5, True),
+    "a session that stamps": (ours(twist(), sender="z1", stamp_ns=5), Z1, Z1, 5, False),
+    "a header": (ours(stamped(12)), "native/app", HEADER_S, 12 * 10**9, True),
+    "a header, stamped": (ours(stamped(12), stamp_ns=5), "native/app", HEADER_S, 12 * 10**9, True),
+    "a header of zero": (ours(stamped(0)), "native/app", "native/app", None, True),
+    "a header of 0, stamped": (ours(stamped(0), stamp_ns=5), "native/app", "native/app", 5, True),
+    "rmw": (by_ros("rmw", twist(), sender="router"), GID_NAME, GID_NAME, SENT_NS, False),
+    "rmw, a header": (
+        by_ros("rmw", stamped(12, 34)), GID_NAME, f"{GID_NAME}, header on rmw/cmd/nav",
+        12_000_000_034, False,
+    ),
+    "rmw, a header of zero": (by_ros("rmw", stamped(0)), GID_NAME, GID_NAME, SENT_NS, False),
+    "a bridge": (by_ros("bridge", twist()), "bridge/nav", "bridge/nav", None, True),
+    "a bridge that stamps": (
+        by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"), f"bridge/{ROUTER}",
+        f"bridge/{ROUTER}", SENT_NS, True,
+    ),
+    "a bridge, our attachment": (
+        by_ros("bridge", twist(), attachment=signed()), "bridge/nav", "bridge/nav", None, True,
+    ),
+    "our attachment": (
+        ours(twist(), attachment=signed(stamp=9, sequence=3), sender="z1", stamp_ns=5),
+        JOYSTICK, JOYSTICK, 9, False,
+    ),
+    "our attachment and a header": (
+        ours(stamped(12), attachment=signed(stamp=9)), JOYSTICK,
+        f"{JOYSTICK}, header on native/cmd/app", 12 * 10**9, False,
+    ),
+    "our attachment without a stamp": (
+        ours(twist(), attachment=signed()), JOYSTICK, JOYSTICK, None, False,
+    ),
+    **{
+        f"another attachment, {one!r}": (
+            ours(twist(), attachment=one), "native/app", "native/app", None, True,
+        )
+        for one in (b"trace", b"{}", b"\x80", signed()[:-1])
+    },
+}  # fmt: skip
+"""A sample with its sender, its clock, its stamp, and whether many may look like its sender."""
+
+
+@each("case", IDENTITIES)
+def test_a_sample_says_who_sent_it_by_which_clock_and_when(case: str) -> None:
+    came, *expected = IDENTITIES[case]
+    told = RECEIVER.command(came)
+    assert [told.sender, told.clock, told.stamp_ns, told.shared] == expected
+
+
+def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
+    told = command(twist(), attachment=signed(sequence=3), sender="z1", stamp_ns=5)
+    assert (told.stamp_ns, told.sequence) == (5, 3)
 
 
 # certificates
@@ -921,3 +920,101 @@ def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> N
     assert receiver.command(bridged).sender == "bridge/app"
     for key in ("cmd/app", "cmd/app/anna", "cmd/app/ben"):
         assert receiver.command(arrival(written(twist(), "json"), key=key)).shared
+
+
+# senders bound to certificates
+
+
+def test_the_first_certificate_keeps_the_sender_for_as_long_as_it_speaks() -> None:
+    bindings = Bindings()
+    for at_ns in range(0, 5 * BOUND_NS, BOUND_NS // 2):
+        assert bindings.other("a", "anna", at_ns) is None
+        assert bindings.other("a", "ben", at_ns + 1) == "anna"
+        assert bindings.other("a", "", at_ns + 1) == "anna"
+    assert bindings.other("b", "ben", at_ns) is None
+
+
+def test_this_machine_is_a_place_like_a_certificate() -> None:
+    bindings = Bindings()
+    assert bindings.other("a", "", 0) is None
+    assert bindings.other("a", "anna", 1) == ""
+
+
+def test_refused_commands_do_not_lengthen_the_binding_and_after_a_silence_it_ends() -> None:
+    bindings = Bindings()
+    bindings.other("a", "anna", 0)
+    assert bindings.other("a", "ben", BOUND_NS) == "anna"
+    assert bindings.other("a", "ben", BOUND_NS + 1) is None
+    assert bindings.other("a", "anna", BOUND_NS + 2) == "ben"
+
+
+def test_a_flood_of_sender_ids_takes_no_memory_and_those_that_speak_stay_bound() -> None:
+    bindings = Bindings()
+    bindings.other("a", "anna", 0)
+    for number in range(4 * MAX_BOUND):
+        bindings.other(f"other {number}", "ben", number)
+        if number % 100 == 0:
+            assert bindings.other("a", "anna", number) is None
+    assert bindings.other("a", "ben", number) == "anna"
+    assert len(bindings._seen) <= MAX_BOUND
+
+
+# the name of a caller
+
+
+def signed_as(name: str) -> bytes:
+    return msgspec.json.encode({"sender": name})
+
+
+def test_a_native_call_has_the_name_it_gives() -> None:
+    for form in (msgspec.json, msgspec.msgpack):
+        signature = form.encode({"sender": "alice@laptop patrol/s3cret", "sequence": 7})
+        assert caller_name("native", signature) == "alice@laptop patrol/b8978a0526b85c8d (native)"
+
+
+@each(
+    "attachment",
+    [b"", b"joe", b"{}", b'{"sender": 7}', b'{"sender": "\xff"}', b"\x81", signed_as("")],
+)
+def test_who_gives_no_name_is_unnamed(attachment: bytes) -> None:
+    assert caller_name("native", attachment) == "unnamed (native)"
+
+
+def test_what_was_stamped_tells_the_session_that_stamped_it() -> None:
+    session = public_name("1f2e")
+    assert caller_name("native", b"", "1f2e") == f"unnamed (native, session {session})"
+
+
+def test_an_rmw_client_is_its_gid() -> None:
+    gid = bytes(range(16))
+    assert caller_name("rmw", bytes(17) + gid) == f"unnamed (rmw {gid.hex()})"
+
+
+def test_a_bridge_tells_nothing() -> None:
+    assert caller_name("bridge", b"rqh" + bytes(17)) == "unnamed (bridge)"
+
+
+@each(
+    ("name", "kept"),
+    [
+        ("mallory (rmw 00)", "mallory ?rmw 00?"),
+        ("a, b", "a? b"),
+        ("a\nACSARD_EVENT=stop", "a?ACSARD_EVENT?stop"),
+        ("\x1b[2J", "??2J"),
+        ("\u202elaptop", "?laptop"),
+        ("Jürgen", "Jürgen"),
+    ],
+)
+def test_a_name_cannot_pass_for_the_words_around_it(name: str, kept: str) -> None:
+    who = caller_name("native", signed_as(f"{name}/s3cret"))
+    assert who == f"{kept}/{public_name(f'{name}/s3cret')[-DIGITS:]} (native)"
+
+
+@given(st.binary(max_size=100) | st.text(max_size=100).map(signed_as))
+def test_any_attachment_makes_a_short_printable_name(attachment: bytes) -> None:
+    who = caller_name("native", attachment)
+    name = who.removesuffix(" (native)")
+    assert who == f"{name} (native)"
+    assert 1 <= len(name) <= MAX_NAME + 1 + DIGITS
+    assert name.isprintable()
+    assert not set(name) & set('(),="\n')

@@ -25,8 +25,6 @@ Array = NDArray[np.float64]
 RADIUS, TRACK, PERIOD = 0.05, 0.30, 0.01
 PERIOD_NS = 10_000_000
 WALL_NS = 1_800_000_000_000_000_000
-SIGNS = np.array([1, -1, -1, 1])
-"""Sign of each wheel in a turn: front right, front left, rear left, rear right."""
 
 
 def speeds(rng: np.random.Generator, seconds: float) -> Array:

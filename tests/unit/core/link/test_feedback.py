@@ -359,62 +359,31 @@ def test_a_board_that_answers_each_line_again_after_sparse_replies_gets_no_old_l
     assert sum(line.dt for line in lines) == pytest.approx(0.6, abs=0.06)
 
 
-def stall(style: ReplyStyle, lines: int, periods: float, left: int) -> None:
-    for _ in range(left):
-        style.left()
-    style.read(lines, periods)
-
-
-def test_while_we_send_every_period_nobody_can_tell() -> None:
-    style = ReplyStyle(speaks=False)
-    for _ in range(1000):
-        stall(style, 1, 1.0, 1)
-    assert style.speaks is None
-
-
-@pytest.mark.parametrize(("lines", "speaks"), [(15, True), (12, True), (1, False), (2, False)])
-def test_a_stall_of_ours_tells_by_the_lines_that_came_in_it(lines: int, speaks: bool) -> None:
-    style = ReplyStyle(speaks=False)
-    stall(style, lines, 15.2, 1)
+@pytest.mark.parametrize(
+    ("configured", "stalls", "speaks"),
+    [
+        pytest.param(False, [(1, 1.0, 1)] * 1000, None, id="we send every period"),
+        pytest.param(False, [(15, 15.2, 1)], True, id="all lines come in our stall"),
+        pytest.param(False, [(12, 15.2, 1)], True, id="most lines come in our stall"),
+        pytest.param(False, [(1, 15.2, 1)], False, id="no line comes in our stall"),
+        pytest.param(False, [(2, 15.2, 1)], False, id="hardly any line comes in our stall"),
+        pytest.param(False, [(3, 3.0, 1)], None, id="a short stall"),
+        pytest.param(False, [(3, 3.0, 1)] * 2, True, id="short stalls tell together"),
+        pytest.param(False, [(13, 15.2, 11)], None, id="neither is clearly nearer"),
+        pytest.param(False, [(13, 15.2, 11), (2, 0.3, 0)], True, id="an adapter held two lines"),
+        pytest.param(False, [(1, 40.0, 13)], None, id="a silence that fits neither"),
+        pytest.param(False, [(15, 15.0, 1), (1, 15.0, 1)], False, id="later evidence counts"),
+        pytest.param(True, [(1, 15.0, 1)], True, id="what is configured is not doubted"),
+        pytest.param(False, [(1, 200.0, 1)], None, id="nothing is expected after long silence"),
+    ],
+)
+def test_a_stall_of_ours_tells_whether_the_board_reports_by_itself(
+    configured: bool, stalls: list[tuple[int, float, int]], speaks: bool | None
+) -> None:
+    """Each stall gives the lines that came, its periods, and the lines that left."""
+    style = ReplyStyle(configured)
+    for lines, periods, left in stalls:
+        for _ in range(left):
+            style.left()
+        style.read(lines, periods)
     assert style.speaks is speaks
-
-
-def test_short_stalls_tell_together() -> None:
-    style = ReplyStyle(speaks=False)
-    stall(style, 3, 3.0, 1)
-    assert style.speaks is None
-    stall(style, 3, 3.0, 1)
-    assert style.speaks is True
-
-
-def test_lines_that_an_adapter_still_holds_belong_to_the_stall_they_were_made_in() -> None:
-    style = ReplyStyle(speaks=False)
-    stall(style, 13, 15.2, 11)
-    assert style.speaks is None, "neither is clearly nearer"
-    stall(style, 2, 0.3, 0)
-    assert style.speaks is True
-
-
-def test_a_silence_that_fits_neither_tells_nothing() -> None:
-    style = ReplyStyle(speaks=False)
-    stall(style, 1, 40.0, 13)
-    assert style.speaks is None
-
-
-def test_later_evidence_counts() -> None:
-    style = ReplyStyle(speaks=False)
-    stall(style, 15, 15.0, 1)
-    stall(style, 1, 15.0, 1)
-    assert style.speaks is False
-
-
-def test_what_is_configured_is_not_doubted() -> None:
-    style = ReplyStyle(speaks=True)
-    stall(style, 1, 15.0, 1)
-    assert style.speaks is True
-
-
-def test_nothing_is_expected_after_a_long_silence() -> None:
-    style = ReplyStyle(speaks=False)
-    stall(style, 1, 200.0, 1)
-    assert style.speaks is None

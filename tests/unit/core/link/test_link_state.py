@@ -37,14 +37,6 @@ def test_every_state_has_its_words_and_a_way_down() -> None:
     assert {state for state, sign in TABLE if sign == "closed"} == set(WORDS) - {"down"}
 
 
-def test_it_is_up_with_the_third_good_line_in_a_row() -> None:
-    bench = Bench()
-    assert bench.good(GOOD_LINES - 1) == "booting"
-    bench.link.bad()
-    assert bench.good(GOOD_LINES - 1) == "booting"
-    assert bench.good() == "up"
-
-
 def test_it_does_not_rise_against_a_reason() -> None:
     bench = Bench()
     assert bench.good(GOOD_LINES + 1, may_rise=False) == "booting"
@@ -59,15 +51,6 @@ def test_lines_further_apart_than_quiet_are_reported_and_make_no_link() -> None:
     assert bench.link.sparse_s == pytest.approx(0.101)
     bench.good()
     assert bench.link.sparse_s == 0.0
-
-
-def test_silence_makes_it_stale_and_good_lines_bring_it_back() -> None:
-    bench = Bench()
-    bench.good(GOOD_LINES)
-    assert bench.wait(100) == "up"
-    assert bench.wait(0.001) == "stale"
-    assert bench.good(GOOD_LINES - 1) == "stale"
-    assert bench.good() == "up"
 
 
 def test_bad_lines_alone_do_not_take_the_link_down_but_are_reported() -> None:

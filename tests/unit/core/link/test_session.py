@@ -89,6 +89,12 @@ class Bench:
         received = tuple(Received(self.now, data) for data in reads)
         return self.session.update(self.now, self.port_open, self.opened, received)
 
+    def happen(self, port: str, ms: float, data: bytes) -> None:
+        """Open or close the port if the word says so, let time pass, and read these bytes."""
+        if port:
+            self.open() if port == "open" else self.close()
+        self.wait(ms, *([data] if data else []))
+
     def up(self) -> Bench:
         """Open the port and feed good lines until the link is up."""
         self.open().wait(10)
@@ -100,91 +106,46 @@ class Bench:
 # the link
 
 
-def test_the_link_is_down_while_the_port_is_closed() -> None:
+NOISE = b"\x00\xf8~boot\r\n" + GOOD[:20]
+LONG = b"x" * 200 + b"\r\n" + GOOD
+BOOTED = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
+
+Step = tuple[str, float, bytes, str]
+"""What happens to the port, the ms that pass, the bytes that are read then, and the link after."""
+
+OPENED: list[Step] = [("open", 10, b"", "booting")]
+UP: list[Step] = [*OPENED, ("", 10, GOOD * 3, "up")]
+
+LINKS: dict[str, list[Step]] = {
+    "a closed port": [("", 10, b"", "down"), ("", 10, GOOD * 5, "down")],
+    "the third good line": [*OPENED, *[("", 10, GOOD, "booting")] * 2, *[("", 10, GOOD, "up")] * 2],
+    "a bad line while booting starts the count again": [
+        *OPENED, ("", 10, GOOD + GOOD + BAD + GOOD + GOOD, "booting"), ("", 10, GOOD, "up"),
+    ],
+    "a line that is too long starts the count again": [*OPENED, *[("", 10, LONG, "booting")] * 4],
+    "a board that prints noise": [*OPENED, *[("", 10, NOISE, "booting")] * 100],
+    "silences between good lines": [*OPENED, *[("", 150, GOOD, "booting")] * 10],
+    "bad lines among good ones": [*UP, *[("", 10, BAD + BAD + GOOD + BAD, "up")] * 100],
+    "quiet": [*UP, ("", 100, b"", "up"), ("", 0.000001, b"", "stale")],
+    "bad lines alone": [*UP, *[("", 10, BAD, "up")] * 10, ("", 10, BAD, "stale")],
+    "a stale link, and three good lines": [
+        *UP, ("", 150, b"", "stale"), *[("", 10, GOOD, "stale")] * 2, ("", 10, GOOD, "up"),
+    ],
+    "a stale link, and a port that closes": [
+        *UP, ("", 150, b"", "stale"), ("close", 10, b"", "down"),
+    ],
+    "a board that restarts within one read": [
+        *UP, ("", 10, BOOTED + GOOD * 4, "booting"), ("", 10, GOOD, "up"),
+    ],
+}  # fmt: skip
+
+
+@each("case", LINKS)
+def test_the_link_follows_the_port_and_the_lines(case: str) -> None:
     bench = Bench()
-    bench.wait(10)
-    assert bench.link() == "down"
-
-
-def test_bytes_read_from_a_closed_port_are_dropped() -> None:
-    bench = Bench()
-    assert bench.wait(10, GOOD * 5) == []
-    assert bench.link() == "down"
-
-
-def test_an_open_port_is_booting() -> None:
-    bench = Bench().open()
-    bench.wait(10)
-    assert bench.link() == "booting"
-
-
-def test_the_link_is_up_with_the_third_good_line_and_not_before() -> None:
-    bench = Bench().open()
-    links = []
-    for _ in range(4):
-        bench.wait(10, GOOD)
-        links.append(bench.link())
-    assert links == ["booting", "booting", "up", "up"]
-
-
-def test_good_lines_of_one_read_count_each() -> None:
-    bench = Bench().open()
-    bench.wait(10, GOOD * 3)
-    assert bench.link() == "up"
-
-
-def test_a_bad_line_while_booting_starts_the_count_again() -> None:
-    bench = Bench().open()
-    bench.wait(10, GOOD + GOOD + BAD + GOOD + GOOD)
-    assert bench.link() == "booting"
-    bench.wait(10, GOOD)
-    assert bench.link() == "up"
-
-
-def test_a_board_that_prints_noise_keeps_booting() -> None:
-    bench = Bench().open()
-    for _ in range(100):
-        bench.wait(10, b"\x00\xf8~boot\r\n" + GOOD[:20])
-    assert bench.link() == "booting"
-
-
-def test_bad_lines_do_not_take_the_link_down_while_good_ones_come() -> None:
-    bench = Bench().up()
-    for _ in range(100):
-        bench.wait(10, BAD + BAD + GOOD + BAD)
-        assert bench.link() == "up"
-
-
-def test_after_quiet_without_a_good_line_the_link_is_stale() -> None:
-    bench = Bench().up()
-    bench.wait(100)
-    assert bench.link() == "up"
-    bench.wait(0.000001)
-    assert bench.link() == "stale"
-
-
-def test_bad_lines_do_not_hold_the_link_up() -> None:
-    bench = Bench().up()
-    for _ in range(11):
-        bench.wait(10, BAD)
-    assert bench.link() == "stale"
-
-
-def test_a_stale_link_is_up_again_after_three_good_lines() -> None:
-    bench = Bench().up()
-    bench.wait(150)
-    links = []
-    for _ in range(3):
-        bench.wait(10, GOOD)
-        links.append(bench.link())
-    assert links == ["stale", "stale", "up"]
-
-
-def test_a_stale_link_whose_port_closes_is_down() -> None:
-    bench = Bench().up()
-    bench.wait(150)
-    bench.close().wait(10)
-    assert bench.link() == "down"
+    for port, ms, data, link in LINKS[case]:
+        bench.happen(port, ms, data)
+        assert bench.link() == link
 
 
 @each("lines", range(5))
@@ -390,37 +351,33 @@ def test_the_time_a_port_was_closed_is_a_gap_however_short() -> None:
 # a new session
 
 
-def test_a_session_restarts_when_the_port_is_opened_and_only_in_that_update() -> None:
+QUIET_MS = LONG_GAP_NS / MS
+
+RESTARTS: dict[str, list[tuple[str, float, bytes, bool]]] = {
+    "the port opens": [("", 10, b"", False), ("open", 10, b"", True), ("", 10, b"", False)],
+    "the port closes and opens between two updates": [
+        ("open", 10, GOOD * 3, True), ("", 10, b"", False), ("open", 10, GOOD, True),
+    ],
+    "the port closes": [("open", 10, GOOD * 3, True), ("close", 10, b"", False)],
+    "the first line after a long gap": [
+        ("open", 10, GOOD * 3, True), ("", QUIET_MS, b"", False), ("", 0, GOOD, True),
+        ("", 10, GOOD, False),
+    ],
+    "a long gap that ends within a read": [
+        ("open", 10, GOOD * 3, True), ("", 1500, GOOD + GOOD + BAD + GOOD, True),
+    ],
+    "a short gap": [("open", 10, GOOD * 3, True), ("", 999.999, GOOD, False)],
+    "the first line ever": [("open", 10, b"", True), ("", 2000, GOOD, False)],
+}  # fmt: skip
+"""What happens to the port, the ms that pass, the bytes read then, and whether it restarts."""
+
+
+@each("case", RESTARTS)
+def test_a_session_restarts_with_the_port_and_after_a_long_gap(case: str) -> None:
     bench = Bench()
-    bench.wait(10)
-    assert not bench.session.restarted
-    bench.open().wait(10)
-    assert bench.session.restarted
-    bench.wait(10)
-    assert not bench.session.restarted
-
-
-def test_a_session_restarts_when_the_port_was_closed_and_opened_between_two_updates() -> None:
-    bench = Bench().up()
-    assert not bench.session.restarted
-    bench.open().wait(10, GOOD)
-    assert bench.session.restarted
-
-
-def test_a_closed_port_is_not_yet_a_new_session() -> None:
-    bench = Bench().up()
-    bench.close().wait(10)
-    assert not bench.session.restarted
-
-
-def test_a_session_restarts_with_the_first_line_after_a_long_gap() -> None:
-    bench = Bench().up()
-    bench.wait(LONG_GAP_NS / MS)
-    assert not bench.session.restarted
-    bench.wait(0, GOOD)
-    assert bench.session.restarted
-    bench.wait(10, GOOD)
-    assert not bench.session.restarted
+    for port, ms, data, restarted in RESTARTS[case]:
+        bench.happen(port, ms, data)
+        assert bench.session.restarted is restarted
 
 
 @pytest.mark.parametrize("begins", ["board", "port"])
@@ -435,25 +392,6 @@ def test_a_new_session_whose_first_line_comes_late_restarts_with_it_again(begins
     bench.wait(LONG_GAP_NS / MS)
     assert not bench.session.restarted
     bench.wait(0, GOOD)
-    assert bench.session.restarted
-
-
-def test_the_first_line_ever_does_not_restart_the_session() -> None:
-    bench = Bench().open()
-    bench.wait(10)
-    bench.wait(2000, GOOD)
-    assert not bench.session.restarted
-
-
-def test_a_session_does_not_restart_after_a_short_gap() -> None:
-    bench = Bench().up()
-    bench.wait(999.999, GOOD)
-    assert not bench.session.restarted
-
-
-def test_a_long_gap_counts_wherever_in_the_read_its_end_is() -> None:
-    bench = Bench().up()
-    bench.wait(1500, GOOD + GOOD + BAD + GOOD)
     assert bench.session.restarted
 
 
@@ -495,25 +433,10 @@ def test_the_codec_writes_the_dialect_of_the_configuration() -> None:
     assert session.codec.encode(WheelSpeeds(*SEED_MOTORS)) == SEED_LINE + b",\r\n"
 
 
-def test_an_over_long_line_starts_the_count_of_good_lines_again() -> None:
-    bench = Bench().open()
-    for _ in range(4):
-        bench.wait(10, b"x" * 200 + b"\r\n" + GOOD)
-    assert bench.link() == "booting"
-
-
-def test_good_lines_with_silences_between_them_do_not_bring_the_link_up() -> None:
-    bench = Bench().open()
-    for _ in range(10):
-        bench.wait(150, GOOD)
-    assert bench.link() == "booting"
-
-
 # the checked link
 
 AUTO = McuConfig(link_check="auto")
 REQUIRE = McuConfig(link_check="require")
-BOOTED = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
 
 
 def test_while_the_check_is_asked_for_only_stops_leave_and_the_link_is_not_up() -> None:
@@ -699,14 +622,6 @@ def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
 
 def test_zero_is_the_stop_line() -> None:
     assert Bench().up().line(STILL) == ZERO + b"\r\n"
-
-
-def test_the_link_is_seen_to_go_when_the_mcu_restarts_within_one_read() -> None:
-    bench = Bench().up()
-    bench.wait(10, BOOTED + GOOD * 4)
-    assert bench.link() == "booting"
-    bench.wait(10, GOOD)
-    assert bench.link() == "up"
 
 
 def disbelieved() -> Bench:

@@ -176,13 +176,6 @@ def test_the_twist_covariance_is_the_samples_and_of_other_axes_the_configured() 
     assert all(rows[i][j] == 0.0 for i in range(6) for j in range(6) if i != j)
 
 
-def test_both_covariances_are_symmetrical() -> None:
-    odom = published()["odom"]
-    for cells in (odom.pose.covariance, odom.twist.covariance):
-        assert len(cells) == 36
-        assert all(cells[6 * i + j] == cells[6 * j + i] for i in range(6) for j in range(6))
-
-
 def test_tf_says_the_same_place_as_odom() -> None:
     found = published()
     (transform,) = found["tf"].transforms

@@ -78,10 +78,6 @@ def pair(twist: Twist) -> tuple[float, float]:
 # speed
 
 
-def test_a_new_limiter_is_at_rest() -> None:
-    assert limiter().twist == REST
-
-
 @each(
     ("wish", "end"),
     [
@@ -148,12 +144,6 @@ def test_between_two_twists_the_wheels_can_follow_no_wheel_is_too_fast_either() 
     for twist in followed(found, Twist(0.0, 4.0), 800):
         assert max(map(abs, KINEMATICS.wheel_speeds(twist).as_tuple())) <= 16.0 + EPS
     assert found.twist == Twist(0.0, 4.0)
-
-
-def test_a_wheel_limit_keeps_the_curvature_once_the_ramps_are_over() -> None:
-    # 1 m/s and 1 rad/s put the right wheels at 1.15 / 0.05 = 23 rad/s; 16 / 23 of both remain.
-    path = followed(limiter(LimitsConfig(wheel_speed=16.0)), Twist(1.0, 1.0), 200)
-    assert pair(path[-1]) == approx(16 / 23, 16 / 23)
 
 
 @given(wishes=st.lists(st.tuples(mixed, periods), max_size=40), most=st.floats(0.1, 40.0))
@@ -403,11 +393,6 @@ def test_with_jerk_a_reversal_speeds_up_no_faster_than_the_limit(
     assert one.twist.linear == pytest.approx(-sign)
 
 
-def test_jerk_is_no_limit_when_it_is_zero() -> None:
-    limits = msgspec.structs.replace(FREE, linear_jerk=0.0)
-    assert limiter(limits).follow(Twist(1.0, 0.0), DT).linear == pytest.approx(0.01)
-
-
 # coasting
 
 
@@ -431,17 +416,8 @@ def test_coasting_for_a_negative_time_changes_nothing() -> None:
     assert pair(found.coast(-1e9, stop=True)) == approx(0.5, 4.0)
 
 
-def test_coasting_at_rest_stays_at_rest() -> None:
-    assert limiter().coast(DT) == REST
-    assert limiter().coast(0.0) == REST
-
-
 def test_coasting_ends_at_rest_without_a_negative_zero() -> None:
     assert repr(moving(-0.5, -1.0).coast(1.0)) == repr(REST)
-
-
-def test_no_time_coasts_nowhere() -> None:
-    assert moving(0.5, 1.0).coast(0.0) == Twist(0.5, 1.0)
 
 
 def test_a_stop_falls_by_its_own_higher_deceleration() -> None:

@@ -42,15 +42,6 @@ def test_the_mode_is_the_one_row_of_the_drawing_that_matches(facts: dict[str, bo
     assert drawn(facts) == [mode_of(**facts)]
 
 
-def test_every_mode_can_be_reached() -> None:
-    assert {mode_of(**facts) for facts in ALL} == set(Mode)
-
-
-def test_only_a_linked_commanded_robot_without_any_latch_drives() -> None:
-    drives = [facts for facts in ALL if mode_of(**facts) is Mode.DRIVING]
-    assert drives == [dict.fromkeys(FACTS[:4], False) | dict.fromkeys(FACTS[4:], True)]
-
-
 @each(("mode", "verb"), sorted(REFUSALS))
 def test_a_refused_request_says_why(mode: Mode, verb: Verb) -> None:
     with pytest.raises(RefusedError) as caught:

@@ -134,17 +134,14 @@ def test_a_reader_sleeps_until_a_sample_arrives_and_ends_when_the_session_is_clo
     assert looks <= 1 + 2 * 4  # a poll every millisecond would look 200 times
 
 
-def test_a_sample_or_the_end_wakes_an_asyncio_reader() -> None:
+async def test_a_sample_or_the_end_wakes_an_asyncio_reader() -> None:
     handler, subscription = declared()
-
-    async def read() -> list[int]:
-        asyncio.get_running_loop().call_later(0.05, handler.callback, sample(2))
-        asyncio.get_running_loop().call_later(0.06, handler.drop)
-        return [one.number async for one in subscription.arriving()]  # type: ignore[attr-defined]
-
     for number in range(2):
         handler.callback(sample(number))
-    assert asyncio.run(read()) == [0, 1, 2]
+    asyncio.get_running_loop().call_later(0.05, handler.callback, sample(2))
+    asyncio.get_running_loop().call_later(0.06, handler.drop)
+    arrived = [one.number async for one in subscription.arriving()]  # type: ignore[attr-defined]
+    assert arrived == [0, 1, 2]
 
 
 def test_the_newest_samples_of_a_flood_are_kept() -> None:
