@@ -23,10 +23,6 @@ NAMES = (
 DIGITS = 5
 """Number of decimals of the settings that are written."""
 
-MOST_STD = 1.0
-"""Largest standard deviation that the configuration accepts."""
-
-
 class Refusal(Struct, frozen=True):
     """The object that `--json` prints if a log gives no calibration."""
 
@@ -59,7 +55,7 @@ class Report(Struct, frozen=True):
     covariance: Sequence[Sequence[float]]
     """Covariance of the three multipliers, in the order of the fields above."""
     odometry: dict[str, float]
-    """Standard deviations for `[odometry]`, by the name of the setting (`Multipliers.own`)."""
+    """Settings of `[odometry]`: the deviations of the geometry and, if it is better, the noise."""
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
@@ -113,7 +109,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
         wheel_separation_multiplier=track, wheel_separation_multiplier_std=track_std,
         left_wheel_radius_multiplier=left, left_wheel_radius_multiplier_std=left_std,
         right_wheel_radius_multiplier=right, right_wheel_radius_multiplier_std=right_std,
-        covariance=multipliers.covariance.tolist(), odometry=deviations(calibration),
+        covariance=multipliers.covariance.tolist(), odometry=odometry(calibration),
         effective_track=track * drive.wheel_separation,
         effective_track_std=None if track_std is None else track_std * drive.wheel_separation,
         effective_track_growth=calibration.growth,
@@ -145,17 +141,14 @@ def keys(calibration: Calibration) -> dict[str, object]:
         f"drive.{name}": round(float(value), DIGITS)
         for name, value in zip(NAMES, calibration.multipliers.values, strict=True)
     }
-    return wanted | {f"odometry.{name}": value for name, value in deviations(calibration).items()}
+    return wanted | {
+        f"odometry.{name}": value for name, value in odometry(calibration).items()
+    }
 
 
-def deviations(calibration: Calibration) -> dict[str, float]:
-    """Return the settings of `[odometry]`; the scale is included only if it was measured."""
-    own, scale = calibration.multipliers.own()
-    stds = zip(NAMES, own, _deviations(calibration), strict=True)
-    given = {f"{name}_std": float(value) for name, value, known in stds if known is not None}
-    if calibration.scale:
-        given["distance_scale_std"] = scale
-    return {name: round(min(value, MOST_STD), DIGITS) for name, value in given.items()}
+def odometry(calibration: Calibration) -> dict[str, float]:
+    """Return the settings of `[odometry]`, with `DIGITS` significant digits."""
+    return {name: float(f"{value:.{DIGITS - 1}g}") for name, value in calibration.odometry.items()}
 
 
 def parts(report: Report, calibration: Calibration, where: str) -> Iterator[RenderableType]:

@@ -124,8 +124,8 @@ def guide(
                 track = track_ratio(made, setup.drive)
     if method.tool:
         taken = [made for leg in legs for made in readings[leg.name]]
-        return calibrated(method.tool, taken, setup.drive)
+        return calibrated(method.tool, taken, setup.drive, setup.odometry)
     metres = answers.get((STRAIGHT, "metres"), 0.0)
     tape = Tape(metres, STRAIGHT) if metres >= LEAST_M else None
     log = Log(tuple(replace(run, name=name) for name, run in rides.items()), ())
-    return calibrate(log, setup.drive, tape)
+    return calibrate(log, setup.drive, tape, setup.odometry)
