@@ -93,6 +93,13 @@ A log of a minute often explains everything by the geometry and leaves a rate of
 of the pose would then claim that some directions have no error at all.
 """
 
+CHANGES = 0.1
+"""Smallest variance rate, as a fraction of the one that would replace the noise that lasts.
+
+No window shows how long an error lasts beyond its end. Without this rate, one robot of eight had a
+covariance without width.
+"""
+
 TWICE = math.log(2.0) - 3 / 8
 """Gain that is sure whatever its standard deviation is.
 
@@ -119,12 +126,17 @@ class Windows(Struct, frozen=True):
     """The matrices C_i, shape (windows, COUNT, n, n)."""
     known: Floats
     """The matrix K, shape (windows, n, n)."""
+    lasting: Floats
+    """Rate of `DISTANCE`, `YAW` and `SKID` that has the effect of lasting noise over a window.
+
+    These are the ratios to `SLIP`, `RATIO` and `TRACK` in a mean window.
+    """
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
         """Return some of the windows."""
         return Windows(
             self.drive[chosen], self.size[chosen], self.residual[chosen], self.effects[chosen],
-            self.known[chosen],
+            self.known[chosen], self.lasting,
         )  # fmt: skip
 
     def covariance(self, noise: Floats) -> Floats:
@@ -146,11 +158,13 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return the noise with variance rates of at least `FLOOR` standard deviations."""
+        """Return the noise with variance rates of at least `FLOOR` and `CHANGES`."""
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         information = np.einsum("wkij,wkji->k", shares, shares) / 2
         least = np.where(information > 0.0, FLOOR / np.sqrt(np.maximum(information, 1e-300)), 0.0)
         least[Source.SLIP :] = 0.0
+        lasting = noise[[Source.SLIP, Source.RATIO, Source.TRACK]]
+        least[: Source.SLIP] = np.maximum(least[: Source.SLIP], CHANGES * self.lasting * lasting)
         return np.asarray(np.maximum(noise, least))
 
     def likelihood(self, noise: Floats) -> Floats:
@@ -288,11 +302,8 @@ def noise(
     gain, chance = with_chance(
         lambda left: float(np.divide(*sums[left].sum(axis=0))), np.ones(len(sums), dtype=bool)
     )
-    metres = sum(float(np.abs(one.distance).sum()) for one in motions)
-    turned = sum(float(np.abs(one.turn).sum()) for one in motions)
-    return Noise(
-        found, present, gain, chance, seen.places, turned / max(metres, 0.1), motions[0].track
-    )
+    turning = sum(one.turned for one in motions) / max(0.1, sum(one.metres for one in motions))
+    return Noise(found, present, gain, chance, seen.places, turning, motions[0].track)
 
 
 class _Motion(Struct, frozen=True):
@@ -304,6 +315,16 @@ class _Motion(Struct, frozen=True):
     """Distance of each step, m."""
     turn: Floats
     track: float
+
+    @property
+    def metres(self) -> float:
+        """Distance ahead and back, m."""
+        return float(np.abs(self.distance).sum())
+
+    @property
+    def turned(self) -> float:
+        """Sum of the turns to both sides, rad."""
+        return float(np.abs(self.turn).sum())
 
     @classmethod
     def of(cls, t: Floats, way: Path, track: float) -> _Motion:
@@ -368,11 +389,13 @@ def _windows(
     if not rows:
         return None
     most = max(len(residual) for _, residual, _, _ in rows)
+    metres, turned = np.mean([(one.metres, one.turned) for one in motions], axis=0)
+    lasting = np.array([metres, metres / motions[0].track ** 2, turned])
     made = Windows(
         np.array([number for number, *_ in rows]),
         np.array([float(len(residual)) for _, residual, *_ in rows]),
         np.zeros((len(rows), most)), np.zeros((len(rows), COUNT, most, most)),
-        np.tile(np.eye(most), (len(rows), 1, 1)),
+        np.tile(np.eye(most), (len(rows), 1, 1)), lasting,
     )  # fmt: skip
     for at, (_, residual, effects, sure_of) in enumerate(rows):
         size = len(residual)
@@ -452,9 +475,7 @@ def _by_places(
     before = motion.middle < times[:, None]
     ahead = np.exp(1j * np.interp(motion.middle, way.t, way.heading))
     lever = spots[:, None] - np.interp(motion.middle, way.t, way.place)
-    unknown = np.column_stack(
-        (np.ones(len(t)), np.full(len(t), 1j), 1j * (spots - spots.mean()))
-    )
+    unknown = np.column_stack((np.ones(len(t)), np.full(len(t), 1j), 1j * (spots - spots.mean())))
     yield _Window(
         _both(residual), _both(unknown), motion, _both(before * ahead), _both(before * 1j * lever),
         {Source.PLACE: np.eye(2 * len(t))},

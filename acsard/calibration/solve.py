@@ -297,9 +297,7 @@ def _noise(
     if made.headings is not None:
         parameters[P.BIAS_ERROR] = best.gyro_bias - made.headings.bias
     steps = made.steps or [positions.wheel_steps(run) for run in made.runs]
-    seen = Reference(
-        made.runs, made.headings, bool(made.segments), steps, made.base, parameters
-    )
+    seen = Reference(made.runs, made.headings, bool(made.segments), steps, made.base, parameters)
     return noise(held, seen, known, odometry)
 
 
@@ -395,6 +393,7 @@ def _calibration(
         known = replace(known, scale=result.own().scale)
     totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)
     notes += [_stays(name, deviation) for name, deviation in best.kept.items()]
+    notes += _of_noise(shown)
     notes += _cuts(log.runs)
     notes += _too_good(made, fitted)
     notes += plausibility.remarks(
@@ -417,6 +416,20 @@ def _calibration(
 def _stays(name: str, deviation: float) -> str:
     known = f" (it is known to {deviation:.1%} by this log)" if deviation < 1.0 else ""
     return f"{name} stays as configured, because this log does not improve it{known}"
+
+
+def _of_noise(shown: Noise | None) -> Iterator[str]:
+    """Yield a sentence about the noise that stays as configured."""
+    if shown is None or not shown.better:
+        yield (
+            "the variances per metre and per radian stay as configured, because those of this log "
+            "do not surely describe the errors of other drives better"
+        )
+    elif not shown.places:
+        yield (
+            "the chance errors of the distance stay as configured, because a gyro does not show "
+            "them: positions do"
+        )
 
 
 def _cuts(driven: Sequence[Run]) -> Iterator[str]:

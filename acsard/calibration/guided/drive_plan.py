@@ -294,6 +294,4 @@ def setup(config: Config) -> Setup:
             f"(drive.wheel_separation = {drive.wheel_separation:g}): record a drive where there "
             "is room, and use --log"
         )
-    return Setup(
-        drive, speed, length, reach, limits.angular_speed, wheel, config.odometry
-    )
+    return Setup(drive, speed, length, reach, limits.angular_speed, wheel, config.odometry)
