@@ -60,6 +60,8 @@ class Report(Struct, frozen=True):
     """Covariance of the three multipliers, in the order of the fields above."""
     odometry: dict[str, float]
     """Settings of `[odometry]`: the deviations of the geometry and, if it is better, the noise."""
+    feedback: dict[str, float]
+    """Settings of `[feedback]` without which the daemon would take sound wheels for faulty."""
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
@@ -125,6 +127,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
         left_wheel_radius_multiplier=left, left_wheel_radius_multiplier_std=left_std,
         right_wheel_radius_multiplier=right, right_wheel_radius_multiplier_std=right_std,
         covariance=multipliers.covariance.tolist(), odometry=odometry(calibration),
+        feedback=calibration.feedback,
         effective_track=track * drive.wheel_separation,
         effective_track_std=None if track_std is None else track_std * drive.wheel_separation,
         effective_track_growth=calibration.growth,
@@ -167,7 +170,8 @@ def keys(calibration: Calibration) -> dict[str, object]:
         f"drive.{name}": round(float(value), DIGITS)
         for name, value in zip(NAMES, calibration.multipliers.values, strict=True)
     }
-    return wanted | {f"odometry.{name}": value for name, value in odometry(calibration).items()}
+    wanted |= {f"odometry.{name}": value for name, value in odometry(calibration).items()}
+    return wanted | {f"feedback.{name}": value for name, value in calibration.feedback.items()}
 
 
 def odometry(calibration: Calibration) -> dict[str, float]:

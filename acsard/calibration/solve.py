@@ -43,7 +43,8 @@ from acsard.calibration.odometry_noise import Noise, Reference, noise, settings
 from acsard.calibration.plausibility import DRIVE, RATIO, TRACK
 from acsard.calibration.positions import Segment, WheelSteps, search
 from acsard.calibration.runs import Block, Log, Run, blocks
-from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.calibration.wheel_response import response
+from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryConfig
 from acsard.core.values import AcsardError
 
 LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0, 64.0)}
@@ -124,22 +125,30 @@ class Calibration(Struct, frozen=True):
     """Settings of `[odometry]` by name: the deviations of the geometry and, if known, the noise."""
     kept: tuple[str, ...] = ()
     """Quantities that stay as configured, `TRACK` and `RATIO` of `prepared`."""
+    feedback: dict[str, float] = {}
+    """Settings of `[feedback]` without which the daemon would take sound wheels for faulty."""
     noise: Noise | None = None
     """The noise of the odometry; None if the log does not show it."""
 
 
 def calibrate(
-    log: Log, drive: DriveConfig, tape: Tape | None = None, odometry: OdometryConfig | None = None
-) -> Calibration:
+    log: Log, drive: DriveConfig, tape: Tape | None = None,
+    odometry: OdometryConfig | None = None, feedback: FeedbackConfig | None = None,
+) -> Calibration:  # fmt: skip
     """Return the calibration of the robot that recorded this log.
 
     `drive` has the geometry that the multipliers belong to, and the present multipliers. `odometry`
-    has the present noise, or None for that of a new configuration. Raises
+    has the present noise, and `feedback` the present response time; None stands for those of a new
+    configuration. Raises
     `LogError` if a sensor of the log cannot be used, and `RefusedError` if the log gives no
     calibration, both with the notes of the log.
     """
+    follows = response(log.runs, drive, feedback or FeedbackConfig())
+    if follows is not None:
+        log = replace(log, notes=(*follows.sentences(), *log.notes))
     try:
-        return _calibrated(log, drive, tape, odometry or OdometryConfig())
+        found = _calibrated(log, drive, tape, odometry or OdometryConfig())
+        return replace(found, feedback={} if follows is None else follows.settings())
     except AcsardError as error:
         noted(error, log.notes)
         raise
