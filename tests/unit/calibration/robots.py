@@ -131,7 +131,7 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
     yaw = np.concatenate(([0.0], np.cumsum(turn) * STEP))
     ahead = np.exp(1j * (yaw[:-1] + turn * STEP / 2))
     where = np.concatenate(([0.0 + 0.0j], np.cumsum((fast + quick) / 2 * ahead) * STEP))
-    times = np.arange(count + 1) * STEP
+    times: Floats = np.asarray(np.arange(count + 1) * STEP, dtype=np.float64)
     if robot.wheel_noise:
         moves = (left != 0.0) | (right != 0.0)
         left = left + moves * _slow_noise(rng, count, robot.wheel_noise)
@@ -139,8 +139,9 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
     every = 2
     ends = np.arange(every, count + 1, every)
     if robot.counts or robot.period_noise:
-        samples = np.append(0.0, times[ends] + rng.normal(0.0, robot.period_noise, len(ends)))
-        sides = [_counted(robot, times, side, samples) for side in (left, right)]
+        late = rng.normal(0.0, robot.period_noise, len(ends))
+        samples: Floats = np.append(0.0, times[ends] + late)
+        sides = [_counted(robot, times, np.asarray(side), samples) for side in (left, right)]
     else:
         sides = [
             side[: len(ends) * every].reshape(-1, every).mean(axis=1) for side in (left, right)

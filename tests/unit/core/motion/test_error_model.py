@@ -245,6 +245,6 @@ def test_slip_is_a_share_of_the_distance_beside_that_of_the_scale() -> None:
     slip = columns(
         OdometryConfig(wheel_slip_std=0.03, distance_scale_std=0.04), Kinematics(DriveConfig())
     )
-    assert slip == ((pytest.approx(0.05), 0.0, 0.0, 0.0),)
+    assert slip[0] == pytest.approx((0.05, 0.0, 0.0, 0.0))
     alone = columns(OdometryConfig(distance_scale_std=0.013), Kinematics(DriveConfig()))
     assert alone == ((0.013, 0.0, 0.0, 0.0),)
