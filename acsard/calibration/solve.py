@@ -282,7 +282,7 @@ def _calibrated(
 
 
 def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
-    """Return the deviations of the geometry. What is kept has the configured ones."""
+    """Return the deviations of the geometry. A kept quantity has its configured one."""
     base, own = best.made.base, best.result.own()
     now = Deviations.of(odometry, base)
     return Deviations(

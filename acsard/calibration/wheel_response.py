@@ -27,8 +27,11 @@ from acsard.core.values import Twist
 TRIED = np.geomspace(0.01, 5.0, 60)
 """Response times that are tried, s: the range of the setting."""
 
-LEAST_ROWS = 200
-"""Smallest number of wheel samples with a command."""
+LEAST_ROWS, MOST_ROWS = 200, 30_000
+"""Smallest number of wheel samples with a command, and number that is enough.
+
+The latter is five minutes at 100 Hz. More would only take memory.
+"""
 
 FOLLOWS = 0.5
 """Largest part of the speeds, as squares, that the model may leave unexplained."""
@@ -72,7 +75,7 @@ class WheelResponse(Struct, frozen=True):
         return {"response_time": self.proposed} if self.false_fault else {}
 
     def sentences(self) -> list[str]:
-        """Return what a person should know."""
+        """Return a sentence about the response time, and one about a speed that is a limit."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (
@@ -96,7 +99,13 @@ def response(
     driven: Sequence[Run], drive: DriveConfig, feedback: FeedbackConfig
 ) -> WheelResponse | None:
     """Return how the wheels follow, or None if the log has no commands that they follow."""
-    parts = [_commanded(run, drive) for run in driven if len(run.commands_t) > 1]
+    parts: list[tuple[Floats, Floats, Floats]] = []
+    room = MOST_ROWS
+    for run in driven:
+        if len(run.commands_t) > 1 and room:
+            steps, wanted, seen = _commanded(run, drive)
+            parts.append((steps[:room], wanted[:room], seen[:room]))
+            room -= len(parts[-1][0])
     if sum(len(steps) for steps, _, _ in parts) < LEAST_ROWS:
         return None
     fastest = _fastest(parts)

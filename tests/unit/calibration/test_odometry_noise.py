@@ -232,7 +232,7 @@ def test_a_gyro_shows_no_noise_of_the_distance() -> None:
 
 def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
     """The windows have steps of noise per radian, noise that lasts, and that of the sensor."""
-    rng, size, count = np.random.default_rng(3), 8, 2000
+    rng, size, count = np.random.default_rng(3), 8, 600
     effects = np.zeros((count, COUNT, size, size))
     sums = np.minimum.outer(np.arange(1.0, size + 1), np.arange(1.0, size + 1))
     lasting = np.outer(np.arange(1.0, size + 1), np.arange(1.0, size + 1))
@@ -249,5 +249,5 @@ def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
     )  # fmt: skip
     noise = windows.search(START, np.ones(COUNT, dtype=bool))
     used = true > 0.0
-    assert noise[used] == pytest.approx(true[used], rel=0.1)
+    assert noise[used] == pytest.approx(true[used], rel=0.2)
     assert windows.at_least(noise)[used] == pytest.approx(noise[used])
