@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import Base, P
+from acsard.calibration.fit import Base, P, student_factor
 from acsard.calibration.heading import Heading, Headings
 from acsard.calibration.improvement import SURE, Fold, positions_of, with_chance
 from acsard.calibration.log_table import Floats
@@ -62,6 +62,7 @@ class Source(IntEnum):
 
 COUNT = len(Source)
 SENSORS = np.arange(COUNT) > Source.TRACK
+RATES = np.arange(COUNT) < Source.SLIP
 START = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
 """Noise from which the search starts. It only has to be positive."""
 
@@ -161,8 +162,14 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return the noise with variance rates of at least `FLOOR` and `CHANGES`."""
+        """Return the noise for another drive, with rates of at least `FLOOR` and `CHANGES`.
+
+        Noise that a few residuals show is widened like the variance of Student's t. Windows overlap
+        by half, so each residual counts half.
+        """
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
+        free = noise * np.einsum("wkii->k", shares) / 2
+        noise = np.where(RATES, noise * student_factor(free), noise)
         information = np.einsum("wkij,wkji->k", shares, shares) / 2
         least = np.where(information > 0.0, FLOOR / np.sqrt(np.maximum(information, 1e-300)), 0.0)
         least[Source.SLIP :] = 0.0
