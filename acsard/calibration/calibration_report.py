@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 from msgspec import Struct
 from rich.console import RenderableType
 
+from acsard.calibration.improvement import NOTHING, BeforeAfter
 from acsard.calibration.multipliers import SEPARATION
+from acsard.calibration.odometry_noise import METRES
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
@@ -22,9 +25,6 @@ NAMES = (
 
 DIGITS = 5
 """Number of decimals of the settings that are written."""
-
-MOST_STD = 1.0
-"""Largest standard deviation that the configuration accepts."""
 
 
 class Refusal(Struct, frozen=True):
@@ -59,7 +59,9 @@ class Report(Struct, frozen=True):
     covariance: Sequence[Sequence[float]]
     """Covariance of the three multipliers, in the order of the fields above."""
     odometry: dict[str, float]
-    """Standard deviations for `[odometry]`, by the name of the setting (`Multipliers.own`)."""
+    """Settings of `[odometry]`: the deviations of the geometry and, if it is better, the noise."""
+    feedback: dict[str, float]
+    """Settings of `[feedback]` without which the daemon would take sound wheels for faulty."""
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
@@ -81,6 +83,16 @@ class Report(Struct, frozen=True):
     position_error_before: float | None
     """Position error over whole drives, m rms."""
     position_error_after: float | None
+    heading_noise_before: float | None
+    """Uncertainty of the heading by noise after 10 m of such driving, deg, as configured.
+
+    It is None, like the next three, if the noise of `[odometry]` stays as configured, or if no
+    sensor shows it.
+    """
+    heading_noise_after: float | None
+    distance_noise_before: float | None
+    """Uncertainty of the distance by noise after 10 m, m, as configured."""
+    distance_noise_after: float | None
     time_offsets: dict[str, float]
     """Delay of each sensor behind the wheels, s."""
     gyro_bias: float
@@ -108,12 +120,14 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
     track, left, right = multipliers.values.tolist()
     track_std, left_std, right_std = _deviations(calibration)
     improvement, drives = calibration.improvement, calibration.drives
+    heading, distance = _noise(calibration)
     return Report(
         log=log, reference=calibration.reference, scale=calibration.scale,
         wheel_separation_multiplier=track, wheel_separation_multiplier_std=track_std,
         left_wheel_radius_multiplier=left, left_wheel_radius_multiplier_std=left_std,
         right_wheel_radius_multiplier=right, right_wheel_radius_multiplier_std=right_std,
-        covariance=multipliers.covariance.tolist(), odometry=deviations(calibration),
+        covariance=multipliers.covariance.tolist(), odometry=odometry(calibration),
+        feedback=calibration.feedback,
         effective_track=track * drive.wheel_separation,
         effective_track_std=None if track_std is None else track_std * drive.wheel_separation,
         effective_track_growth=calibration.growth,
@@ -126,10 +140,21 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
         heading_error_after=improvement.heading.after,
         position_error_before=improvement.place.before,
         position_error_after=improvement.place.after,
+        heading_noise_before=heading.before, heading_noise_after=heading.after,
+        distance_noise_before=distance.before, distance_noise_after=distance.after,
         time_offsets=calibration.delays, gyro_bias=calibration.gyro_bias,
         runs=drives.runs, seconds=drives.seconds, distance=drives.metres, turns=drives.turns,
         kept=calibration.kept, notes=calibration.notes, written=written or None,
     )  # fmt: skip
+
+
+def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
+    """Return the uncertainty of heading (deg) and distance (m) by the noise that is written."""
+    noise = calibration.noise
+    if noise is None or not noise.better:
+        return NOTHING, NOTHING
+    heading = BeforeAfter(*(math.degrees(angle) for angle in noise.heading()))
+    return heading, BeforeAfter(*noise.distance()) if noise.places else NOTHING
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
@@ -145,17 +170,13 @@ def keys(calibration: Calibration) -> dict[str, object]:
         f"drive.{name}": round(float(value), DIGITS)
         for name, value in zip(NAMES, calibration.multipliers.values, strict=True)
     }
-    return wanted | {f"odometry.{name}": value for name, value in deviations(calibration).items()}
+    wanted |= {f"odometry.{name}": value for name, value in odometry(calibration).items()}
+    return wanted | {f"feedback.{name}": value for name, value in calibration.feedback.items()}
 
 
-def deviations(calibration: Calibration) -> dict[str, float]:
-    """Return the settings of `[odometry]`; the scale is included only if it was measured."""
-    own, scale = calibration.multipliers.own()
-    stds = zip(NAMES, own, _deviations(calibration), strict=True)
-    given = {f"{name}_std": float(value) for name, value, known in stds if known is not None}
-    if calibration.scale:
-        given["distance_scale_std"] = scale
-    return {name: round(min(value, MOST_STD), DIGITS) for name, value in given.items()}
+def odometry(calibration: Calibration) -> dict[str, float]:
+    """Return the settings of `[odometry]`, with `DIGITS` significant digits."""
+    return {name: float(f"{value:.{DIGITS - 1}g}") for name, value in calibration.odometry.items()}
 
 
 def parts(report: Report, calibration: Calibration, where: str) -> Iterator[RenderableType]:
@@ -203,6 +224,16 @@ def _better(report: Report) -> list[str]:
         if before is not None and after is not None:
             sentences.append(
                 words.format(f"{_two(before * factor)} {unit}", f"{_two(after * factor)} {unit}")
+            )
+    for before, after, words, unit, factor in (
+        (report.heading_noise_before, report.heading_noise_after, "heading", "deg", 1),
+        (report.distance_noise_before, report.distance_noise_after, "distance", "cm", 100),
+    ):
+        if before is not None and after is not None:
+            sentences.append(
+                f"chance errors of the {words} after {METRES:g} m, as the odometry states them: "
+                f"{_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
+                "values"
             )
     return [*sentences, "(measured on drives that the fit did not use)"] if sentences else []
 

@@ -7,7 +7,7 @@ several fits by this error, and gives no values that are worse than the configur
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -194,10 +194,18 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
         sums = [squares[left].sum(axis=0) + LEAST_SQUARE for squares in kinds]
         return float(sum(np.log(before / after) for before, after, _ in sums) / 2)
 
+    return with_chance(gain, drives)
+
+
+def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
+    """Return the gain of these drives, and its standard deviation by the jackknife over them.
+
+    `gain` is a function of the drives that are used.
+    """
     count = int(drives.sum())
-    alone = [gain(drives & (np.arange(len(drives)) != at)) for at in np.flatnonzero(drives)]
     if count == 1:
         return gain(drives), np.inf
+    alone = [gain(drives & (np.arange(len(drives)) != at)) for at in np.flatnonzero(drives)]
     chance = float(np.sqrt((count - 1) * student_factor(count - 1.0)) * np.std(alone))
     return gain(drives), chance
 

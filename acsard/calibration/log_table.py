@@ -32,10 +32,14 @@ ANGLE = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0), "mrad": 
 TURNS = {"rpm": math.tau / 60, "rps": math.tau, "dps": math.radians(1.0)}
 RATE = {f"{unit}/s": size for unit, size in ANGLE.items()} | TURNS
 
-UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE}
+SPEED = {f"{unit}/s": size for unit, size in LENGTH.items()}
+APPLIED = "applied_linear", "applied_angular"
+"""Columns of the commanded twist, in m/s and rad/s."""
+
+UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
 """Known units by column, as factors to s, m and rad. All other columns take the units `RATE`."""
 
-SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad"}
+SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad", APPLIED[0]: "m/s"}
 
 _NAME = re.compile(r"(?P<name>[^\[(]*)[\[(]?(?P<unit>[^\])]*)")
 
@@ -127,7 +131,7 @@ def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 """Columns of wheel speeds in rad/s: of each wheel, or the mean of each side."""
 
-NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw")
+NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED)
 COLUMNS = (*NUMBERS, "run")
 """Columns that a log can have: numbers, and the name of the run."""
 
@@ -293,7 +297,8 @@ def _columns(header: list[str], number: int) -> list[str]:
             f"{where}: no column with which to compare the wheels: it must name yaw_rate (a gyro, "
             f"rad/s), or x and y (positions, m){_near(['yaw_rate', 'x', 'y'], header)}"
         )
-    used = {*wanted, *sensors, "run"}
+    commands = APPLIED if set(APPLIED) <= set(header) else ()
+    used = {*wanted, *sensors, *commands, "run"}
     return [name if name in used else "" for name in header]
 
 

@@ -6,6 +6,7 @@ shows how large the wheels are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -14,9 +15,34 @@ from msgspec import Struct
 from acsard.calibration.fit import Base, P
 from acsard.calibration.heading import Rates
 from acsard.calibration.log_table import Floats, RefusedError
+from acsard.core.config.settings import OdometryConfig
 
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
 """Indices into `values` and `covariance` of `Multipliers`."""
+
+
+class Deviations(Struct, frozen=True):
+    """Standard deviations of the geometry, as fractions."""
+
+    track: float
+    """That of the effective track, compared with the mean radius."""
+    ratio: float
+    """That of the ratio of both radii."""
+    scale: float
+    """That of the mean radius, to which all distances are proportional."""
+
+    @classmethod
+    def of(cls, odometry: OdometryConfig, base: Base) -> Deviations:
+        """Return the configured ones."""
+        sides = (
+            odometry.left_wheel_radius_multiplier_std / base.left,
+            odometry.right_wheel_radius_multiplier_std / base.right,
+        )
+        return cls(
+            odometry.wheel_separation_multiplier_std / base.track,
+            math.hypot(odometry.wheel_radius_ratio_std, *sides),
+            math.hypot(odometry.distance_scale_std, math.hypot(*sides) / 2),
+        )
 
 
 class Multipliers(Struct, frozen=True):
@@ -36,24 +62,14 @@ class Multipliers(Struct, frozen=True):
         apart = np.array([0.0, 1.0, -1.0])
         return float(np.sqrt(max(0.0, apart @ shares @ apart)))
 
-    def own(self) -> tuple[Floats, float]:
-        """Return four standard deviations, as the settings of `[odometry]` declare them.
+    def own(self) -> Deviations:
+        """Return the standard deviations that the settings of `[odometry]` declare.
 
-        The first three belong to one multiplier each. The fourth belongs to the common scale of all
-        multipliers, as a fraction. The odometry treats the four errors as independent.
-
-        Let d be the relative variance of the difference of both radii. Each radius then has its own
-        variance d / 2, which contributes d / 4 to the variance of their mean. This d / 4 is
-        subtracted from the variances of the mean radius (the scale) and of the track relative to
-        the mean radius (the track).
+        The odometry treats them as independent.
         """
         shares = self.covariance / np.outer(self.values, self.values)
-        mean, track, apart = (
-            float(row @ shares @ row)
-            for row in np.array([[0.0, 0.5, 0.5], [1.0, -0.5, -0.5], [0.0, 1.0, -1.0]])
-        )
-        own = np.sqrt(np.maximum(0.0, [track - apart / 4, apart / 2, apart / 2]))
-        return self.values * own, float(np.sqrt(max(0.0, mean - apart / 4)))
+        rows = np.array([[1.0, -0.5, -0.5], [0.0, -1.0, 1.0], [0.0, 0.5, 0.5]])
+        return Deviations(*(math.sqrt(max(0.0, float(row @ shares @ row))) for row in rows))
 
 
 def configured(base: Base) -> Multipliers:

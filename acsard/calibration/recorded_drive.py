@@ -58,7 +58,7 @@ def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> 
     except LogError as error:
         noted(error, table.notes)
         raise
-    return calibrate(driven, config.drive, tape)
+    return calibrate(driven, config.drive, tape, config.odometry, config.feedback)
 
 
 def _table(log: Path, config: Config, choice: Choice) -> Table:

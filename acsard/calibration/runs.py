@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table
+from acsard.calibration.log_table import APPLIED, FOUR, TWO, Floats, LogError, Table
 
 Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
@@ -52,7 +52,8 @@ the file. Positions of 10 Hz in rows of 20 Hz stay the same in about half of the
 """
 
 WHEELS = "left right"
-STREAMS = (WHEELS, "yaw_rate", "yaw", "x y")
+COMMANDS = " ".join(APPLIED)
+STREAMS = (WHEELS, "yaw_rate", "yaw", "x y", COMMANDS)
 """The columns of each sensor."""
 
 Streams = dict[str, tuple[Floats, ...]]
@@ -118,6 +119,11 @@ class Run(Struct, frozen=True, dict=True):
     place_t: Floats
     place: Complexes
     """Positions x + iy in m, relative to the first one."""
+    commands_t: Floats
+    linear: Floats
+    """Commanded speed, m/s."""
+    angular: Floats
+    """Commanded turn rate, rad/s."""
 
     @cached_property
     def gaps(self) -> Floats:
@@ -334,13 +340,13 @@ def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | 
 
 
 def _run(name: str, streams: Streams) -> Run:
-    wheels, gyro, yaw, place = (streams[stream] for stream in STREAMS)
+    wheels, gyro, yaw, place, commands = (streams[stream] for stream in STREAMS)
     start = float(wheels[0][0])
     x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
     points = (x - x[:1]) + 1j * (y - y[:1])
     return Run(
         name, start, wheels[0] - start, wheels[1], wheels[2], gyro[0] - start, gyro[1],
-        yaw[0] - start, yaw[1], place[0] - start, points,
+        yaw[0] - start, yaw[1], place[0] - start, points, commands[0] - start, *commands[1:],
     )  # fmt: skip
 
 

@@ -136,7 +136,7 @@ OUTPUT_COLUMNS = (
 """Columns with outputs of the robot. A row of a gyro sample leaves them empty."""
 
 CSV_HEADER = ",".join([*MEASURED, *OUTPUT_COLUMNS])
-MEASURED_CSV_HEADER = ",".join(MEASURED)
+MEASURED_CSV_HEADER = ",".join([*MEASURED, "applied_linear [m/s]", "applied_angular [rad/s]"])
 
 _NO_WHEELS = "," * 4
 _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
@@ -159,9 +159,10 @@ def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
     """Yield the CSV rows of a step with only the columns that calibration reads."""
     for sample in step.inputs.gyro:
-        yield gyro_columns(sample, step.inputs.now)
+        yield gyro_columns(sample, step.inputs.now) + ",,"
     for estimate in outputs.estimates:
-        yield wheel_columns(estimate)
+        applied = f"{outputs.applied.linear:.6g},{outputs.applied.angular:.6g}"
+        yield f"{wheel_columns(estimate)},{applied}"
 
 
 def wheel_columns(estimate: Estimate) -> str:

@@ -54,12 +54,15 @@ SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
 """Steps straight ahead (m) and on the spot (rad), for the errors of a robot that stands."""
 
 
-NOISE = "distance_variance_per_metre", "yaw_variance_per_metre", "yaw_variance_per_radian"
+NOISE = (
+    "distance_variance_per_metre", "yaw_variance_per_metre", "yaw_variance_per_radian",
+    "wheel_slip_std",
+)  # fmt: skip
 """Settings of `[odometry]` for the errors by skidding."""
 
 PARAMETERS = (
     "wheel_separation_multiplier_std", "left_wheel_radius_multiplier_std",
-    "right_wheel_radius_multiplier_std", "distance_scale_std",
+    "right_wheel_radius_multiplier_std", "wheel_radius_ratio_std", "distance_scale_std",
 )  # fmt: skip
 """Settings of `[odometry]` for the errors of wheel radii and track."""
 
@@ -255,7 +258,7 @@ class _Model:
     @property
     def declares_parameters(self) -> bool:
         """Whether the settings declare an uncertainty of the wheels or of the track."""
-        return bool(columns(self.odometry, self.kinematics))
+        return bool(columns(_only(self.odometry, *PARAMETERS), self.kinematics))
 
     def share(
         self, cause: Cause, basis: Basis, ahead: Steps, left: Steps, only: OdometryConfig,

@@ -21,7 +21,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.config.settings import Config, DriveConfig
+from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig, OdometryConfig
 from acsard.core.values import AcsardError
 from acsard.terminal.prompt import Ask
 
@@ -191,6 +191,10 @@ class Setup(Struct, frozen=True):
     """Largest turn rate that the limits allow, rad/s."""
     wheel: float
     """Largest rolling speed of the wheels in a turn, m/s."""
+    odometry: OdometryConfig = OdometryConfig()
+    """The present noise of the odometry."""
+    feedback: FeedbackConfig = FeedbackConfig()
+    """The present response time of the wheels."""
 
     @property
     def from_edge(self) -> float:
@@ -292,4 +296,13 @@ def setup(config: Config) -> Setup:
             f"(drive.wheel_separation = {drive.wheel_separation:g}): record a drive where there "
             "is room, and use --log"
         )
-    return Setup(drive, speed, length, reach, limits.angular_speed, wheel)
+    return Setup(
+        drive,
+        speed,
+        length,
+        reach,
+        limits.angular_speed,
+        wheel,
+        config.odometry,
+        config.feedback,
+    )

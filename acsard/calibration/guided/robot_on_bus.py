@@ -20,14 +20,14 @@ from msgspec import Struct
 
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
-from acsard.calibration.log_table import Floats, Table
+from acsard.calibration.log_table import APPLIED, Floats, Table
 from acsard.calibration.runs import Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_S, Watch
 from acsard.client.synchronous import Client
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
-from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time
+from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time, TwistStamped
 from acsard.core.messages.topics import by_key
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
@@ -103,7 +103,9 @@ class Sensor:
         )
 
 
-STREAMS = {"wheels": ("left", "right"), "gyro": ("yaw_rate",), "places": ("x", "y")}
+STREAMS = {
+    "wheels": ("left", "right"), "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
+}  # fmt: skip
 """Columns of the log by the source of their samples."""
 
 
@@ -145,6 +147,11 @@ class Recorder:
         spot = pose.position
         self._add("places", message.header.stamp, came, (spot.x, spot.y))
 
+    def command(self, message: TwistStamped, came: float) -> None:
+        """Add the twist that the daemon commands of the wheels."""
+        values = message.twist.linear.x, message.twist.angular.z
+        self._add("commands", message.header.stamp, came, values)
+
     def _add(self, stream: str, stamp: Time, came: float, values: tuple[float, ...]) -> None:
         made = stamp.to_ns() / NS_PER_S if stamp.sec else None
         self.samples[stream].append(Sample(came, made, values))
@@ -172,7 +179,8 @@ class RobotOnBus:
     def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
         self._client, self._prompt = client, prompt
         self._joints, self._geometry = config.joints.as_tuple(), config.drive
-        self._sensors: list[tuple[Sensor, str]] = []
+        commands = Sensor(client.session, client.key("cmd_vel_out"), (TwistStamped,))
+        self._sensors: list[tuple[Sensor, str]] = [(commands, "command")]
         self._wheels = Sensor(client.session, client.key("wheel_states"), (JointState,))
         self._watch = Watch(client, time.monotonic())
 

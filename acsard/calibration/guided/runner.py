@@ -25,6 +25,7 @@ from acsard.calibration.guided.tape_readings import (
 from acsard.calibration.multipliers import LEAST_M, Tape
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import Calibration, calibrate
+from acsard.calibration.wheel_response import response
 from acsard.terminal.prompt import Ask, Prompt
 
 MOST_REPEATS = 2
@@ -124,8 +125,13 @@ def guide(
                 track = track_ratio(made, setup.drive)
     if method.tool:
         taken = [made for leg in legs for made in readings[leg.name]]
-        return calibrated(method.tool, taken, setup.drive)
+        found = calibrated(method.tool, taken, setup.drive, setup.odometry)
+        follows = response(list(rides.values()), setup.drive, setup.feedback)
+        if follows is None:
+            return found
+        notes = (*follows.sentences(), *found.notes)
+        return replace(found, notes=notes, feedback=follows.settings())
     metres = answers.get((STRAIGHT, "metres"), 0.0)
     tape = Tape(metres, STRAIGHT) if metres >= LEAST_M else None
     log = Log(tuple(replace(run, name=name) for name, run in rides.items()), ())
-    return calibrate(log, setup.drive, tape)
+    return calibrate(log, setup.drive, tape, setup.odometry, setup.feedback)

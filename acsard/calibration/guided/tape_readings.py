@@ -29,12 +29,13 @@ from acsard.calibration.improvement import (
     with_constant_track,
 )
 from acsard.calibration.log_table import Floats, RefusedError
-from acsard.calibration.multipliers import configured, multipliers
+from acsard.calibration.multipliers import SEPARATION, configured, multipliers
+from acsard.calibration.odometry_noise import settings
 from acsard.calibration.plausibility import in_range, remarks, unsure
 from acsard.calibration.positions import WheelSteps, extent, path, wheel_steps
 from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, Drives
-from acsard.core.config.settings import DriveConfig
+from acsard.core.config.settings import DriveConfig, OdometryConfig
 
 SKIDDING = 0.015
 """Standard deviation of the heading by skidding, rad for each square root of a metre of rolling."""
@@ -309,7 +310,9 @@ The heading error of a drive in between belongs to neither.
 """
 
 
-def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Calibration:
+def calibrated(
+    tool: str, readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
+) -> Calibration:
     """Return the calibration by the readings of `tool`, in words. Raises `RefusedError`."""
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
@@ -333,6 +336,9 @@ def calibrated(tool: str, readings: Sequence[Reading], drive: DriveConfig) -> Ca
         scale="distance", growth=float(fit.parameters[P.TRACK_GROWTH]),
         growth_std=float(std[P.TRACK_GROWTH]), improvement=_improvement(readings, base, fit, rate),
         delays={}, gyro_bias=0.0, notes=tuple(notes),
+        odometry=settings(
+            result.own(), float(result.values[SEPARATION]), (), odometry, scaled=True
+        ),
     )  # fmt: skip
 
 

@@ -283,6 +283,8 @@ class OdometryConfig(Struct, frozen=True):
     wheel_separation_multiplier_std: Deviation = 0.0
     left_wheel_radius_multiplier_std: Deviation = 0.0
     right_wheel_radius_multiplier_std: Deviation = 0.0
+    wheel_radius_ratio_std: Deviation = 0.0
+    wheel_slip_std: Deviation = 0.0
     distance_scale_std: Deviation = 0.0
     covariance: Literal["model", "constant"] = "model"
 

@@ -127,8 +127,9 @@ def columns(
 
         dl = r m_l phi_l,   dr = r m_r phi_r,   dyaw = (dr - dl) / (m_L b)
 
-    and a scale that multiplies all lengths. r is `wheel_radius`, b is `wheel_separation`, and phi_l
-    and phi_r are the wheel angles. A parameter with a standard deviation of 0 has no column.
+    the ratio m_r / m_l, a scale that multiplies all lengths, and the share of each distance that
+    the wheels lose by slip. r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are
+    the wheel angles. A parameter with a standard deviation of 0 has no column.
 
     If `learned` is given, the last column is the error of the learned track. It is zero while the
     configured track is in use.
@@ -146,9 +147,14 @@ def columns(
     if odometry.wheel_separation_multiplier_std:
         share = 0.0 if used.deviation else odometry.wheel_separation_multiplier_std / separation
         rows.append((0.0, 0.0, 0.0, -share))
-    if odometry.distance_scale_std:
-        # The scale multiplies radii and track alike, so it does not change turns.
-        rows.append((odometry.distance_scale_std, 0.0, 0.0, 0.0))
+    if odometry.wheel_radius_ratio_std:
+        # One side is larger by half of the ratio's error, and the other one is smaller by as much.
+        share = odometry.wheel_radius_ratio_std
+        rows.append((0.0, share * track / 4, share / track, 0.0))
+    # The scale multiplies radii and track alike, so it does not change turns. Slip that lasts has
+    # the same effect on the distance.
+    if scale := math.hypot(odometry.distance_scale_std, odometry.wheel_slip_std):
+        rows.append((scale, 0.0, 0.0, 0.0))
     if learned is not None:
         rows.append((0.0, 0.0, 0.0, -learned.deviation))
     return tuple(rows)

@@ -76,6 +76,13 @@ class Robot:
     The error varies over about a second.
     """
     decimals: int = 2
+    counts: int = 0
+    """Encoder counts of a wheel turn; 0 for an encoder without steps."""
+    period_noise: float = 0.0
+    """Standard deviation of the times at which the board samples its wheels, s.
+
+    The board divides by the true period, and the host multiplies by the mean one.
+    """
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
 
@@ -124,17 +131,22 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
     yaw = np.concatenate(([0.0], np.cumsum(turn) * STEP))
     ahead = np.exp(1j * (yaw[:-1] + turn * STEP / 2))
     where = np.concatenate(([0.0 + 0.0j], np.cumsum((fast + quick) / 2 * ahead) * STEP))
-    times = np.arange(count + 1) * STEP
+    times: Floats = np.asarray(np.arange(count + 1) * STEP, dtype=np.float64)
     if robot.wheel_noise:
         moves = (left != 0.0) | (right != 0.0)
         left = left + moves * _slow_noise(rng, count, robot.wheel_noise)
         right = right + moves * _slow_noise(rng, count, robot.wheel_noise)
     every = 2
     ends = np.arange(every, count + 1, every)
-    shown_left, shown_right = (
-        np.round(side[: len(ends) * every].reshape(-1, every).mean(axis=1), robot.decimals)
-        for side in (left, right)
-    )
+    if robot.counts or robot.period_noise:
+        late = rng.normal(0.0, robot.period_noise, len(ends))
+        samples: Floats = np.append(0.0, times[ends] + late)
+        sides = [_counted(robot, times, np.asarray(side), samples) for side in (left, right)]
+    else:
+        sides = [
+            side[: len(ends) * every].reshape(-1, every).mean(axis=1) for side in (left, right)
+        ]
+    shown_left, shown_right = (np.round(side, robot.decimals) for side in sides)
     gyro_t = np.arange(0.003, times[-1], 1 / robot.gyro_hz)
     gyro = np.interp(gyro_t - robot.late, times[:-1] + STEP / 2, turn) + robot.bias
     gyro += rng.normal(0.0, robot.gyro_noise, len(gyro_t))
@@ -149,6 +161,16 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
         np.asarray(times[ends] - every * STEP / 2 + start), shown_left, shown_right,
         gyro_t + start, gyro, place_t + start, place, yaw[ends], where[ends],
     )  # fmt: skip
+
+
+def _counted(robot: Robot, times: Floats, speeds: Floats, samples: Floats) -> Floats:
+    """Return the mean speed of both wheels of a side between samples, as their counts show it."""
+    angle = np.interp(samples, times, np.append(0.0, np.cumsum(speeds) * STEP))
+    if robot.counts:
+        step = 2 * np.pi / robot.counts
+        phases = robot.rng.uniform(0.0, step, (2, 1))
+        angle = (np.floor((angle + phases) / step) * step).mean(axis=0)
+    return np.asarray(np.diff(angle) / np.diff(samples))
 
 
 def _smooth(plan: Plan) -> tuple[Floats, Floats]:

@@ -102,21 +102,14 @@ def test_what_is_configured_is_taken_as_it_is() -> None:
     assert configured(BASE).std.tolist() == [0, 0, 0]
 
 
-def test_what_all_three_have_in_common_is_told_apart_from_what_each_has_alone() -> None:
+def test_the_errors_of_track_ratio_and_scale_are_told_apart() -> None:
     # The scale is off by 1 %, each radius by another 0.1 %, the track by 2 %. All are independent.
     values = np.array([1.6, 1.1, 1.0])
     shares = np.diag([0.02, 0.001, 0.001]) ** 2 + 0.01**2
-    own, scale = Multipliers(values, shares * np.outer(values, values)).own()
-    assert scale == pytest.approx(0.01, rel=0.01)
-    assert own / values == pytest.approx([0.02, 0.001, 0.001], rel=0.01)
-
-
-def test_radii_that_are_the_least_known_are_no_scale_and_no_track() -> None:
-    values = np.array([1.6, 1.1, 1.0])
-    shares = np.diag([0.01, 0.03, 0.03]) ** 2
-    own, scale = Multipliers(values, shares * np.outer(values, values)).own()
-    assert scale == pytest.approx(0.0, abs=1e-9)
-    assert own / values == pytest.approx([0.01, 0.03, 0.03])
+    own = Multipliers(values, shares * np.outer(values, values)).own()
+    assert own.scale == pytest.approx(0.01, rel=0.01)
+    assert own.ratio == pytest.approx(0.001 * np.sqrt(2), rel=0.01)
+    assert own.track == pytest.approx(0.02, rel=0.01)
 
 
 def test_blocks_add_up_to_the_normal_equations_of_all_rows() -> None:

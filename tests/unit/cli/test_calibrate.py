@@ -67,7 +67,9 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     for name in ("wheel_separation", "left_wheel_radius", "right_wheel_radius"):
         key = f"{name}_multiplier"
         assert getattr(config.drive, key) == pytest.approx(found[key], abs=1e-5)
-        assert getattr(config.odometry, f"{key}_std") == found["odometry"][f"{key}_std"]
+    assert "yaw_variance_per_metre" in found["odometry"]
+    for name, value in found["odometry"].items():
+        assert getattr(config.odometry, name) == value
     with pytest.raises(MendableError, match="not surely better") as end:
         called(tmp_path, GOOD, "--json", "--write", text=text)
     assert end.value.code == Exit.FAILURE

@@ -374,7 +374,8 @@ def test_calibration_reads_the_same_from_the_whole_table_and_from_the_measured_c
         whole += csv_rows(step, replay_step(robot, step))
         part += measured_csv_rows(step, replay_step(twin, step))
     tables = [read("\n".join(lines).encode()) for lines in (whole, part)]
-    assert list(tables[0].columns) == ["t", "fr", "fl", "rl", "rr", "yaw_rate"]
+    commands = ["applied_linear", "applied_angular"]
+    assert list(tables[0].columns) == ["t", "fr", "fl", "rl", "rr", "yaw_rate", *commands]
     for name, values in tables[0].columns.items():
         np.testing.assert_array_equal(values, tables[1].columns[name])
     speeds = [e.speeds.front_right for t in tape.taken for e in t.outputs.estimates]

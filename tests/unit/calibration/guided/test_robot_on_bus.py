@@ -19,6 +19,7 @@ from acsard.core.messages.schema import (
     Quaternion,
     Time,
     Twist,
+    TwistStamped,
     TwistWithCovariance,
     Vector3,
 )  # fmt: skip
@@ -77,6 +78,16 @@ def test_positions_are_taken_from_a_pose_and_from_odometry_alike() -> None:
         recorder = Recorder(JOINTS)
         recorder.place(message, 5.0)
         assert recorder.samples["places"] == [Sample(5.0, 1.0, (1.0, 2.0))]
+
+
+def test_the_commands_of_the_wheels_are_part_of_the_run() -> None:
+    recorder = recorded()
+    for k in range(100):
+        twist = Twist(Vector3(x=0.4), Vector3(z=-0.5))
+        recorder.command(TwistStamped(stamped(5010.0 + 0.02 * k), twist), 10.1 + 0.02 * k)
+    run = recorder.run()
+    assert (set(run.linear), set(run.angular)) == ({0.4}, {-0.5})
+    assert run.commands_t[0] == pytest.approx(0.0)
 
 
 def test_the_fastest_wheel_is_told_whichever_way_it_turns() -> None:

@@ -27,7 +27,7 @@ from acsard.calibration.guided.tape_readings import (
 from acsard.calibration.log_table import RefusedError
 from acsard.calibration.runs import Run
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import DriveConfig
+from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.config.writing import excerpt
 from acsard.terminal.output import plain
 from tests.unit.calibration.cut import BASE, IDEAL, log_of, table
@@ -180,7 +180,7 @@ DRIVE = DriveConfig()
 
 
 def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
-    made = calibrated("a tape", readings(), DRIVE)
+    made = calibrated("a tape", readings(), DRIVE, OdometryConfig())
     assert made.improvement.turn.before == pytest.approx(180, rel=0.05)
     assert made.improvement.turn.after is not None
     assert made.improvement.turn.after < 10
@@ -189,7 +189,7 @@ def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
 
 
 def test_people_read_it_and_the_configuration_takes_it() -> None:
-    made = calibrated("a tape", readings(), DRIVE)
+    made = calibrated("a tape", readings(), DRIVE, OdometryConfig())
     told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml"))
     assert "compared with a tape" in told
     assert "error of a turn of 360 deg" in told
@@ -201,4 +201,4 @@ def test_people_read_it_and_the_configuration_takes_it() -> None:
 def test_readings_that_tell_too_little_are_refused() -> None:
     vague = [Reading(one.rides, one.quantity, one.value, 100 * one.deviation) for one in readings()]
     with pytest.raises(RefusedError, match="too inaccurate"):
-        calibrated("a tape", vague, DRIVE)
+        calibrated("a tape", vague, DRIVE, OdometryConfig())

@@ -222,3 +222,29 @@ def test_to_the_side_it_is_what_is_configured_but_at_rest() -> None:
     config = OdometryConfig(twist_covariance_diagonal=(1.0, 0.25, 1.0, 1.0, 1.0, 1.0))
     assert uncertainty(config).of(REST, 0.01).lateral == 0.25
     assert uncertainty(config).at_rest(1.0).lateral == LEAST
+
+
+def test_the_ratio_s_error_makes_one_side_larger_and_the_other_smaller() -> None:
+    """It turns the robot like both radii together, and leaves the distance straight ahead."""
+    ratio = columns(OdometryConfig(wheel_radius_ratio_std=0.01), Kinematics(DriveConfig()))
+    both = columns(
+        OdometryConfig(
+            left_wheel_radius_multiplier_std=0.005, right_wheel_radius_multiplier_std=0.005
+        ),
+        Kinematics(DriveConfig()),
+    )
+    ((along, by_turn, yaw, of_turn),) = ratio
+    left, right = both
+    assert (along, by_turn, yaw, of_turn) == pytest.approx(
+        tuple(b - a for a, b in zip(left, right, strict=True)), abs=1e-15
+    )
+    assert along == of_turn == 0.0
+
+
+def test_slip_is_a_share_of_the_distance_beside_that_of_the_scale() -> None:
+    slip = columns(
+        OdometryConfig(wheel_slip_std=0.03, distance_scale_std=0.04), Kinematics(DriveConfig())
+    )
+    assert slip[0] == pytest.approx((0.05, 0.0, 0.0, 0.0))
+    alone = columns(OdometryConfig(distance_scale_std=0.013), Kinematics(DriveConfig()))
+    assert alone == ((0.013, 0.0, 0.0, 0.0),)
