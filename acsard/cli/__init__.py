@@ -18,11 +18,11 @@ from decimal import Decimal
 from importlib import import_module
 from typing import NoReturn
 
-from acsard import __version__
 from acsard.core.config.nearest import nearest
 from acsard.core.formatting import lines
 from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
+from acsard.host.version import version
 
 VERBS = {
     "run": "run the daemon (the default)",
@@ -91,7 +91,7 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    whole.add_argument("--version", action="version", version=f"acsard {__version__}")
+    whole.add_argument("--version", action="version", version=f"acsard {version()}")
     verbs = whole.add_subparsers(title="subcommands", metavar="SUBCOMMAND", dest="verb")
     for name, text in VERBS.items():
         verb = verbs.add_parser(name, help=text)

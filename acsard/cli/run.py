@@ -13,7 +13,6 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from acsard import __version__
 from acsard.cli.common import add_config, by_environment, load, recorded, tables
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
@@ -23,6 +22,7 @@ from acsard.daemon import daemon
 from acsard.daemon.bus.zenoh_sessions import reachable
 from acsard.daemon.settings_file import SettingsFile
 from acsard.host.logs import Log, Writer
+from acsard.host.version import version
 
 _BANNER = """\
 acsard {version}, robot {robot}
@@ -96,7 +96,7 @@ def main(args: argparse.Namespace) -> int:
             screen.write(told + "\n")
         log.info(
             "started",
-            version=__version__,
+            version=version(),
             robot=config.robot.id,
             port=device,
             simulated=simulated,
@@ -203,7 +203,7 @@ def banner(
     if config.mcu.simulated:
         port = f"the built-in SIMULATOR ({device}); no real robot will move"
     return _BANNER.format(
-        version=__version__,
+        version=version(),
         robot=config.robot.id,
         port=port,
         listen=_bus(config),

@@ -17,7 +17,6 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequen
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from typing import Any, Self
 
-from acsard import __version__
 from acsard.core.config.settings import TLS, Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
@@ -40,6 +39,7 @@ from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
 from acsard.host.logs import Log
 from acsard.host.systemd import PATIENCE_S, Systemd
+from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
 EXIT_RAMP_S = 0.6
@@ -305,7 +305,7 @@ def _stop_line(config: Config) -> bytes:
 def _info(config: Config, path: str) -> Info:
     return Info(
         id=config.robot.id,
-        version=__version__,
+        version=version(),
         pid=os.getpid(),
         port=path,
         simulated=config.mcu.simulated,

@@ -14,12 +14,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from acsard import __version__
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.writing import document
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
+from acsard.host.version import version
 from acsard.recording.directory import Ring, Run, mark_cut
 from acsard.recording.file import About, Writing
 from acsard.recording.mcap_records import MAX_DATA_BYTES
@@ -221,7 +221,7 @@ class StepWriter:
             self._look_back(ring, now)
         about = About(
             robot=self._config.robot.id,
-            version=__version__,
+            version=version(),
             python=platform.python_version(),
             mono_ns=now.mono_ns,
             wall_ns=now.wall_ns,

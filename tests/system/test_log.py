@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from acsard import __version__
 from acsard.client import connect
 from acsard.core.messages.signature import public_name
 from acsard.host.own_identity import own_name
+from acsard.host.version import version
 from tests.system.harness import Bus, Daemon, Peer, acsard, running, until
 
 
@@ -69,7 +69,7 @@ def test_a_day_is_described_from_its_start_to_its_totals(tmp_path: Path, peer: P
         modes = [line["text"].partition(":")[0] for line in daemon.events("mode")]
         (commander,), (refused,) = daemon.events("commander"), daemon.events("command_refused")
         last = daemon.err[-1]
-    assert (started["version"], started["robot"]) == (__version__, "acsar")
+    assert (started["version"], started["robot"]) == (version(), "acsar")
     assert (started["port"], started["rate"]) == (str(peer.path), 100.0)
     assert modes[:2] == ["waiting -> ready", "ready -> driving"]
     assert modes[-2] in ("driving -> stopped", "ready -> stopped")

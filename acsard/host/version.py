@@ -1,0 +1,52 @@
+"""The version of this program with the commit of its source.
+
+`deploy/build_hook.py` imports this module when it builds a wheel, so it uses only the standard
+library.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from acsard import __version__
+
+_PACKAGE = Path(__file__).parents[1]
+
+COMMIT_FILE = "commit"
+"""Name of the file in an installed package that has the commit. `deploy/build_hook.py` adds it."""
+
+DIGITS = 9
+"""Number of digits of a commit that are shown."""
+
+
+@lru_cache(1)
+def version() -> str:
+    """Return the version, as `0.1.0+g1a2b3c4d5` if the commit of the source is known."""
+    commit = _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
+    return f"{__version__}+g{commit[:DIGITS]}" if commit else __version__
+
+
+def commit_of(clone: Path) -> str:
+    """Return the commit that is checked out in this directory, or "" if it is no clone of git.
+
+    The files of git are read directly, because a computer that runs the daemon may have no git.
+    Changes since the commit are not visible in them.
+    """
+    git = clone / ".git"
+    if git.is_file():  # the directory is a worktree
+        git = clone / _text(git).removeprefix("gitdir:").strip()
+    head = _text(git / "HEAD")
+    if not head.startswith("ref: "):
+        return head
+    name = head.removeprefix("ref: ")
+    common = git / (_text(git / "commondir") or ".")
+    packed = [line.partition(" ") for line in _text(common / "packed-refs").splitlines()]
+    return _text(common / name) or next((found for found, _, ref in packed if ref == name), "")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except (OSError, ValueError):
+        return ""
