@@ -130,7 +130,7 @@ def _without_measurements(message: Any) -> Any:
     """Return the message without the values that a recording does not hold."""
     match message:
         case RobotState():
-            return replace(message, certificate_expiry="", latencies={})
+            return replace(message, certificate_expiry="", certificate_days=None, latencies={})
         case DiagnosticArray():
             rows = [row for row in message.status if row.name not in MEASURED]
             return DiagnosticArray(message.header, rows)

@@ -17,6 +17,7 @@ from acsard.core.messages.schema import RobotState
 from acsard.daemon.latencies import NAMES
 from acsard.top.text import ScreenData, clean, count, flow, rule
 from acsard.top.wide_screen import (
+    board,
     certificate,
     drives,
     hidden,
@@ -92,6 +93,8 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
         lines += folded(f"gyro {clean(state.gyro)}", width, 2)
     if state.effective_track:
         lines += folded(f"track {clean(state.effective_track)}", width, 2)
+    if inputs := board(state):
+        lines += folded(f"board {inputs}", width, 2)
     kinds = refused(state, before)
     for kind, parts in kinds:
         lines += flow([Text(f"rejected {kind}"), *parts], width, 2)
@@ -117,7 +120,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
     """Wrap a sentence between words. The first line is indented unless it starts with a label."""
-    first = "" if text.startswith(("gyro ", "track ", "last one ")) else " " * inset
+    first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
     wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset
     return [Text(one) for one in wrap(text, room, initial_indent=first, subsequent_indent=rest)]

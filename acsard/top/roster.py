@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
@@ -9,30 +10,27 @@ from msgspec.structs import replace
 
 from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
+from acsard.core.messages.schema import RobotState
+from acsard.core.messages.state_warnings import brief, warnings
 from acsard.daemon.bus.robot_discovery import ALL, nobody, seen
 from acsard.top.teleop import reason
 
-HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "FILE", "SEEN", "WHY")
+HEADS = ("ROBOT", "MODE", "M/S", "LINK", "PLACE", "VERSION", "SEEN", "WHY")
 
-ROOM = (32, 8, 6, 7, 10, 7, 6)
+ROOM = (32, 8, 6, 7, 22, 21, 6)
 """Maximum width of each column but the last, which takes the rest. The first is as wide as its
 longest id."""
 
-NAME, WHY = 12, 20
+NAME, WHY = 12, 32
 """Minimum widths of the first and last column. A long id may not narrow the last column below its
 minimum, unless the first would fall below its own."""
 
-NARROW = (0, 1, 2, 6, 7)
-"""Columns of a terminal that is narrower than `WIDE`."""
-
-FILE = 5
-"""Column that marks a robot whose settings differ from its configuration file. The table has this
-column only if there is such a robot."""
-
-WIDE = 72
+LEFT_OUT = ("VERSION", "PLACE", "LINK")
+"""Columns that a narrow terminal lacks. The first is the first to go."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""Modes that need attention; they are listed first, because the lines may not all fit."""
+"""Modes that need attention; they are listed first, because the lines may not all fit. The robots
+with a warning come next."""
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
@@ -41,11 +39,12 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     There are at most `height` lines of at most `width` characters.
     """
     cells = [HEADS, *map(told, sorted(rows, key=_order))]
-    marked = any(row[FILE] for row in cells[1:])
-    wide = [n for n in range(len(HEADS)) if n != FILE or marked]
-    shown = wide if width >= WIDE else NARROW
     widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
     rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
+    shown = list(range(len(HEADS)))
+    for head in LEFT_OUT:
+        if sum(rooms[n] + 2 for n in shown) - 2 > width:
+            shown.remove(HEADS.index(head))
     rest = sum(rooms[n] + 2 for n in shown[1:])
     rooms[0] = min(rooms[0], max(NAME, width - rest))
     lines = [
@@ -86,24 +85,37 @@ def told(row: Row) -> tuple[str, ...]:
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
-        return (name, "-", "-", "-", printable(row.version) or "-", "", "never", why)
-    state, why = row.state, reason(row.state)
-    if state.settings_differ:
-        why = f"{why}; settings: {printable(state.settings_differ)}"
-    if state.speed_limit:
-        why = f"{why}; speed limit: {printable(state.speed_limit)}"
-    if absence := _absence(row):
-        why = f"{absence}, was: {why}"
+        return (name, "-", "-", "-", "-", printable(row.version) or "-", "never", why)
+    state, absence = row.state, _absence(row)
     return (
         name,
         printable(state.mode),
         signed(state.linear, 2, 6),
         printable(state.link),
+        _place(state),
         printable(row.version) or "-",
-        "differs" if state.settings_differ else "",
         rough(row.age),
-        why,
+        f"{absence}, was: {_why(state)}" if absence else _why(state),
     )
+
+
+def _why(state: RobotState) -> str:
+    """Return the warnings in few words, the reason of the mode, and the details.
+
+    In a mode that needs attention the reason comes first, because a terminal cuts the end.
+    """
+    found, parts = warnings(state), [reason(state)]
+    if found:
+        parts.insert(1 if state.mode in URGENT else 0, brief(found))
+    details = [(one.what.replace("_", " "), one.text) for one in found]
+    details.append(("speed limit", state.speed_limit))
+    return "; ".join(parts + [f"{what}: {printable(text)}" for what, text in details if text])
+
+
+def _place(state: RobotState) -> str:
+    """Return x and y in m and the heading in degrees."""
+    figures = (state.x, 1), (state.y, 1), (math.degrees(state.yaw), 0)
+    return " ".join(signed(value, decimals, 7).strip() for value, decimals in figures) + "°"
 
 
 def _absence(row: Row) -> str:
@@ -115,7 +127,10 @@ def _absence(row: Row) -> str:
 def _order(row: Row) -> tuple[int, str]:
     """Sort by urgency, then by id. Absence counts before the last reported mode."""
     what = _absence(row) or ("" if row.state is None else row.state.mode)
-    return URGENT.index(what) if what in URGENT else len(URGENT), row.robot_id
+    if what in URGENT:
+        return URGENT.index(what), row.robot_id
+    warned = row.state is not None and warnings(row.state)
+    return len(URGENT) + (not warned), row.robot_id
 
 
 class Roster(Fleet):

@@ -20,6 +20,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
+from acsard.core.messages.state_warnings import WARNING
 from acsard.core.values import AcsardError
 from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.output import has_screen, plain
@@ -109,6 +110,8 @@ def roster(fleet: Roster) -> None:
         for line in told[1:]:
             if "GONE" in line.plain or "SILENT" in line.plain:
                 line.stylize("bold red")
+            elif WARNING in line.plain:
+                line.stylize("bold yellow")
         below = f"q quits   {fleet.more or fleet.seen}" if rows else fleet.hint()
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
         return Group(*told, Text(), last)

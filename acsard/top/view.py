@@ -15,6 +15,7 @@ from rich.text import Text
 
 from acsard.core.formatting import lasting, rough
 from acsard.core.messages.schema import RobotState
+from acsard.core.messages.state_warnings import WARNING, warnings
 from acsard.top import narrow_screen
 from acsard.top import wide_screen as beside
 from acsard.top.text import MODES, ScreenData, clean, ends
@@ -27,6 +28,8 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
     """Return the screen as lines of at most `width` cells, at most `height` of them (None: all)."""
     width = max(20, min(WIDEST, width))
     head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
+    if seen.state is not None:
+        head += [Text(clean(f"{WARNING}: {one}"), "yellow") for one in warnings(seen.state)]
     sections: list[list[Text]] = []
     if seen.state is not None:
         state = seen.state

@@ -146,6 +146,8 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
         lines.append(_gyro(state.gyro))
     if state.effective_track:
         lines.append(row("track", clean(state.effective_track)))
+    if inputs := board(state):
+        lines.append(row("board", inputs))
     lines += _refusals(state, before)
     return lines
 
@@ -161,7 +163,7 @@ def title(seen: ScreenData, state: RobotState) -> Text:
 
 def certificate(state: RobotState) -> Text:
     """Return the remaining validity of the certificate."""
-    style = "" if state.certificate_expiry.startswith("valid for") else "bold red"
+    style = "" if state.certificate_expiry.startswith("valid") else "bold red"
     return Text(f"certificate {clean(state.certificate_expiry)}", style)
 
 
@@ -178,6 +180,12 @@ def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[
         return f"{rate(now, then, seconds)} of {count(now)}"
 
     return counted
+
+
+def board(state: RobotState) -> str:
+    """Return the inputs that the board reports, in words; "" if it reports none."""
+    stop = state.emergency_stop
+    return f"emergency stop {clean(stop)}" if stop else ""
 
 
 def overrun(state: RobotState) -> Text:

@@ -241,8 +241,8 @@ class Page:
     async def metrics(self, request: web.Request) -> web.StreamResponse:
         robots, counts = self._robots, self._parts.counts
         body = metrics.text(
-            robots.id, robots.state, not robots.gone, len(self._viewers), counts.all(),
-            counts.refused(),
+            robots.id, robots.about.version, robots.state, not robots.gone, len(self._viewers),
+            counts.all(), counts.refused(),
         )  # fmt: skip
         return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
 

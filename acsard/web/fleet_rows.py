@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from acsard.client import Client, fleet
+from acsard.core.messages.state_warnings import warnings
 from acsard.daemon.bus.robot_discovery import ALL
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
@@ -127,5 +128,5 @@ def _row(one: fleet.Row) -> Row:
         return Row(one.robot_id, "gone", was, None, "", age, version)
     return Row(
         one.robot_id, state.mode, state.reason, state.linear, state.link, age, version,
-        state.settings_differ,
+        [str(one) for one in warnings(state)], [state.x, state.y, state.yaw],
     )  # fmt: skip

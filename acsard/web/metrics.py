@@ -12,6 +12,7 @@ from typing import Literal, get_args
 
 from acsard.core.link.link_state import State
 from acsard.core.messages.schema import RobotState
+from acsard.core.messages.state_warnings import WHATS, warnings
 from acsard.core.motion.modes import Mode
 from acsard.core.values import Event
 from acsard.web.callers import Reason
@@ -27,9 +28,12 @@ WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 
 US = 1e-6
 
+DAY_S = 86400.0
+
 
 def text(
     robot: str,
+    version: str,
     state: RobotState | None,
     heard: bool,
     viewers: int,
@@ -47,6 +51,7 @@ def text(
 
     add("up", "gauge", "1 while messages from the daemon arrive", [({}, float(heard))])
     if state is not None and heard:
+        add("info", "gauge", "1, with the version of the daemon", [({"version": version}, 1.0)])
         for name, kind, what, samples in _of_robot(state):
             add(name, kind, what, samples)
     add("page_viewers", "gauge", "pages and programs connected", [({}, viewers)])
@@ -70,6 +75,12 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         "1 for the present state of the link to the microcontroller, else 0",
         links,
     )
+    warned = {one.what for one in warnings(state)}
+    subjects = [({"what": what}, float(what in warned)) for what in WHATS]
+    yield "warning", "gauge", "1 while the robot warns of this, else 0", subjects
+    if state.certificate_days is not None:
+        left = [({}, state.certificate_days * DAY_S)]
+        yield "certificate_seconds", "gauge", "until the first TLS certificate ends", left
     if state.linear is not None and state.angular is not None:
         yield "linear_speed_mps", "gauge", "measured, forward", [({}, state.linear)]
         yield "angular_speed_radps", "gauge", "measured, to the left", [({}, state.angular)]

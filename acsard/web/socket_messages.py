@@ -251,8 +251,10 @@ class Row(Struct, frozen=True):
     """Seconds since the last state arrived; None before the first one."""
     version: str
     """Version of the daemon; "" until it is reported."""
-    settings_differ: str = ""
-    """Settings in force that differ from the robot's configuration file, in words; else empty."""
+    warnings: Sequence[str] = ()
+    """What is wrong with the robot although it may be ready, in words."""
+    place: Sequence[float] | None = None
+    """x and y in m, and yaw in rad, in the odom frame; None before the first state."""
 
 
 class Rows(Struct, frozen=True):

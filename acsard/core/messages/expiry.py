@@ -15,6 +15,8 @@ DAY_NS = 86400 * NS_PER_S
 def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     """Return the level (0 ok, 1 warning, 2 error) and a description of the validity.
 
+    Only the description of level 0 begins with "valid".
+
     Args:
         ends: the end of each certificate that TLS needs, wall-clock ns since 1970, by the name of
             its owner. The name of the robot's own is "". It is empty if the ends are unknown.
@@ -31,7 +33,9 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
         return 2, f"expired {-days:.0f} days ago{of}: TLS refuses every client"
-    return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days{of}"
+    if days < EXPIRY_DAYS:
+        return 1, f"ends in {days:.0f} days{of}"
+    return 0, f"valid for {days:.0f} days{of}"
 
 
 def first(ends: Mapping[str, int]) -> tuple[str, int]:

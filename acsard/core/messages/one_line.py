@@ -11,6 +11,7 @@ from typing import Any
 
 from acsard.core.formatting import printable, signed
 from acsard.core.messages.schema import Odometry, Pose, PoseStamped, RobotState, Twist, TwistStamped
+from acsard.core.messages.state_warnings import brief, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
@@ -39,7 +40,8 @@ def _odometry(odom: Odometry) -> list[str]:
 def _state(state: RobotState) -> list[str]:
     reason = state.reason.removeprefix(f"{state.mode}: ")
     mode = printable(f"{state.mode}: {reason}")
-    return [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
+    told = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
+    return [one for one in (*told, brief(warnings(state))) if one]
 
 
 def _pose(pose: Pose) -> list[str]:

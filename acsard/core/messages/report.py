@@ -13,7 +13,7 @@ from msgspec.structs import asdict
 from acsard.core.config.settings import Config
 from acsard.core.messages.covariances import UNKNOWN, Covariances
 from acsard.core.messages.diagnostics import diagnostics
-from acsard.core.messages.expiry import expiry
+from acsard.core.messages.expiry import DAY_NS, expiry, first
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     Battery,
@@ -287,7 +287,13 @@ class Report:
             battery=_summary(snapshot.battery),
             settings_differ=self.settings_differ,
             speed_limit=self.speed_limit,
+            certificate_days=self._certificate_days(outputs.now),
         )
+
+    def _certificate_days(self, now: Instant) -> float | None:
+        if not (self._config.bus.tls and self.certificate_ends):
+            return None
+        return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
         """Return the message with the stamp of the last report, None if the board has none."""

@@ -305,7 +305,10 @@ class RobotState(Message, frozen=True):
     counters: dict[str, int]
     """Counters since the start of the daemon, by name."""
     certificate_expiry: str = ""
-    """Remaining validity of the bus's TLS certificate, in words; empty without TLS."""
+    """Remaining validity of the bus's TLS certificate, in words; empty without TLS.
+
+    The words begin with "valid" while the certificate is valid for 30 days or longer.
+    """
     latencies: dict[str, Latency] = {}
     """Durations of the control loop by the names in `daemon/latencies.py`, up to a second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
@@ -362,6 +365,11 @@ class RobotState(Message, frozen=True):
     """The limit of a SpeedLimit that lowers `limits.linear_speed`, with its sender, in words.
 
     Empty if none lowers it.
+    """
+    certificate_days: float | None = None
+    """Days until the first of the certificates that TLS needs ends; negative after its end.
+
+    Null without TLS, and while its end is unknown.
     """
 
 

@@ -25,6 +25,12 @@ const BARS = {
 const NEVER = ["inactive", "stopped", "fault", "shutdown"];
 export const ZERO = { linear_x: 0, angular_z: 0 };
 
+/** What to do first while the emergency stop at the robot counts as pressed, by its state. */
+const PRESSED = {
+  pressed: "Emergency stop pressed at the robot. Release it there, then press Release STOP.",
+  silent: "The board no longer reports the emergency stop. Check the board, then press Release STOP.",
+};
+
 /** Return whether the link to the board is up. While it is not, nobody can stop the motors from here. */
 export function boarded(state) {
   return state.link === "up";
@@ -34,6 +40,7 @@ export function boarded(state) {
  *  source of a lower priority, but not from another sender of this one. */
 export function still(state, source, sender) {
   if (!state) return "Nothing is received from the robot.";
+  if (state.mode === "stopped" && PRESSED[state.emergency_stop]) return PRESSED[state.emergency_stop];
   if (BARS[state.mode]) return BARS[state.mode] + (boarded(state) ? "" : " The board is missing, too.");
   if (!boarded(state)) return "No board: nothing can drive.";
   const ours = state.sources.find((one) => one.name === source);

@@ -11,7 +11,7 @@ import { Minute } from "./plots.js";
 import { Recordings } from "./recordings.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { RELEASE, figure, milliseconds, named, person, said as clickable, signed, yaw } from "./words.js";
+import { RELEASE, figure, milliseconds, named, person, said as clickable, spot, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const { stopping, alarm } = window; // of stop.js, which has run before
@@ -222,7 +222,7 @@ function stated({ detail }) {
   map.lose(!boarded(state));
   const who = state.sender ? person(state.sender, hello?.sender) : state.source;
   views.text("who", !state.source || state.mode !== "driving" ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
-  views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
+  views.text("where", spot(state.x, state.y, state.yaw));
   const { linear, angular } = state; // null without feedback from the board
   dialled();
   forgotten();

@@ -1,7 +1,7 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./hand.js";
-import { RELEASE, age, ago, clock, logged, person, reason, said, signed } from "./words.js";
+import { RELEASE, age, ago, clock, logged, person, reason, said, signed, spot } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
 const LEVELS = ["", "warning", "error", "warning"];
@@ -69,18 +69,20 @@ export function happened(list, told, elsewhere) {
 export function cards(list, robots, own, here) {
   const before = new Map([...list.children].map((card) => [card.dataset.robot, card]));
   const shown = robots.map((one) => {
-    const bad = ["fault", "stopped"].includes(one.mode) ? "error" : one.mode === "driving" || one.mode === "ready" ? "" : "warning";
+    const fine = ["driving", "ready"].includes(one.mode) && !one.warnings?.length;
+    const bad = ["fault", "stopped"].includes(one.mode) ? "error" : fine ? "" : "warning";
     const facts = [
       typeof one.speed === "number" ? `${signed(one.speed, 2)} m/s` : "",
       one.link ? `link ${one.link}` : "",
       one.version ? `version ${one.version}` : "",
       typeof one.age === "number" ? `seen ${ago(one.age)}` : "",
-      one.settings_differ ? `settings: ${one.settings_differ}` : "",
+      one.place ? spot(...one.place) : "",
     ];
     const card = before.get(one.robot) ?? empty(one.robot, own);
-    const [, mode, why, what] = card.children;
+    const [, mode, warned, why, what] = card.children;
     card.className = bad;
     mode.textContent = one.mode ?? "silent";
+    warned.textContent = (one.warnings ?? []).join("; ");
     why.textContent = reason({ mode: one.mode, reason: one.reason ?? "" }, one.robot === here ? "" : one.robot);
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
@@ -92,7 +94,7 @@ export function cards(list, robots, own, here) {
 function empty(robot, own) {
   const link = made("a", "", robot === own ? `${robot} (this page's own)` : robot);
   link.href = robot === own ? "./" : `./?robot=${encodeURIComponent(robot)}`;
-  const card = made("li", "", link, made("span", "mode"), made("div", "quiet"), made("div", "quiet"));
+  const card = made("li", "", link, made("span", "mode"), made("div", "warn"), made("div", "quiet"), made("div", "quiet"));
   card.dataset.robot = robot;
   return card;
 }
@@ -111,9 +113,10 @@ export function banner(state, locked, elsewhere, own) {
   const warned = [
     alone ? "Nobody can stop the motors from here: use the robot's own switch." : "",
     state.wheel_fault, state.recording_error, state.latch_file_error,
-    state.certificate_expiry.startsWith("valid") ? "" : state.certificate_expiry,
+    /^(valid|$)/.test(state.certificate_expiry) ? "" : `certificate ${state.certificate_expiry}`,
   ];
   doubted(warned.filter(Boolean).join("; "));
+  document.getElementById("estop").hidden = !["pressed", "silent"].includes(state.emergency_stop);
   document.body.classList.toggle("boardless", alone);
 }
 

@@ -53,6 +53,11 @@ export function age(ms) {
   return ms < 1000 ? `${Math.round(ms)} ms` : `${(ms / 1000).toFixed(1)} s`;
 }
 
+/** Format a pose in odom: m and rad as m and degrees. */
+export function spot(x, y, yaw) {
+  return `x ${signed(x, 2)} m · y ${signed(y, 2)} m · ${signed((yaw * 180) / Math.PI, 0)}°`;
+}
+
 /** Return the heading of a quaternion about z, rad. */
 export function yaw(q) {
   return 2 * Math.atan2(q.z, q.w);

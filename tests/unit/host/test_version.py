@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from acsard import __version__
-from tests.pages import ROOT
 from acsard.host.version import COMMIT_FILE, DIGITS, commit_of, version
+from tests.pages import ROOT
 
 
 def git(where: Path, *words: str) -> str:

@@ -225,7 +225,7 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
     ],
 )
 def test_a_certificate_in_use_that_ends_is_a_warning_with_its_mend(here: bool, mend: str) -> None:
-    words = "valid for 9 days (that of the router tls/router.local:7447)"
+    words = "ends in 9 days (that of the router tls/router.local:7447)"
     row = DiagnosticStatus(1, "acsard: certificate", words, "acsar", [])
     (told,) = certificate(row, here)
     assert (told.subject, told.level) == ("certificates", "warning")

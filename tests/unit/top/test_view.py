@@ -110,6 +110,14 @@ def test_messages_of_another_form_are_told_from_silence() -> None:
     assert "another version" in told
 
 
+@each("width", [40, 80])
+def test_a_warning_stands_below_the_mode_with_its_words(width: int) -> None:
+    told = lines_of(of(mode="ready", recording_error="disk full", emergency_stop="released"), width)
+    at = next(n for n, line in enumerate(told) if "READY" in line)
+    assert "WARNING: recording fails: disk full" in told[at : at + 4]
+    assert any(re.match("board +emergency stop released", line) for line in told)
+
+
 # any message from the bus
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from acsard.client import Client
 from acsard.core.messages.encodings import encode, encoding_name
@@ -25,6 +26,9 @@ PATIENCE_S = 20.0
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 INFO = Info("r2", "1.2.3", 42, "/dev/pts/3", True, 100.0, [], [])
+
+
+WARNS = "recording fails: disk full"
 
 
 def quiet() -> zenoh.Config:
@@ -71,8 +75,9 @@ async def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when
     session: zenoh.Session,
 ) -> None:
     def say() -> None:
+        full = replace(STATE, recording_error="disk full")
         session.put(
-            "acsard/r2/state", encode(STATE, "msgpack"),
+            "acsard/r2/state", encode(full, "msgpack"),
             encoding=encoding_name("msgpack", "RobotState"),
         )  # fmt: skip
 
@@ -90,6 +95,7 @@ async def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when
     say()
     heard = await row(fleet, lambda one: one.mode == STATE.mode and one.version)
     assert (heard.version, heard.speed) == ("1.2.3", STATE.linear)
+    assert (heard.place, heard.warnings) == ([STATE.x, STATE.y, STATE.yaw], [WARNS])
     say()
     await asyncio.sleep(0.5)
     (late,) = fleet.rows()

@@ -6,6 +6,7 @@ from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
 from acsard.core.messages.schema import Latency, RobotState, Spread, Time
+from acsard.core.messages.state_warnings import WHATS
 from acsard.web.metrics import KNOWN, NAMED, Counts, text
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
@@ -34,7 +35,7 @@ def parsed(told: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
 
 
 def test_what_the_robot_says_is_there_with_its_labels() -> None:
-    got = parsed(text("acsar", STATE, True, 3, {"commands": 4}, {"host": 5}))
+    got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", STATE, True, 3, {"commands": 4}, {"host": 5}))
     own = ("robot", "acsar")
     assert got["acsard_up", frozenset({own})] == 1
     assert got["acsard_mode", frozenset({own, ("mode", "driving")})] == 1
@@ -49,20 +50,30 @@ def test_what_the_robot_says_is_there_with_its_labels() -> None:
 
 
 def test_a_robot_that_is_not_heard_is_down_and_tells_no_old_speed() -> None:
-    got = parsed(text("acsar", STATE, False, 0, {}, {}))
+    got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", STATE, False, 0, {}, {}))
     assert got["acsard_up", frozenset({("robot", "acsar")})] == 0
     assert not any(name == "acsard_linear_speed_mps" for name, _ in got)
 
 
 def test_without_feedback_no_speed_is_reported() -> None:
     unknown = replace(STATE, link="down", linear=None, angular=None, wheels=[])
-    got = parsed(text("acsar", unknown, True, 0, {}, {}))
+    got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", unknown, True, 0, {}, {}))
     assert not any("speed" in name for name, _ in got)
     assert got["acsard_link", frozenset({("robot", "acsar"), ("state", "down")})] == 1
 
 
+def test_what_ends_a_robot_quietly_is_a_sample_of_its_own() -> None:
+    own = ("robot", "acsar")
+    ends = replace(STATE, certificate_expiry="ends in 10 days", certificate_days=10.0)
+    got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", ends, True, 0, {}, {}))
+    assert got["acsard_info", frozenset({own, ("version", "0.1.0+g1a2b3c4d5")})] == 1
+    warned = {dict(labels)["what"]: n for (name, labels), n in got.items() if "warning" in name}
+    assert warned == dict.fromkeys(WHATS, 0.0) | {"certificate": 1.0}
+    assert got["acsard_certificate_seconds", frozenset({own})] == 864_000
+
+
 def test_words_of_a_stranger_stay_within_their_label() -> None:
-    got = parsed(text("acsar", None, False, 0, {'a"b\\c\nd': 1}, {}))
+    got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", None, False, 0, {'a"b\\c\nd': 1}, {}))
     whats = [dict(labels)["what"] for name, labels in got if name == "acsard_page_total"]
     assert whats == ['a"b\\c\nd']
 

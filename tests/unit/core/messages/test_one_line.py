@@ -6,6 +6,7 @@ import math
 import re
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.messages.one_line import SHORT, place, short, speeds
 from acsard.core.messages.schema import (
@@ -15,6 +16,7 @@ from acsard.core.messages.schema import (
     PoseStamped,
     PoseWithCovariance,
     Quaternion,
+    RobotState,
     Time,
     Twist,
     TwistStamped,
@@ -71,6 +73,15 @@ def test_lines_of_a_robot_that_drives_stand_below_each_other() -> None:
 @each("value", [1e300, -1e12, math.inf, math.nan])
 def test_no_figure_breaks_the_line(value: float) -> None:
     assert len("".join(place(value, value, 0.0) + speeds(value, value))) < 80
+
+
+def test_the_line_of_a_state_ends_with_its_warnings() -> None:
+    state = RobotState(
+        Time(), "ready", "waiting for a command", 0.0, 0.0, 0.0, 0.0, 0.0, [], "up", "", [], "", {}
+    )  # fmt: skip
+    assert short(state).endswith("  ready: waiting for a command")
+    bad = replace(state, recording_error="the disk is full", certificate_expiry="ends in 10 days")
+    assert short(bad).endswith("  WARNING: certificate ends in 10 days, recording fails")
 
 
 def test_each_type_that_has_one_is_a_line() -> None:

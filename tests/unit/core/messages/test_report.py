@@ -746,7 +746,7 @@ DAY_NS = 86400 * 10**9
     [
         (400, 0, "valid for 400 days"),
         (30, 0, "valid for 30 days"),
-        (29, 1, "valid for 29 days"),
+        (29, 1, "ends in 29 days"),
         (-2, 2, "expired 2 days ago"),
     ],
 )
@@ -757,6 +757,7 @@ def test_a_certificate_that_ends_is_reported_in_time(days: int, level: int, word
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
     assert state.certificate_expiry.startswith(words)
+    assert state.certificate_days == days
     array = made.current("diagnostics", lambda: SNAPSHOT)
     assert isinstance(array, DiagnosticArray)
     (status,) = [one for one in array.status if one.name == "acsard: certificate"]
@@ -769,6 +770,7 @@ def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
     assert "`acsard doctor`" in state.certificate_expiry
+    assert state.certificate_days is None
 
 
 def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
@@ -776,4 +778,4 @@ def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert state.certificate_expiry == ""
+    assert (state.certificate_expiry, state.certificate_days) == ("", None)

@@ -87,5 +87,5 @@ def test_state_is_the_same_field_by_field() -> None:
     # stop and the bumpers, and `reason` says which one is pressed. The battery has its own topic.
     assert left_out == {
         "stamp", "latencies", "encoder_counts", "latch", "latch_file_error", "settings_differ",
-        "speed_limit", "emergency_stop", "bumpers", "battery",
+        "speed_limit", "emergency_stop", "bumpers", "battery", "certificate_days",
     }  # fmt: skip

@@ -1,0 +1,69 @@
+"""Lists what is wrong with a robot although it may be `ready`, for every place that shows a robot.
+
+Each of these ends a robot's work quietly, hours or weeks later: `fleet`, `top`, `echo --short`, the
+page and `/metrics` show them with the same words. Programs find the same facts in `state`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, get_args
+
+from msgspec import Struct
+
+from acsard.core.formatting import printable
+from acsard.core.messages.schema import RobotState
+
+What = Literal["emergency_stop", "certificate", "recording", "latch_file", "wheel", "settings"]
+
+WHATS: tuple[What, ...] = get_args(What)
+"""Every subject of a warning; the most urgent one is the first."""
+
+WARNING = "WARNING"
+"""Begins the warnings of a robot in a line of text."""
+
+ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop silent"}
+
+
+class StateWarning(Struct, frozen=True):
+    """One warning."""
+
+    what: What
+    brief: str
+    """A few words, which a column of a table can hold."""
+    text: str = ""
+    """The words of the robot; "" if `brief` has all of them."""
+
+    def __str__(self) -> str:
+        """Return all words in one line, printable."""
+        return printable(f"{self.brief}: {self.text}" if self.text else self.brief)
+
+
+def warnings(state: RobotState) -> list[StateWarning]:
+    """Return the warnings about this robot, in the order of `WHATS`."""
+    return list(_warnings(state))
+
+
+def brief(found: Sequence[StateWarning]) -> str:
+    """Return these warnings in few words, printable, as `WARNING: recording fails`; "" for none."""
+    words = ", ".join(printable(one.brief) for one in found)
+    return f"{WARNING}: {words}" if words else ""
+
+
+def _warnings(state: RobotState) -> Iterator[StateWarning]:
+    if state.emergency_stop in ESTOP:
+        yield StateWarning("emergency_stop", ESTOP[state.emergency_stop])
+    expiry = state.certificate_expiry
+    if expiry and not expiry.startswith("valid"):
+        brief = expiry.partition(":")[0].partition(" (")[0]
+        yield StateWarning(
+            "certificate", f"certificate {brief}", expiry.removeprefix(brief).strip()
+        )
+    if state.recording_error:
+        yield StateWarning("recording", "recording fails", state.recording_error)
+    if state.latch_file_error:
+        yield StateWarning("latch_file", "latch file fails", state.latch_file_error)
+    if state.wheel_fault:
+        yield StateWarning("wheel", "wheel fault", state.wheel_fault)
+    if state.settings_differ:
+        yield StateWarning("settings", "settings differ", state.settings_differ)
