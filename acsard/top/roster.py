@@ -11,13 +11,13 @@ from msgspec.structs import replace
 from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
-from acsard.core.messages.state_warnings import brief, warnings
+from acsard.core.messages.state_warnings import brief, charge, warnings
 from acsard.daemon.bus.robot_discovery import ALL, nobody, seen
 from acsard.top.teleop import reason
 
-HEADS = ("ROBOT", "MODE", "M/S", "LINK", "PLACE", "VERSION", "SEEN", "WHY")
+HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
 
-ROOM = (32, 8, 6, 7, 22, 21, 6)
+ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
 """Maximum width of each column but the last, which takes the rest. The first is as wide as its
 longest id."""
 
@@ -25,7 +25,10 @@ NAME, WHY = 12, 32
 """Minimum widths of the first and last column. A long id may not narrow the last column below its
 minimum, unless the first would fall below its own."""
 
-LEFT_OUT = ("VERSION", "PLACE", "LINK")
+BATTERY = HEADS.index("BATTERY")
+"""Column of the state of charge. The table has it only if a robot has a battery."""
+
+LEFT_OUT = ("VERSION", "PLACE", "LINK", "BATTERY")
 """Columns that a narrow terminal lacks. The first is the first to go."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
@@ -41,10 +44,11 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     cells = [HEADS, *map(told, sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
     rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
-    shown = list(range(len(HEADS)))
-    for head in LEFT_OUT:
-        if sum(rooms[n] + 2 for n in shown) - 2 > width:
-            shown.remove(HEADS.index(head))
+    powered = any(row[BATTERY] for row in cells[1:])
+    shown = [n for n in range(len(HEADS)) if n != BATTERY or powered]
+    for column in map(HEADS.index, LEFT_OUT):
+        if column in shown and sum(rooms[n] + 2 for n in shown) - 2 > width:
+            shown.remove(column)
     rest = sum(rooms[n] + 2 for n in shown[1:])
     rooms[0] = min(rooms[0], max(NAME, width - rest))
     lines = [
@@ -85,13 +89,14 @@ def told(row: Row) -> tuple[str, ...]:
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
-        return (name, "-", "-", "-", "-", printable(row.version) or "-", "never", why)
+        return (name, "-", "-", "-", "", "-", printable(row.version) or "-", "never", why)
     state, absence = row.state, _absence(row)
     return (
         name,
         printable(state.mode),
         signed(state.linear, 2, 6),
         printable(state.link),
+        charge(state.battery),
         _place(state),
         printable(row.version) or "-",
         rough(row.age),

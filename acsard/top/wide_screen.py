@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from rich.text import Text
 
 from acsard.core.formatting import rough, signed
+from acsard.core.messages.one_line import power
 from acsard.core.messages.schema import Info, RobotState, SourceState, Spread
 from acsard.core.motion.gyro import WORDS
 from acsard.core.values import NS_PER_S
@@ -184,8 +185,12 @@ def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[
 
 def board(state: RobotState) -> str:
     """Return the inputs that the board reports, in words; "" if it reports none."""
-    stop = state.emergency_stop
-    return f"emergency stop {clean(stop)}" if stop else ""
+    told = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
+    if state.bumpers is not None:
+        told.append(f"bumpers {''.join('X' if one else '.' for one in state.bumpers)}")
+    if state.battery is not None:
+        told += ["battery", *power(state.battery)]
+    return "  ".join(told)
 
 
 def overrun(state: RobotState) -> Text:

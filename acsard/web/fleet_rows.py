@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from acsard.client import Client, fleet
-from acsard.core.messages.state_warnings import warnings
+from acsard.core.messages.state_warnings import charge, warnings
 from acsard.daemon.bus.robot_discovery import ALL
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
@@ -129,4 +129,5 @@ def _row(one: fleet.Row) -> Row:
     return Row(
         one.robot_id, state.mode, state.reason, state.linear, state.link, age, version,
         [str(one) for one in warnings(state)], [state.x, state.y, state.yaw],
+        charge(state.battery),
     )  # fmt: skip

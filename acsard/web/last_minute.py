@@ -28,8 +28,8 @@ ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
 
 MEASURED = 2 + len(WHEELS)
 
-WIDTH = MEASURED + 4
-"""Number of columns in a row: measured values, commanded twist (2), lateness (2)."""
+WIDTH = MEASURED + 5
+"""Number of columns in a row: measured values, commanded twist (2), lateness (2), voltage."""
 
 MS = 1e-3
 
@@ -60,6 +60,8 @@ class Plotted(Struct, frozen=True):
     """99th percentile of the period lateness over the minute before the row, ms."""
     late_max: Column
     """Maximum of the period lateness over the minute before the row, ms."""
+    volts: Column
+    """Voltage of the battery, V; None if the board does not report it."""
 
 
 class Minute:
@@ -81,15 +83,16 @@ class Minute:
         figure = state.latencies.get("period_lateness")
         late = figure.last_minute if figure else None
         lateness = [late.p99 * MS, late.max * MS] if late else [None, None]
-        row = [*measured, *twist, *lateness]
+        volts = state.battery.volts if state.battery else None
+        row = [*measured, *twist, *lateness, volts]
         self._rows.append((at_ns, [None if one is None else round(one, 3) for one in row]))
 
     def plotted(self, now_ns: int) -> Plotted:
         """Return the rows that are not older than a minute, as columns."""
         rows = [row for row in self._rows if now_ns - row[0] <= LASTS_NS]
         columns = [[values[n] for _, values in rows] for n in range(WIDTH)]
-        linear, angular, *wheels, wished_linear, wished_angular, late_p99, late_max = columns
+        linear, angular, *wheels, wished_linear, wished_angular, late_p99, late_max, volts = columns
         age = [(now_ns - at_ns) // 1_000_000 for at_ns, _ in rows]
         return Plotted(
-            age, linear, angular, wished_linear, wished_angular, wheels, late_p99, late_max
+            age, linear, angular, wished_linear, wished_angular, wheels, late_p99, late_max, volts
         )

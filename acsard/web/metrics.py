@@ -81,6 +81,21 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
     if state.certificate_days is not None:
         left = [({}, state.certificate_days * DAY_S)]
         yield "certificate_seconds", "gauge", "until the first TLS certificate ends", left
+    if state.emergency_stop:
+        pressed = float(state.emergency_stop != "released")
+        yield "emergency_stop", "gauge", "1 while it counts as pressed, else 0", [({}, pressed)]
+    bumpers = [({"bumper": str(n)}, float(one)) for n, one in enumerate(state.bumpers or (), 1)]
+    if bumpers:
+        yield "bumper", "gauge", "1 while it counts as pressed, else 0", bumpers
+    battery = state.battery
+    if battery is not None:
+        for name, what, value, scale in (
+            ("volts", "voltage", battery.volts, 1.0),
+            ("amperes", "current, negative while it discharges", battery.amps, 1.0),
+            ("charge_ratio", "state of charge, 0 to 1", battery.percent, 0.01),
+        ):
+            if value is not None:
+                yield f"battery_{name}", "gauge", what, [({}, value * scale)]
     if state.linear is not None and state.angular is not None:
         yield "linear_speed_mps", "gauge", "measured, forward", [({}, state.linear)]
         yield "angular_speed_radps", "gauge", "measured, to the left", [({}, state.angular)]

@@ -255,6 +255,8 @@ class Row(Struct, frozen=True):
     """What is wrong with the robot although it may be ready, in words."""
     place: Sequence[float] | None = None
     """x and y in m, and yaw in rad, in the odom frame; None before the first state."""
+    battery: str = ""
+    """State of charge, else the voltage, in words; "" if neither is reported."""
 
 
 class Rows(Struct, frozen=True):

@@ -199,6 +199,42 @@ def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
     assert bus.state()["mode"] == "ready"
 
 
+def test_a_pressed_emergency_stop_has_a_sign_and_its_mend_at_the_stick(
+    tmp_path: Path, browser: Browser
+) -> None:
+    """Release STOP is refused while the button is pressed, and the page says what to do first."""
+
+    def says(status: bytes) -> None:
+        board.reply = lambda speeds: PLAIN(speeds) + b"!status %b\r\n" % status
+
+    shown = "!document.getElementById('estop').hidden"
+    with (
+        Peer(tmp_path / "mcu") as board,
+        Daemon(tmp_path, board.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, tmp_path) as page,
+    ):
+        says(b"estop=ok")
+        bus.linked()
+        browser.open(page.here)
+        shows(browser, "mode", "READY")
+        assert not browser.js(shown)
+        says(b"estop=pressed")
+        shows(browser, "mode", "STOPPED")
+        shows(browser, "reason", "emergency stop pressed at the robot")
+        assert browser.js(shown)
+        assert browser.text("estop") == "⬢ E-STOP"
+        shows(browser, "hint", "Release it there, then press Release STOP.")
+        browser.tap("clear")
+        shows(browser, "alarm", "release it there, then")
+        says(b"estop=ok")
+        until(lambda: not browser.js(shown), 5.0, "the button is released")
+        shows(browser, "hint", "Stopped. Press Release STOP first.")
+        browser.tap("clear")
+        shows(browser, "mode", "READY")
+        browser.open("about:blank")
+
+
 NAMES = """import('/page/words.js').then(({person, named, logged}) => [
     person('unnamed'), named('stopped by unnamed (native) at noon'),
     named('held by 0123456789abcdef [laptop]'), named('held by 0123456789abcdef'),

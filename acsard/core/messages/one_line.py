@@ -10,8 +10,17 @@ from collections.abc import Callable
 from typing import Any
 
 from acsard.core.formatting import printable, signed
-from acsard.core.messages.schema import Odometry, Pose, PoseStamped, RobotState, Twist, TwistStamped
-from acsard.core.messages.state_warnings import brief, warnings
+from acsard.core.messages.schema import (
+    Battery,
+    BatterySummary,
+    Odometry,
+    Pose,
+    PoseStamped,
+    RobotState,
+    Twist,
+    TwistStamped,
+)
+from acsard.core.messages.state_warnings import brief, charge, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
@@ -41,7 +50,22 @@ def _state(state: RobotState) -> list[str]:
     reason = state.reason.removeprefix(f"{state.mode}: ")
     mode = printable(f"{state.mode}: {reason}")
     told = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
-    return [one for one in (*told, brief(warnings(state))) if one]
+    left = charge(state.battery)
+    return [*told, *filter(None, (left and f"battery {left}", brief(warnings(state))))]
+
+
+def power(battery: BatterySummary) -> list[str]:
+    """Return voltage, current and charge of a battery, each with its unit, "-" if unknown."""
+    return [
+        f"{signed(battery.volts, 2, 6).strip().removeprefix('+')} V",
+        f"{signed(battery.amps, 2, 7).strip()} A",
+        f"{signed(battery.percent, 0, 4).strip().removeprefix('+')} %",
+    ]
+
+
+def _battery(battery: Battery) -> list[str]:
+    percent = None if battery.percentage is None else battery.percentage * 100
+    return power(BatterySummary(battery.voltage, percent, battery.current, "ok"))
 
 
 def _pose(pose: Pose) -> list[str]:
@@ -56,6 +80,7 @@ def _twist(twist: Twist) -> list[str]:
 SHORT: dict[type, Callable[[Any], list[str]]] = {
     Odometry: _odometry,
     RobotState: _state,
+    Battery: _battery,
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }

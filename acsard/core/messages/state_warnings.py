@@ -12,9 +12,12 @@ from typing import Literal, get_args
 from msgspec import Struct
 
 from acsard.core.formatting import printable
-from acsard.core.messages.schema import RobotState
+from acsard.core.messages.schema import BatterySummary, RobotState
 
-What = Literal["emergency_stop", "certificate", "recording", "latch_file", "wheel", "settings"]
+What = Literal[
+    "emergency_stop", "bumper", "battery", "certificate", "recording", "latch_file", "wheel",
+    "settings",
+]  # fmt: skip
 
 WHATS: tuple[What, ...] = get_args(What)
 """Every subject of a warning; the most urgent one is the first."""
@@ -23,6 +26,14 @@ WARNING = "WARNING"
 """Begins the warnings of a robot in a line of text."""
 
 ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop silent"}
+
+BATTERY = {
+    "warning": "battery low",
+    "return": "battery low, return",
+    "stop": "battery empty",
+    "unknown": "battery not reported",
+}
+"""Words for each level of the battery but `ok`."""
 
 
 class StateWarning(Struct, frozen=True):
@@ -50,9 +61,25 @@ def brief(found: Sequence[StateWarning]) -> str:
     return f"{WARNING}: {words}" if words else ""
 
 
+def charge(battery: BatterySummary | None) -> str:
+    """Return the state of charge, else the voltage, of a battery; "" if neither is reported."""
+    if battery is None:
+        return ""
+    if battery.percent is not None:
+        return f"{battery.percent:.0f} %"
+    return "" if battery.volts is None else f"{battery.volts:.1f} V"
+
+
 def _warnings(state: RobotState) -> Iterator[StateWarning]:
     if state.emergency_stop in ESTOP:
         yield StateWarning("emergency_stop", ESTOP[state.emergency_stop])
+    if pressed := [str(n) for n, one in enumerate(state.bumpers or (), 1) if one]:
+        noun = "bumpers" if len(pressed) > 1 else "bumper"
+        yield StateWarning("bumper", f"{noun} {' and '.join(pressed)} pressed")
+    if state.battery is not None and state.battery.level in BATTERY:
+        left = charge(state.battery)
+        words = BATTERY[state.battery.level]
+        yield StateWarning("battery", f"{words} ({left})" if left else words)
     expiry = state.certificate_expiry
     if expiry and not expiry.startswith("valid"):
         brief = expiry.partition(":")[0].partition(" (")[0]

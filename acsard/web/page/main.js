@@ -228,6 +228,7 @@ function stated({ detail }) {
   forgotten();
   const late = state.latencies.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
+  plots.volts.add(heard, state.battery?.volts);
   plots.speed.add(heard, linear, null);
   plots.turn.add(heard, angular, null);
   if (view !== "status") return;

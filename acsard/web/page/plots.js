@@ -15,6 +15,7 @@ const ROOM = 44;
 const LOOKS = [[[], 0], [[12, 12], 0], [[4, 8], 0], [[5, 19], 5]];
 const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "commanded", colour: "--wished" }];
 const WHEELS = ["front right", "front left", "rear left", "rear right"].map((name, n) => ({ name, colour: `--w${n}` }));
+const VOLTS = [{ name: "voltage", colour: "--accent" }];
 const LATE = [{ name: "99 %", colour: "--accent" }, { name: "maximum", colour: "--bad" }];
 
 export class Minute {
@@ -27,6 +28,7 @@ export class Minute {
     this.turn = plot("turn", COMPARED, { low: -0.3, high: 0.3 });
     this.wheels = plot("wheels", WHEELS, { low: -1, high: 3 });
     this.late = plot("late", LATE, { low: 0, high: 1 });
+    this.volts = plot("volts", VOLTS, { span: 1 });
   }
 
   /** Add the server's data: a column for each line, as long as `age` (ms before `now`). */
@@ -36,6 +38,7 @@ export class Minute {
     this.turn.begin(times, kept.angular, kept.wished_angular);
     this.wheels.begin(times, ...kept.wheels);
     this.late.begin(times, kept.late_p99, kept.late_max);
+    this.volts.begin(times, kept.volts);
     const first = times[0] ?? now;
     this.#before = Math.min(this.#before, first < now - SPAN + GAP ? -Infinity : first);
     let known = first;
@@ -46,7 +49,7 @@ export class Minute {
   }
 
   draw(now) {
-    for (const plot of [this.speed, this.turn, this.wheels, this.late]) plot.draw(now);
+    for (const plot of [this.speed, this.turn, this.wheels, this.late, this.volts]) plot.draw(now);
   }
 
   /** Return which part of the last minute is missing, in words, or "". */
@@ -60,12 +63,27 @@ export class Minute {
   }
 }
 
+/** Return the upper and the lower end of a scale, and its marks as pairs of value and label. */
+function scaled(floor, values) {
+  if (floor.span) {
+    const [least, most] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
+    const half = (Math.max(floor.span, most - least) / 2) * 1.08;
+    const [top, bottom] = [(least + most) / 2 + half, (least + most) / 2 - half];
+    return [top, bottom, [top, bottom].map((value) => [value, signed(value, 1)])];
+  }
+  const top = Math.max(floor.high, ...values) * 1.08;
+  const bottom = Math.min(floor.low, ...values) * 1.08;
+  const label = (value) => signed(value / 1.08, Math.abs(top) < 10 ? 2 : 0);
+  return [top, bottom, (bottom < 0 ? [top, 0, bottom] : [top, bottom]).map((value) => [value, label(value)])];
+}
+
 class Plot {
   #canvas;
   #lines;
   #floor;
 
-  /** `lines`: [{name, colour}], one for each value of `add`; `floor`: the smallest range of the scale. */
+  /** `lines`: [{name, colour}], one for each value of `add`; `floor`: the smallest range of the scale, or
+   *  its smallest span around the values, for values that are far from zero. */
   constructor(canvas, lines, floor) {
     this.#canvas = canvas;
     this.#lines = lines.map((line) => ({ ...line, points: [], sample: made("canvas"), said: made("span") }));
@@ -103,8 +121,7 @@ class Plot {
     if (!width) return;
     const look = colours();
     const all = this.#lines.flatMap((line) => line.points.map((point) => point[1]));
-    const top = Math.max(this.#floor.high, ...all) * 1.08;
-    const bottom = Math.min(this.#floor.low, ...all) * 1.08;
+    const [top, bottom, marks] = scaled(this.#floor, all);
     const x = (at) => ROOM + ((at - now + SPAN) / SPAN) * (width - ROOM - 6);
     const y = (value) => 8 + ((top - value) / (top - bottom)) * (height - 18);
     const first = Math.min(now, ...this.#lines.flatMap((line) => line.points.slice(0, 1).map((point) => point[0])));
@@ -114,14 +131,14 @@ class Plot {
     paper.fillStyle = look("--quiet");
     paper.strokeStyle = look("--line");
     paper.lineWidth = 1;
-    for (const value of bottom < 0 ? [top, 0, bottom] : [top, bottom]) {
+    for (const [value, mark] of marks) {
       paper.beginPath();
       paper.moveTo(ROOM, y(value));
       paper.lineTo(width - 6, y(value));
       paper.stroke();
       // Leave out a label that would overlap the label of zero.
       if (value && Math.abs(y(value) - y(0)) < 14) continue;
-      paper.fillText(signed(value / (value ? 1.08 : 1), Math.abs(top) < 10 ? 2 : 0), 6, y(value) + 4);
+      paper.fillText(mark, 6, y(value) + 4);
     }
     this.#lines.forEach(({ name, colour, points, sample, said }, n) => {
       const last = points.at(-1);

@@ -4,6 +4,12 @@ import { boarded } from "./hand.js";
 import { RELEASE, age, ago, clock, logged, person, reason, said, signed, spot } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
+const BATTERY = {
+  warning: "The battery is low.",
+  return: "The battery is low: drive back.",
+  stop: "The battery is empty.",
+  unknown: "The board no longer reports the battery.",
+};
 const LEVELS = ["", "warning", "error", "warning"];
 
 /** Return an element with its children; strings become text nodes. */
@@ -76,6 +82,7 @@ export function cards(list, robots, own, here) {
       one.link ? `link ${one.link}` : "",
       one.version ? `version ${one.version}` : "",
       typeof one.age === "number" ? `seen ${ago(one.age)}` : "",
+      one.battery ? `battery ${one.battery}` : "",
       one.place ? spot(...one.place) : "",
     ];
     const card = before.get(one.robot) ?? empty(one.robot, own);
@@ -112,12 +119,32 @@ export function banner(state, locked, elsewhere, own) {
   text("reason", locked && button ? why.replace(`press ${button}`, does) : why);
   const warned = [
     alone ? "Nobody can stop the motors from here: use the robot's own switch." : "",
+    BATTERY[state.battery?.level] ?? "", pressed(state.bumpers),
     state.wheel_fault, state.recording_error, state.latch_file_error,
     /^(valid|$)/.test(state.certificate_expiry) ? "" : `certificate ${state.certificate_expiry}`,
   ];
   doubted(warned.filter(Boolean).join("; "));
+  powered(state.battery);
   document.getElementById("estop").hidden = !["pressed", "silent"].includes(state.emergency_stop);
   document.body.classList.toggle("boardless", alone);
+}
+
+/** Return which bumpers are pressed, in words, or "". */
+function pressed(bumpers) {
+  const numbers = (bumpers ?? []).flatMap((one, n) => (one ? [n + 1] : []));
+  return numbers.length ? `bumper${numbers.length > 1 ? "s" : ""} ${numbers.join(" and ")} pressed` : "";
+}
+
+/** Show the state of charge, or else the voltage, with an icon that is filled as far as it is known. */
+function powered(battery) {
+  const shown = document.getElementById("battery");
+  shown.hidden = !battery;
+  document.getElementById("volts").hidden = typeof battery?.volts !== "number";
+  if (!battery) return;
+  const { percent, volts, level } = battery;
+  shown.dataset.level = level;
+  shown.style.setProperty("--charge", `${percent ?? (level === "ok" ? 100 : 0)}%`);
+  text("battery", typeof percent === "number" ? `${Math.round(percent)} %` : typeof volts === "number" ? `${signed(volts, 1)} V` : "–");
 }
 
 /** Show a warning in the banner until `words` is "". */

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from acsard.client import fleet as fleets
 from acsard.client.fleet import Row
 from acsard.client.follower import FLEET_ASK_S
-from acsard.core.messages.schema import Info, Time
+from acsard.core.messages.schema import BatterySummary, Info, Time
 from acsard.daemon.bus.address import Address
 from acsard.top.roster import HEADS, Roster, table
 from tests.each import each
@@ -27,7 +27,7 @@ ROW = Row("robot1", True, replace(STATE, reason="driving: commanded by app"), 0.
 
 def test_a_line_has_all_of_a_robot() -> None:
     head, line = table([ROW], 120)
-    assert tuple(head.split()) == HEADS
+    assert head.split() == [one for one in HEADS if one != "BATTERY"]
     assert line.split() == [
         "robot1", "driving", "+0.50", "up", "+1.2", "-0.5", "+57°", "0.1.0", "0.1", "s",
         "commanded", "by", "app",
@@ -48,10 +48,15 @@ FULL = "the disk is full: nothing is recorded"
         ({"latch_file_error": "no room"}, "latch file fails"),
         ({"wheel_fault": "rear left wheel is left out"}, "wheel fault"),
         ({"settings_differ": DIFFER}, "settings differ"),
+        ({"emergency_stop": "silent"}, "emergency stop silent"),
+        ({"bumpers": [False, True, True]}, "bumpers 2 and 3 pressed"),
+        ({"battery": BatterySummary(22.0, 21.4, None, "return")}, "battery low, return (21 %)"),
+        ({"battery": BatterySummary(20.0, None, None, "stop")}, "battery empty (20.0 V)"),
+        ({"battery": BatterySummary(None, None, None, "unknown")}, "battery not reported"),
     ],
 )
 def test_a_robot_that_will_fail_later_does_not_look_ready(
-    wrong: dict[str, str], brief: str, width: int
+    wrong: dict[str, Any], brief: str, width: int
 ) -> None:
     bad, good = replace(READY, **wrong), replace(READY, certificate_expiry="valid for 31 days")
     rows = [Row("robot1", True, good, 0.1, "0.1.0"), Row("robot2", True, bad, 0.1, "0.1.0")]
@@ -60,6 +65,17 @@ def test_a_robot_that_will_fail_later_does_not_look_ready(
     assert f"WARNING: {brief}"[: width - first.index("WARNING") - 1] in first
     assert second.startswith("robot1  ready")
     assert second.endswith("waiting for a command")
+
+
+def test_the_column_of_the_battery_is_there_if_a_robot_has_one() -> None:
+    full = replace(READY, battery=BatterySummary(24.5, 87.2, -1.0, "ok"))
+    volts = replace(READY, battery=BatterySummary(24.56, None, None, "ok"))
+    states = {"robot1": full, "robot2": volts, "robot3": READY}
+    head, *lines = table([replace(ROW, robot_id=n, state=s) for n, s in states.items()], 80)
+    assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "BATTERY", "SEEN", "WHY"]
+    at = head.index("BATTERY")
+    assert [line[at : at + 7].strip() for line in lines] == ["87 %", "24.6 V", ""]
+    assert not any("WARNING" in line for line in lines)
 
 
 def test_the_words_of_each_warning_follow_all_of_them() -> None:
@@ -80,7 +96,7 @@ def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
 
 def test_a_narrow_terminal_lacks_the_version_first() -> None:
     rows = [replace(ROW, state=replace(READY, recording_error=FULL))]
-    heads = list(HEADS)
+    heads = [one for one in HEADS if one != "BATTERY"]
     for width, missing in ((100, ""), (90, "VERSION"), (80, "PLACE"), (60, "LINK")):
         if missing:
             heads.remove(missing)

@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rich.cells import cell_len
 
-from acsard.core.messages.schema import Latency, RobotState, SourceState, Spread, Time
+from acsard.core.messages.schema import (
+    BatterySummary,
+    Latency,
+    RobotState,
+    SourceState,
+    Spread,
+    Time,
+)
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
 from acsard.top.text import MODES, ScreenData
@@ -112,10 +119,13 @@ def test_messages_of_another_form_are_told_from_silence() -> None:
 
 @each("width", [40, 80])
 def test_a_warning_stands_below_the_mode_with_its_words(width: int) -> None:
-    told = lines_of(of(mode="ready", recording_error="disk full", emergency_stop="released"), width)
+    inputs = {"emergency_stop": "released", "bumpers": [False, True]}
+    battery = BatterySummary(24.5, 87.0, -1.25, "ok")
+    told = lines_of(of(mode="ready", recording_error="disk full", battery=battery, **inputs), width)
     at = next(n for n, line in enumerate(told) if "READY" in line)
     assert "WARNING: recording fails: disk full" in told[at : at + 4]
-    assert any(re.match("board +emergency stop released", line) for line in told)
+    words = " ".join(" ".join(told).split())
+    assert "board emergency stop released bumpers .X battery 24.50 V -1.25 A 87 %" in words
 
 
 # any message from the bus

@@ -5,7 +5,15 @@ from __future__ import annotations
 import msgspec
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import Latency, RobotState, Spread, Time, Twist, Vector3
+from acsard.core.messages.schema import (
+    BatterySummary,
+    Latency,
+    RobotState,
+    Spread,
+    Time,
+    Twist,
+    Vector3,
+)
 from acsard.core.values import NS_PER_S
 from acsard.web.last_minute import LASTS_NS, ROWS, STEP_NS, Minute, Plotted
 from tests.each import each
@@ -38,13 +46,13 @@ def columns(plotted: Plotted) -> list[list[float | None]]:
 
 def test_a_row_has_what_each_line_of_the_plots_shows() -> None:
     minute = Minute()
-    minute.add(NS_PER_S, STATE, WISHED)
+    minute.add(NS_PER_S, replace(STATE, battery=BatterySummary(24.5, 87.0, None, "ok")), WISHED)
     told = minute.plotted(3 * NS_PER_S)
     assert told.age == [2000]
     assert (told.linear, told.angular) == ([0.25], [-0.5])
     assert (told.wished_linear, told.wished_angular) == ([0.3], [-0.6])
     assert told.wheels == [[1.0], [2.0], [3.0], [4.0]]
-    assert (told.late_p99, told.late_max) == ([0.02], [0.08])
+    assert (told.late_p99, told.late_max, told.volts) == ([0.02], [0.08], [24.5])
 
 
 def test_it_is_the_last_minute_and_no_more_however_long_it_goes_on() -> None:

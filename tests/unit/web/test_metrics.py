@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
-from acsard.core.messages.schema import Latency, RobotState, Spread, Time
+from acsard.core.messages.schema import BatterySummary, Latency, RobotState, Spread, Time
 from acsard.core.messages.state_warnings import WHATS
 from acsard.web.metrics import KNOWN, NAMED, Counts, text
 
@@ -70,6 +70,24 @@ def test_what_ends_a_robot_quietly_is_a_sample_of_its_own() -> None:
     warned = {dict(labels)["what"]: n for (name, labels), n in got.items() if "warning" in name}
     assert warned == dict.fromkeys(WHATS, 0.0) | {"certificate": 1.0}
     assert got["acsard_certificate_seconds", frozenset({own})] == 864_000
+
+
+def test_the_inputs_and_the_battery_of_the_board_are_samples_if_it_reports_them() -> None:
+    own = ("robot", "acsar")
+    board = replace(
+        STATE,
+        emergency_stop="silent",
+        bumpers=[False, True],
+        battery=BatterySummary(24.5, 87.0, None, "ok"),
+    )
+    got = parsed(text("acsar", "1", board, True, 0, {}, {}))
+    assert got["acsard_emergency_stop", frozenset({own})] == 1
+    assert [got["acsard_bumper", frozenset({own, ("bumper", n)})] for n in "12"] == [0, 1]
+    assert got["acsard_battery_volts", frozenset({own})] == 24.5
+    assert got["acsard_battery_charge_ratio", frozenset({own})] == 0.87
+    assert not any(name == "acsard_battery_amperes" for name, _ in got)
+    none = parsed(text("acsard", "1", STATE, True, 0, {}, {}))
+    assert not any(word in name for name, _ in none for word in ("emergency", "bumper", "battery"))
 
 
 def test_words_of_a_stranger_stay_within_their_label() -> None:

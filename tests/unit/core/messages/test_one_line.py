@@ -10,6 +10,8 @@ from msgspec.structs import replace
 
 from acsard.core.messages.one_line import SHORT, place, short, speeds
 from acsard.core.messages.schema import (
+    Battery,
+    BatterySummary,
     Header,
     Odometry,
     Pose,
@@ -82,6 +84,12 @@ def test_the_line_of_a_state_ends_with_its_warnings() -> None:
     assert short(state).endswith("  ready: waiting for a command")
     bad = replace(state, recording_error="the disk is full", certificate_expiry="ends in 10 days")
     assert short(bad).endswith("  WARNING: certificate ends in 10 days, recording fails")
+    full = replace(state, battery=BatterySummary(24.5, 87.0, None, "ok"))
+    assert short(full).endswith("  ready: waiting for a command  battery 87 %")
+
+
+def test_a_battery_is_its_voltage_current_and_charge() -> None:
+    assert short(Battery(HEADER, voltage=24.5, percentage=0.87)) == "24.50 V  - A  87 %"
 
 
 def test_each_type_that_has_one_is_a_line() -> None:
