@@ -1,8 +1,8 @@
 """Print each message on a key as one line of JSON, until Ctrl-C. Every key below the robot's id
 works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one file for
-`acsard calibrate --log`: acsard echo wheel_states imu --csv > drive.csv. --short prints pose and
-speeds as text: acsard echo odom -n 1 --short. If --id names several robots, each line names its
-robot, and -n N prints N messages of each.
+`acsard calibrate --log`: acsard echo wheel_states imu --csv > drive.csv. --short prints pose,
+speeds and warnings as text: acsard echo odom -n 1 --short. If --id names several robots, each line
+names its robot, and -n N prints N messages of each.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ FIELDS = {
         "source", "sources", "refused", "counters", "certificate_expiry", "latencies",
         "gyro", "effective_track", "encoder_counts", "wheel_fault", "sender", "recording_error",
         "latch", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
-        "speed_limit", "settings_differ",
+        "speed_limit", "settings_differ", "certificate_days",
     },
     "diagnostics": {"header", "status"},
     "battery": {

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import tomllib
+import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from pathlib import Path
@@ -18,7 +19,10 @@ import zenoh
 from acsard.cli import main
 from acsard.client import synchronous
 from acsard.daemon.bus.robot_discovery import ALL, stop
+from acsard.host.version import version
+from acsard.machine.authority import Authority
 from tests.pages import blocks
+from tests.system.browser import Page
 from tests.system.fleet_router import ROBOT_FILE, certified, router
 from tests.system.harness import (
     Bus,
@@ -33,6 +37,7 @@ from tests.system.harness import (
 )
 from tests.system.identities import free_tls_endpoint
 from tests.system.terminals import SCREEN, at_terminal, screens
+from tests.system.test_record_disks import disk
 from tests.system.typed import typed
 
 pytestmark = pytest.mark.slow  # each starts two robots and a router
@@ -158,11 +163,13 @@ def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots
         f"acsard: all robots visible at {robots.endpoint}: 2 robots",
     )
     head, *rows = ended.out.splitlines()
-    assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "VERSION", "SEEN", "WHY"]
+    assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "PLACE", "VERSION", "SEEN", "WHY"]
     assert [row.split()[0] for row in rows] == [ONE, TWO]
     for row in rows:
         waits = "waiting for a command"
-        assert re.search(rf"ready +\+0\.00 +up +\d+\.\d+\S* +\d+\.\d s +{waits}", row), row
+        assert re.search(
+            rf"ready +\+0\.00 +up +\S+ \S+ \S+° +{re.escape(version())} +\d+\.\d s +{waits}", row
+        ), row
 
 
 def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
@@ -218,21 +225,72 @@ def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> No
     assert "Traceback" not in terminal.screen + program.stderr
 
 
-def test_fleet_marks_the_robot_whose_settings_differ_from_its_file(robots: Robots) -> None:
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount")
+def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Path) -> None:
+    """An operator sees them in the table, on the page, in its metrics and by echo."""
+    endpoint, names = free_endpoint(), ("full", "ends", "sound")
+    Authority.make(tmp_path / "own", "test", 10).issue(tmp_path / "own", "ends", ["localhost"], 10)
+    with ExitStack() as stack:
+        stack.enter_context(zenoh.open(client_config(endpoint, "router")))
+        full = stack.enter_context(disk(tmp_path, "size=256k"))
+        (full / "ballast").write_bytes(bytes(256 * 1024))
+        daemons = {}
+        for name in names:
+            own: Tables = {"robot": {"id": name}, "ros": {"namespace": name}}
+            own["bus"] = {"listen": [free_endpoint()], "connect": [endpoint]}
+            if name == "ends":
+                own["bus"] |= {"tls": str(tmp_path / "own")}
+                own["bus"]["listen"].append(free_tls_endpoint())
+            words = ["--record", str(full / "record")] if name == "full" else []
+            daemon = Daemon(tmp_path, config=own, name=name, words=words)
+            daemons[name] = stack.enter_context(daemon)
+        view = Robots(tmp_path, endpoint, daemons)
+        said = {
+            "full": "WARNING: recording fails; waiting for a command",
+            "ends": "WARNING: certificate ends in 10 days; waiting for a command",
+            "sound": "waiting for a command",
+        }
+
+        def lines() -> list[str]:
+            return view.tool("fleet", "--once").out.splitlines()[1:]
+
+        def ready() -> bool:
+            return all(
+                re.search(r" ready .*s  (WARNING|waiting for a c)", line) for line in lines()
+            )
+
+        until(lambda: len(lines()) == 3 and ready() and "fails" in lines()[1], 30.0, "each")
+        assert [line.split()[0] for line in lines()] == ["ends", "full", "sound"]
+        for line in lines():
+            assert said[line.split()[0]] in line
+            assert f" {version()} " in line
+        assert lines()[1].endswith("No space left on device")
+        page = stack.enter_context(Page(daemons["full"], tmp_path, "--connect", endpoint))
+
+        def metrics() -> str:
+            with urllib.request.urlopen(f"{page.here}/metrics") as answer:
+                return str(answer.read().decode())
+
+        until(lambda: 'warning{robot="full",what="recording"} 1' in metrics(), 10.0, "its metric")
+        echoed = view.tool("echo", "state", "-n", "1", "--short", who="full").out
+        assert echoed.rstrip().endswith("WARNING: recording fails")
+
+
+def test_fleet_warns_of_the_robot_whose_settings_differ_from_its_file(robots: Robots) -> None:
     def table() -> dict[str, str]:
         out = robots.tool("fleet", "--once", who=f"{ONE},{TWO}").out.splitlines()
         return {line.split()[0]: line for line in out}
 
     differ = "rates.odom = 50.0, not 0.0, rates.state = 7.5, not 10.0"
     assert robots.tool("set", "rates.state", "7.5", "rates.odom", "50", who=ONE).code == 0
-    until(lambda: "differs" in table()[ONE], 10.0, "the mark")
+    until(lambda: "WARNING: settings differ" in table()[ONE], 10.0, "the warning")
     assert differ in table()[ONE]
-    assert "differs" not in table()[TWO]
+    assert "WARNING" not in table()[TWO]
     ended = robots.tool("fleet", "--json", who=f"{ONE},{TWO}")
     told = {one["robot_id"]: one["state"]["settings_differ"] for one in json.loads(ended.out)}
     assert (ended.code, told) == (0, {ONE: differ, TWO: ""})
     assert robots.tool("set", "rates.state", "10.0", "rates.odom", "0", who=ONE).code == 0
-    until(lambda: "FILE" not in table()["ROBOT"], 10.0, "no mark")
+    until(lambda: "WARNING" not in table()[ONE], 10.0, "no warning")
 
 
 @pytest.mark.slow
