@@ -10,6 +10,7 @@ import sys
 from msgspec.structs import replace
 
 from acsard.core.messages.one_line import short
+from acsard.core.messages.schema import BatterySummary
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import chosen
 from acsard.top.roster import table
@@ -25,14 +26,26 @@ WAITING = replace(
 """The same robot while no client drives it."""
 
 
+WARNED = replace(
+    WAITING,
+    emergency_stop="released",
+    bumpers=[False, False],
+    battery=BatterySummary(22.41, 21.0, -1.2, "warning"),
+    certificate_expiry="ends in 10 days",
+    recording_error="/var/lib/acsard/recordings: No space left on device",
+)
+"""The same robot with what ends its work later."""
+
+
 def screens(width: int) -> dict[str, list[str]]:
     """Return the lines of each screen, by verb."""
-    robots = [test_roster.ROW, replace(test_roster.ROW, robot_id="robot2", state=WAITING)]
+    states = {"robot2": WAITING, "robot3": WARNED}
+    robots = [replace(test_roster.ROW, robot_id=name, state=one) for name, one in states.items()]
     return {
         "drive": [one.plain for one in lines(replace(test_teleop.SEEN, state=WAITING), width)],
-        "top": lines_of(replace(SEEN, state=WAITING, before=BEFORE), width),
-        "fleet": table(robots, width),
-        "echo state --short": [short(STATE), short(WAITING)],
+        "top": lines_of(replace(SEEN, state=WARNED, before=BEFORE), width),
+        "fleet": table([test_roster.ROW, *robots], width),
+        "echo state --short": [short(STATE), short(WAITING), short(WARNED)],
     }
 
 

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from acsard.core.formatting import lasting, rough
 from acsard.core.messages.schema import RobotState
-from acsard.core.messages.state_warnings import WARNING, warnings
+from acsard.core.messages.state_warnings import WARNING, brief, warnings
 from acsard.top import narrow_screen
 from acsard.top import wide_screen as beside
 from acsard.top.text import MODES, ScreenData, clean, ends
@@ -29,7 +29,7 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
     width = max(20, min(WIDEST, width))
     head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
     if seen.state is not None:
-        head += [Text(clean(f"{WARNING}: {one}"), "yellow") for one in warnings(seen.state)]
+        head += _warnings(seen.state, width)
     sections: list[list[Text]] = []
     if seen.state is not None:
         state = seen.state
@@ -87,6 +87,17 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
         return [badge, *narrow_screen.folded(words, width, 2)]
     gap = " " * (badge.cell_len + 2)
     return [Text.assemble(badge, "  ", (first, "bold")), Text.assemble(gap, (second, "bold"))]
+
+
+def _warnings(state: RobotState, width: int) -> list[Text]:
+    """Return the warnings in one line if the screen is wide: a single one with its details."""
+    found = warnings(state)
+    words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
+    wide = width >= narrow_screen.BELOW
+    lines = [Text(words)] if wide and words else narrow_screen.folded(words, width, 2)
+    for line in lines:
+        line.stylize("yellow")
+    return lines
 
 
 def _split(words: str, room: int) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from acsard.machine.authority import Authority
 from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.camera_stream import Stream
 from tests.system.chromium import CHROMIUM, PHONE, SIDEWAYS, Browser, browsing
-from tests.system.harness import PLAIN, Bus, Daemon, Peer, running, until
+from tests.system.harness import PLAIN, Bus, Daemon, Peer, Tables, running, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -199,7 +199,10 @@ def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
     assert bus.state()["mode"] == "ready"
 
 
-def test_a_pressed_emergency_stop_has_a_sign_and_its_mend_at_the_stick(
+SHOWN = "!!document.getElementById({!r}).checkVisibility()"
+
+
+def test_a_pressed_emergency_stop_and_a_low_battery_have_signs_and_the_mend_is_at_the_stick(
     tmp_path: Path, browser: Browser
 ) -> None:
     """Release STOP is refused while the button is pressed, and the page says what to do first."""
@@ -207,10 +210,11 @@ def test_a_pressed_emergency_stop_has_a_sign_and_its_mend_at_the_stick(
     def says(status: bytes) -> None:
         board.reply = lambda speeds: PLAIN(speeds) + b"!status %b\r\n" % status
 
-    shown = "!document.getElementById('estop').hidden"
+    low: Tables = {"battery": {"measure": "percent", "warning_below": 30.0}}
+    shown = SHOWN.format("estop")
     with (
         Peer(tmp_path / "mcu") as board,
-        Daemon(tmp_path, board.path) as daemon,
+        Daemon(tmp_path, board.path, config=low) as daemon,
         Bus(daemon.endpoint) as bus,
         Page(daemon, tmp_path) as page,
     ):
@@ -218,7 +222,15 @@ def test_a_pressed_emergency_stop_has_a_sign_and_its_mend_at_the_stick(
         bus.linked()
         browser.open(page.here)
         shows(browser, "mode", "READY")
-        assert not browser.js(shown)
+        assert [browser.js(SHOWN.format(name)) for name in ("estop", "battery")] == [False, False]
+        says(b"estop=ok volts=22.50 charge=21%")
+        shows(browser, "battery", "21 %")
+        shows(browser, "doubt", "The battery is low.")
+        browser.js("document.getElementById('tab-status').click()")
+        assert browser.js(SHOWN.format("volts"))
+        legend = "document.querySelector('#volts .legend').textContent"
+        until(lambda: browser.js(legend) == "voltage 22.50", 5.0, "the plot")
+        browser.js("document.getElementById('tab-drive').click()")
         says(b"estop=pressed")
         shows(browser, "mode", "STOPPED")
         shows(browser, "reason", "emergency stop pressed at the robot")

@@ -27,8 +27,8 @@ export const ZERO = { linear_x: 0, angular_z: 0 };
 
 /** What to do first while the emergency stop at the robot counts as pressed, by its state. */
 const PRESSED = {
-  pressed: "Emergency stop pressed at the robot. Release it there, then press Release STOP.",
-  silent: "The board no longer reports the emergency stop. Check the board, then press Release STOP.",
+  pressed: "Emergency stop: release it at the robot first.",
+  silent: "Emergency stop silent: check the board first.",
 };
 
 /** Return whether the link to the board is up. While it is not, nobody can stop the motors from here. */

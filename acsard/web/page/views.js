@@ -8,7 +8,7 @@ const BATTERY = {
   warning: "The battery is low.",
   return: "The battery is low: drive back.",
   stop: "The battery is empty.",
-  unknown: "The board no longer reports the battery.",
+  unknown: "The level of the battery is unknown.",
 };
 const LEVELS = ["", "warning", "error", "warning"];
 

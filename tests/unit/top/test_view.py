@@ -119,13 +119,18 @@ def test_messages_of_another_form_are_told_from_silence() -> None:
 
 @each("width", [40, 80])
 def test_a_warning_stands_below_the_mode_with_its_words(width: int) -> None:
-    inputs = {"emergency_stop": "released", "bumpers": [False, True]}
+    inputs = {"emergency_stop": "released", "bumpers": [False, False]}
     battery = BatterySummary(24.5, 87.0, -1.25, "ok")
     told = lines_of(of(mode="ready", recording_error="disk full", battery=battery, **inputs), width)
     at = next(n for n, line in enumerate(told) if "READY" in line)
-    assert "WARNING: recording fails: disk full" in told[at : at + 4]
+    assert "WARNING: recording fails: disk full" in map(str.strip, told[at : at + 4])
     words = " ".join(" ".join(told).split())
-    assert "board emergency stop released bumpers .X battery 24.50 V -1.25 A 87 %" in words
+    assert "board emergency stop released bumpers .. battery 24.50 V -1.25 A 87 %" in words
+
+
+def test_more_warnings_take_one_line_of_a_wide_screen() -> None:
+    told = lines_of(of(recording_error="disk full", bumpers=[False, True]))
+    assert "WARNING: bumper 2 pressed, recording fails" in told
 
 
 # any message from the bus
