@@ -105,6 +105,8 @@ class State(Struct, frozen=True):
     gyro: str
     effective_track: str
     wheel_fault: str
+    emergency_stop: str
+    bumpers: list[bool]
     recording_error: str
     certificate_expiry: str
     counters: list[Counter]
@@ -131,6 +133,8 @@ def state(message: RobotState) -> State:
         gyro=message.gyro,
         effective_track=message.effective_track,
         wheel_fault=message.wheel_fault,
+        emergency_stop=message.emergency_stop,
+        bumpers=message.bumpers or [],
         recording_error=message.recording_error,
         certificate_expiry=message.certificate_expiry,
         counters=[Counter(name, count) for name, count in message.counters.items()],
