@@ -79,7 +79,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
     subjects = [({"what": what}, float(what in warned)) for what in WHATS]
     yield "warning", "gauge", "1 while the robot warns of this, else 0", subjects
     if state.certificate_days is not None:
-        left = [({}, state.certificate_days * DAY_S)]
+        left: list[Sample] = [({}, state.certificate_days * DAY_S)]
         yield "certificate_seconds", "gauge", "until the first TLS certificate ends", left
     if state.emergency_stop:
         pressed = float(state.emergency_stop != "released")

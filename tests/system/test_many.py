@@ -236,11 +236,15 @@ def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Pat
         (full / "ballast").write_bytes(bytes(256 * 1024))
         daemons = {}
         for name in names:
-            own: Tables = {"robot": {"id": name}, "ros": {"namespace": name}}
-            own["bus"] = {"listen": [free_endpoint()], "connect": [endpoint]}
+            listen, tls = [free_endpoint()], ""
             if name == "ends":
-                own["bus"] |= {"tls": str(tmp_path / "own")}
-                own["bus"]["listen"].append(free_tls_endpoint())
+                tls = str(tmp_path / "own")
+                listen.append(free_tls_endpoint())
+            own: Tables = {
+                "robot": {"id": name},
+                "bus": {"listen": listen, "connect": [endpoint], "tls": tls},
+                "ros": {"namespace": name},
+            }
             words = ["--record", str(full / "record")] if name == "full" else []
             daemon = Daemon(tmp_path, config=own, name=name, words=words)
             daemons[name] = stack.enter_context(daemon)
