@@ -119,6 +119,11 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         browser.tap("tab-robots")
         shows("cards", THEIRS)
         shows("cards", "Nobody drives.")
+        shows("cards", "x 0.00 m · y 0.00 m · 0°")
+        two.theirs.get("srv/set", {"settings": {"rates.odom": 50.0}})
+        shows("cards", "settings differ: rates.odom = 50.0, not 0.0")
+        assert browser.js("document.querySelectorAll('#cards li.warning').length") == 1
+        two.theirs.get("srv/set", {"settings": {"rates.odom": 0.0}})
         link = f"document.querySelector('#cards a[href*={THEIRS}]')"
         until(lambda: browser.js(f"Boolean({link})"), 10.0, "a card to open")
         browser.js(f"{link}.click()")
