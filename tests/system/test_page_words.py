@@ -236,7 +236,7 @@ def test_a_pressed_emergency_stop_and_a_low_battery_have_signs_and_the_mend_is_a
         shows(browser, "reason", "emergency stop pressed at the robot")
         assert browser.js(shown)
         assert browser.text("estop") == "⬢ E-STOP"
-        shows(browser, "hint", "Release it there, then press Release STOP.")
+        shows(browser, "hint", "Emergency stop: release it at the robot first.")
         browser.tap("clear")
         shows(browser, "alarm", "release it there, then")
         says(b"estop=ok")
