@@ -31,7 +31,7 @@ BATTERY = {
     "warning": "battery low",
     "return": "battery low, return",
     "stop": "battery empty",
-    "unknown": "battery not reported",
+    "unknown": "battery level unknown",
 }
 """Words for each level of the battery but `ok`."""
 

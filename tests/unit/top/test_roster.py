@@ -52,7 +52,7 @@ FULL = "the disk is full: nothing is recorded"
         ({"bumpers": [False, True, True]}, "bumpers 2 and 3 pressed"),
         ({"battery": BatterySummary(22.0, 21.4, None, "return")}, "battery low, return (21 %)"),
         ({"battery": BatterySummary(20.0, None, None, "stop")}, "battery empty (20.0 V)"),
-        ({"battery": BatterySummary(None, None, None, "unknown")}, "battery not reported"),
+        ({"battery": BatterySummary(None, None, None, "unknown")}, "battery level unknown"),
     ],
 )
 def test_a_robot_that_will_fail_later_does_not_look_ready(
