@@ -109,7 +109,8 @@ def _why(state: RobotState) -> str:
 
     In a mode that needs attention the reason comes first, because a terminal cuts the end.
     """
-    found, parts = warnings(state), [reason(state)]
+    why = reason(state)
+    found, parts = [one for one in warnings(state) if one.brief not in why], [why]
     if found:
         parts.insert(1 if state.mode in URGENT else 0, brief(found))
     details = [(one.what.replace("_", " "), one.text) for one in found]

@@ -94,6 +94,13 @@ def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
     assert "  a wheel is stuck; WARNING: settings differ; settings: limits" in line
 
 
+def test_a_warning_that_the_reason_says_is_not_repeated() -> None:
+    why = "emergency stop pressed at the robot; release it there, then call srv/clear"
+    state = replace(STATE, mode="stopped", reason=why, emergency_stop="pressed")
+    (_, line) = table([replace(ROW, state=state)], 200)
+    assert line.endswith(f"  {why}")
+
+
 def test_a_narrow_terminal_lacks_the_version_first() -> None:
     rows = [replace(ROW, state=replace(READY, recording_error=FULL))]
     heads = [one for one in HEADS if one != "BATTERY"]
