@@ -199,54 +199,6 @@ def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
     assert bus.state()["mode"] == "ready"
 
 
-SHOWN = "!!document.getElementById({!r}).checkVisibility()"
-
-
-def test_a_pressed_emergency_stop_and_a_low_battery_have_signs_and_the_mend_is_at_the_stick(
-    tmp_path: Path, browser: Browser
-) -> None:
-    """Release STOP is refused while the button is pressed, and the page says what to do first."""
-
-    def says(status: bytes) -> None:
-        board.reply = lambda speeds: PLAIN(speeds) + b"!status %b\r\n" % status
-
-    low: Tables = {"battery": {"measure": "percent", "warning_below": 30.0}}
-    shown = SHOWN.format("estop")
-    with (
-        Peer(tmp_path / "mcu") as board,
-        Daemon(tmp_path, board.path, config=low) as daemon,
-        Bus(daemon.endpoint) as bus,
-        Page(daemon, tmp_path) as page,
-    ):
-        says(b"estop=ok")
-        bus.linked()
-        browser.open(page.here)
-        shows(browser, "mode", "READY")
-        assert [browser.js(SHOWN.format(name)) for name in ("estop", "battery")] == [False, False]
-        says(b"estop=ok volts=22.50 charge=21%")
-        shows(browser, "battery", "21 %")
-        shows(browser, "doubt", "The battery is low.")
-        browser.js("document.getElementById('tab-status').click()")
-        assert browser.js(SHOWN.format("volts"))
-        legend = "document.querySelector('#volts .legend').textContent"
-        until(lambda: browser.js(legend) == "voltage 22.50", 5.0, "the plot")
-        browser.js("document.getElementById('tab-drive').click()")
-        says(b"estop=pressed")
-        shows(browser, "mode", "STOPPED")
-        shows(browser, "reason", "emergency stop pressed at the robot")
-        assert browser.js(shown)
-        assert browser.text("estop") == "⬢ E-STOP"
-        shows(browser, "hint", "Emergency stop: release it at the robot first.")
-        browser.tap("clear")
-        shows(browser, "alarm", "release it there, then")
-        says(b"estop=ok")
-        until(lambda: not browser.js(shown), 5.0, "the button is released")
-        shows(browser, "hint", "Stopped. Press Release STOP first.")
-        browser.tap("clear")
-        shows(browser, "mode", "READY")
-        browser.open("about:blank")
-
-
 NAMES = """import('/page/words.js').then(({person, named, logged}) => [
     person('unnamed'), named('stopped by unnamed (native) at noon'),
     named('held by 0123456789abcdef [laptop]'), named('held by 0123456789abcdef'),
@@ -300,6 +252,54 @@ def test_the_map_shows_the_robot_and_its_direction_beside_the_buttons_and_a_scal
     west, east, north, south = browser.js(DRAWN.replace("COLOUR", "--ink"))
     assert left < west < east < left + 70  # a bar of 45 px says 0.5 m
     assert words - 30 < north < south < bottom
+
+
+SHOWN = "!!document.getElementById({!r}).checkVisibility()"
+
+
+def test_a_pressed_emergency_stop_and_a_low_battery_have_signs_and_the_mend_is_at_the_stick(
+    tmp_path: Path, browser: Browser
+) -> None:
+    """Release STOP is refused while the button is pressed, and the page says what to do first."""
+
+    def says(status: bytes) -> None:
+        board.reply = lambda speeds: PLAIN(speeds) + b"!status %b\r\n" % status
+
+    low: Tables = {"battery": {"measure": "percent", "warning_below": 30.0}}
+    shown = SHOWN.format("estop")
+    with (
+        Peer(tmp_path / "mcu") as board,
+        Daemon(tmp_path, board.path, config=low) as daemon,
+        Bus(daemon.endpoint) as bus,
+        Page(daemon, tmp_path) as page,
+    ):
+        says(b"estop=ok")
+        bus.linked()
+        browser.open(page.here)
+        shows(browser, "mode", "READY")
+        assert [browser.js(SHOWN.format(name)) for name in ("estop", "battery")] == [False, False]
+        says(b"estop=ok volts=22.50 charge=21%")
+        shows(browser, "battery", "21 %")
+        shows(browser, "doubt", "The battery is low.")
+        browser.js("document.getElementById('tab-status').click()")
+        assert browser.js(SHOWN.format("volts"))
+        legend = "document.querySelector('#volts .legend').textContent"
+        until(lambda: browser.js(legend) == "voltage 22.50", 5.0, "the plot")
+        browser.js("document.getElementById('tab-drive').click()")
+        says(b"estop=pressed")
+        shows(browser, "mode", "STOPPED")
+        shows(browser, "reason", "emergency stop pressed at the robot")
+        assert browser.js(shown)
+        assert browser.text("estop") == "⬢ E-STOP"
+        shows(browser, "hint", "Emergency stop: release it at the robot first.")
+        browser.tap("clear")
+        shows(browser, "alarm", "release it there, then")
+        says(b"estop=ok")
+        until(lambda: not browser.js(shown), 5.0, "the button is released")
+        shows(browser, "hint", "Stopped. Press Release STOP first.")
+        browser.tap("clear")
+        shows(browser, "mode", "READY")
+        browser.open("about:blank")
 
 
 def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_camera(
