@@ -23,15 +23,17 @@ A battery takes minutes from one level to the next, so the robot reacts soon eno
 
 SETTLE_S = 3.0
 """Time of reports, s, after which the mean counts. It begins again after a silence. A motor start
-within this time lowers the mean by up to a tenth of the drop."""
+within this time lowers the mean by up to a tenth of the drop. A gap adds no more than one report.
+"""
 
 SILENT_S = 5.0
 """Age, s, at which a value no longer counts. A board that reports its battery once a second may
 lose four reports."""
 
-LONGEST_NS = NS_PER_S
-"""Longest time for which one report may stand in the mean, ns. After a gap, a single report from
-the moment of a motor start would otherwise weigh too much."""
+LONGEST_NS = 300_000_000
+"""Longest time for which one report stands in the mean, ns: that of a motor start. A single report
+from the moment of a motor start would otherwise weigh too much after a gap, or if reports are rare.
+The mean of a board that reports once a second is about three times as slow."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The levels that a value can have, the best first."""
@@ -87,6 +89,8 @@ class Battery:
         self._mean: float | None = None
         self._since_ns = self._mean_ns = 0
         """Monotonic times of the first and the last report since a silence, ns."""
+        self._stood_ns = 0
+        """Time for which the reports since a silence stand in the mean, ns."""
 
     @property
     def held(self) -> bool:
@@ -142,10 +146,12 @@ class Battery:
             self._since_ns = at_ns if first else self._since_ns
         elif self._mean is None:
             self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
+            self._stood_ns = 0
         elif at_ns > self._mean_ns:
             # At first it is the plain mean of all reports.
-            span_ns = min(TIME_CONSTANT_S * NS_PER_S, at_ns - self._since_ns)
             stood_ns = min(at_ns - self._mean_ns, LONGEST_NS)
+            self._stood_ns += stood_ns
+            span_ns = min(TIME_CONSTANT_S * NS_PER_S, self._stood_ns)
             self._mean += (value - self._mean) * stood_ns / span_ns
             self._mean_ns = at_ns
 
@@ -158,7 +164,8 @@ class Battery:
             return "unknown"
         if not self._bounds:
             return "ok"
-        if now_ns - self._since_ns < SETTLE_S * NS_PER_S:
+        lasted_ns = now_ns - self._since_ns if self._mean is None else self._stood_ns
+        if lasted_ns < SETTLE_S * NS_PER_S:
             return None
         if self._mean is None:
             return "unknown"
