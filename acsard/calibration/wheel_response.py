@@ -1,18 +1,19 @@
 """Finds how soon the wheels of a log follow their commands, and how fast they can turn.
 
-The daemon expects of a wheel that its speed y follows the command u with the time constant
-`feedback.response_time` (T below) and calls a wheel faulty that contradicts this for
-`feedback.fault_time`:
+The daemon expects of a healthy wheel that its speed y follows the command u with the time constant
+`feedback.response_time` (T below). A wheel that contradicts this for `feedback.fault_time` is a
+fault:
 
     T dy/dt = u - y
 
-The response time that fits best is found by trying. The present one is judged by the longest time
-for which a sound wheel of this log contradicts it: it turns against the expected direction, or less
-than a tenth as fast as expected.
+The response time that fits best is found by trying. The daemon's own witness of a wheel
+(`core/motion/wheel_witness.py`) judges the present one: it counts the time for which the sound
+wheels of the log are evidence of a fault.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,8 +21,11 @@ from msgspec import Struct
 
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import GAP_S, Run
+from acsard.core.config.motion_rules import LINES_OF_EVIDENCE
 from acsard.core.config.settings import DriveConfig, FeedbackConfig
 from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.wheel_faults import LEAST
+from acsard.core.motion.wheel_witness import SLACK, Expected, Witness
 from acsard.core.values import Twist
 
 TRIED = np.geomspace(0.01, 5.0, 60)
@@ -36,14 +40,8 @@ The latter is five minutes at 100 Hz. More would only take memory.
 FOLLOWS = 0.5
 """Largest part of the speeds, as squares, that the model may leave unexplained."""
 
-TURNS = 2.0
-"""Expected speed above which a wheel is judged, rad/s, as the daemon does."""
-
-AGAINST, DEAD = 0.3, 0.1
-"""Speeds, as fractions of the expected one, from which on a wheel turns against it, or is dead."""
-
 SPARE = 0.5
-"""Fraction of the fault time for which a sound wheel may contradict the proposed response time."""
+"""Largest evidence against a sound wheel with the proposed response time, in fault times."""
 
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
 """Evidence for the highest speed of a wheel.
@@ -109,22 +107,20 @@ def response(
     if sum(len(steps) for steps, _, _ in parts) < LEAST_ROWS:
         return None
     fastest = _fastest(parts)
-    squares, whole, longest = np.zeros(len(TRIED)), 0.0, np.zeros(len(TRIED))
-    lasted_now = 0.0
-    now = np.array([feedback.response_time])
+    squares, whole = np.zeros(len(TRIED)), 0.0
     for steps, wanted, seen in parts:
-        expected = _expected(steps, np.clip(wanted, -fastest, fastest), seen, TRIED)
+        expected = _expected(steps, np.clip(wanted, -fastest, fastest), seen)
         squares += ((expected - seen[:, :, None]) ** 2).sum(axis=(0, 1))
         whole += float((seen**2).sum())
-        longest = np.maximum(longest, _contradicted(steps, wanted, seen, TRIED))
-        lasted_now = max(lasted_now, float(_contradicted(steps, wanted, seen, now)[0]))
     best = int(np.argmin(squares))
     if not squares[best] < FOLLOWS * whole:
         return None
-    limit = feedback.fault_time
-    good = np.flatnonzero((longest <= SPARE * limit) & (TRIED[best] <= TRIED))
-    proposed = float(TRIED[good[0] if len(good) else best])
-    false_fault = bool(limit) and lasted_now > limit and bool(len(good))
+    limit, proposed = feedback.fault_time, float(TRIED[best])
+    false_fault = limit > 0.0 and _evidence(parts, feedback.response_time, limit) > limit
+    if false_fault:
+        good = (t for t in TRIED[best:].tolist() if _evidence(parts, t, limit) <= SPARE * limit)
+        proposed = next(good, 0.0)
+        false_fault = proposed > 0.0
     return WheelResponse(
         float(TRIED[best]), float(f"{proposed:.2g}"), feedback.response_time, false_fault, fastest
     )
@@ -148,36 +144,37 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
     return steps, np.asarray(wanted), np.column_stack((run.left, run.right))
 
 
-def _expected(steps: Floats, wanted: Floats, seen: Floats, times: Floats) -> Floats:
-    """Return the expected speeds for each response time, shape (samples, 2, times)."""
-    expected = np.empty((*wanted.shape, len(times)))
-    last = np.zeros((2, len(times)))
+def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
+    """Return the expected speeds for each of `TRIED`, shape (samples, 2, times)."""
+    expected = np.empty((*wanted.shape, len(TRIED)))
+    last = np.zeros((2, len(TRIED)))
     for number, step in enumerate(steps):
         if np.isnan(step):
-            last = np.repeat(seen[number, :, None], len(times), axis=1)
+            last = np.repeat(seen[number, :, None], len(TRIED), axis=1)
         else:
-            last = last + (wanted[number, :, None] - last) * (step / (times + step))
+            last = last + (wanted[number, :, None] - last) * (step / (TRIED + step))
         expected[number] = last
     return expected
 
 
-def _contradicted(steps: Floats, wanted: Floats, seen: Floats, times: Floats) -> Floats:
-    """Return the longest time for which a wheel contradicts each response time, s."""
-    expected = _expected(steps, wanted, seen, times)
-    told, speed = wanted[..., None], seen[..., None]
-    size, turns = np.abs(expected), np.abs(speed)
-    least = np.minimum(size, np.abs(told))
-    moving = (size > TURNS) & (expected * told > 0.0)
-    bad = moving & (
-        ((speed * expected < 0.0) & (turns > AGAINST * size))
-        | ((least > TURNS) & (turns < DEAD * least))
-    )
-    bad &= ~np.isnan(steps)[:, None, None]
-    lasted, longest = np.zeros(bad.shape[1:]), np.zeros(bad.shape[1:])
-    for step, row in zip(np.nan_to_num(steps), bad, strict=True):
-        lasted = np.where(row, lasted + step, 0.0)
-        longest = np.maximum(longest, lasted)
-    return np.asarray(longest.max(axis=0))
+def _evidence(
+    parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
+) -> float:
+    """Return the longest evidence of a fault, s, that the daemon sees with this response time."""
+    longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
+    for steps, wanted, seen in parts:
+        sides = [(Expected(), Witness()) for _ in range(2)]
+        for step, told, speeds in zip(steps.tolist(), wanted.tolist(), seen.tolist(), strict=True):
+            still = max(map(abs, told)) < LEAST
+            for (expected, witness), command, speed in zip(sides, told, speeds, strict=True):
+                if math.isnan(step):
+                    expected.forget()
+                    witness.forget()
+                    continue
+                expected.follow(command, speed, speed, step, response_time)
+                witness.look(speed, expected, step, most, 0.0, still)
+                longest = max(longest, *witness.evidence.values())
+    return longest
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
@@ -185,7 +182,7 @@ def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
     found: list[float] = []
     for steps, wanted, seen in parts:
         for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):
-            short = (speed > TURNS) & (speed < REACHED * np.abs(told)) & ~np.isnan(steps)
+            short = (speed > SLACK) & (speed < REACHED * np.abs(told)) & ~np.isnan(steps)
             edges = np.flatnonzero(np.diff(short.astype(np.int8), prepend=0, append=0))
             for begin, end in edges.reshape(-1, 2):
                 at = np.cumsum(steps[begin:end])

@@ -74,7 +74,7 @@ def test_the_response_time_is_found(seconds: float) -> None:
 
 
 def test_a_slow_robot_that_reverses_would_be_faulty_and_its_response_time_is_proposed() -> None:
-    """Its wheels turn on for 0.7 s after a reversed command, longer than the fault time."""
+    """Its wheels roll on behind the command for longer than the fault time allows."""
     made = found(REVERSING, 2.0)
     assert made.false_fault
     assert 1.0 < made.proposed < 3.0
