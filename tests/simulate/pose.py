@@ -61,13 +61,17 @@ class PoseWitness:
         """Distance that such encoders may be off, m."""
         self._known_ns = 0
         """From when on the lines show the motion again."""
-        self._seldom = config.get("control", {}).get("rate") == 10.0
+        rate = config.get("control", {}).get("rate")
+        self._seldom = rate == 10.0
         """Whether lines come so seldom that two of them say little of a longer gap between."""
         rates = config.get("odometry", {})
         sure = rates.get("yaw_variance_per_metre", 1.0) < 1e-4
         sure |= rates.get("yaw_variance_per_radian", 1.0) < 1e-2
-        # At ten lines a second nobody knows the heading as well as these rates say.
-        self._drifts = self._seldom and sure
+        told = config["mcu"].get("encoder_counts") or (counts or 3200) > 400
+        rounded = isinstance(rate, float) and rate > 100.0 and not told
+        # Nobody knows the heading as well as these rates say at ten lines a second, or from lines
+        # so frequent that their speeds are a count or none.
+        self._drifts = sure and (self._seldom or rounded)
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False
