@@ -55,8 +55,8 @@ class PoseWitness:
         )
         """Time that a motor needs to follow its command again."""
         counts = config.get("sim", {}).get("encoder_counts")
-        untold = counts == 96 and not config["mcu"].get("encoder_counts")
-        turn = COARSE_COUNTS * math.tau / 96 if untold else 0.0
+        told = config.get("mcu", {}).get("encoder_counts")
+        turn = COARSE_COUNTS * math.tau / 96 if counts == 96 and not told else 0.0
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
         self._known_ns = 0
@@ -67,8 +67,8 @@ class PoseWitness:
         rates = config.get("odometry", {})
         sure = rates.get("yaw_variance_per_metre", 1.0) < 1e-4
         sure |= rates.get("yaw_variance_per_radian", 1.0) < 1e-2
-        told = config["mcu"].get("encoder_counts") or (counts or 3200) > 400
-        rounded = isinstance(rate, float) and rate > 100.0 and not told
+        coarse = (counts or 3200) <= 400 and not told
+        rounded = isinstance(rate, float) and rate > 100.0 and coarse
         # Nobody knows the heading as well as these rates say at ten lines a second, or from lines
         # so frequent that their speeds are a count or none.
         self._drifts = sure and (self._seldom or rounded)
