@@ -15,7 +15,13 @@ ROOT = Path(__file__).resolve().parents[1]
 
 PAGES = tuple(
     str(path.relative_to(ROOT))
-    for pattern in ("README.md", "acsard/README.md", "tests/README.md", "deploy/*/README.md")
+    for pattern in (
+        "README.md",
+        "acsard/README.md",
+        "tests/README.md",
+        "deploy/README.md",
+        "deploy/*/README.md",
+    )
     for path in sorted(ROOT.glob(pattern))
 )
 
@@ -146,6 +152,7 @@ IN_ONE_VIEW = Elsewhere(
     "tests/system/test_many.py", "test_the_two_robots_of_the_fleet_page_are_in_one_view"
 )
 BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
+CABLE = Elsewhere(HERE, "test_the_first_page_pulls_a_cable_and_the_robot_waits_until_it_is_back")
 DRIVE = Elsewhere(
     "tests/system/test_cli.py", "test_a_held_key_drives_and_letting_go_stops_by_itself"
 )
@@ -203,6 +210,18 @@ COMMANDS: dict[str, How] = {
         "tests/system/test_start.py", "test_permission_granted_within_2_s_of_the_start_is_enough"
     ),
     "acsard doctor": Run("daemon", codes=(0, 1)),
+    # deploy/README.md
+    "acsard run": FIRST,
+    "acsard sim --link ./mcu": CABLE,
+    "acsard run --port ./mcu": CABLE,
+    "cp acsard.toml robot.toml": Run(),
+    "export ACSARD_CONFIG=$PWD/robot.toml": Run(),
+    "acsard mcu check --port DEVICE --write": Elsewhere(
+        "tests/system/test_mcu.py",
+        "test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map",
+        "the port is the simulator",
+    ),
+    "acsard drive --linear 0.2 --angular 0.5": DRIVE._replace(but="at the default speeds"),
     # acsard/README.md
     ".venv/bin/python -m pydoc acsard": Run("Where to look"),
     ".venv/bin/ruff check .": InCi(".venv/bin/ruff check ."),

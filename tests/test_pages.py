@@ -52,7 +52,13 @@ def at(block: Block) -> str:
 def test_there_is_a_page_beside_each_thing_it_describes() -> None:
     parts = ("calibration", "clients", "firmware", "foxglove", "ros2", "systemd", "web", "zenoh")
     beside = {f"deploy/{part}/README.md" for part in parts}
-    assert set(PAGES) == {"README.md", "acsard/README.md", "tests/README.md", *beside}
+    assert set(PAGES) == {
+        "README.md",
+        "acsard/README.md",
+        "tests/README.md",
+        "deploy/README.md",
+        *beside,
+    }
 
 
 # commands

@@ -145,6 +145,26 @@ def test_the_broken_board_of_the_firmware_page_is_found_broken(tmp_path: Path) -
     assert re.search("^FAIL +motor b ", done.out, re.M)
 
 
+def test_the_first_page_pulls_a_cable_and_the_robot_waits_until_it_is_back(tmp_path: Path) -> None:
+    place = with_acsard(tmp_path)
+    typed_there = ("acsard sim --link ./mcu", "acsard run --port ./mcu")
+    board, run = ([sys.executable, "-m", *command.split()] for command in typed_there)
+    write_config(place / "acsard.toml", {"bus": {"listen": [free_endpoint()]}})
+    why = find("deploy/README.md", "acsard echo state")
+
+    def stands_because(words: str) -> None:
+        until(lambda: words in shell(place, why).out, 20.0, words)
+
+    with Program(board, place) as sim:
+        sim.says("acsard run --port")
+        with Program(run, place):
+            stands_because("ready: waiting for a command")
+            sim.signal(signal.SIGINT)
+            stands_because("waiting: ./mcu does not exist")
+            with Program(board, place):
+                stands_because("ready: waiting for a command")
+
+
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     with Fleet(tmp_path_factory.mktemp("fleet")) as fleet:
