@@ -43,8 +43,8 @@ def _least(topic: Topic) -> str:
     return topic.publish or topic.query or topic.subscribe or ""
 
 
-def role_table(*, by_bus: bool) -> str:
-    """Return the permissions of each role; by the bus a client may also publish samples."""
+def role_table() -> str:
+    """Return the permissions of each role."""
     rows = []
     for role in ROLES:
         verbs = [f"`{verb}`" for verb, least in SERVICE_ROLES.items() if least == role]
@@ -60,7 +60,7 @@ def role_table(*, by_bus: bool) -> str:
             may += ["drive by the listed sources"] if role == COMMAND_ROLE else []
             may += [f"call {', '.join(verbs)}", *(f"query {key}" for key in asked)]
             put = [f"`{key}`" for key in keys_for(role, "publish", TOPICS)]
-            may += [f"publish {', '.join(put)}"] if put and by_bus else []
+            may += [f"publish {', '.join(put)}"] if put else []
         rows.append((role, "; ".join(may)))
     return _table(("role", "permissions"), rows)
 
@@ -148,9 +148,7 @@ def _replaced(pattern: str, part: str, text: str) -> str:
 
 FILES: dict[str, Callable[[str], str]] = {
     "README.md": _marked("keys", key_table()),
-    "deploy/systemd/README.md": _marked("roles", role_table(by_bus=True)),
-    "deploy/zenoh/README.md": _marked("roles", role_table(by_bus=True)),
-    "deploy/web/README.md": _marked("roles", role_table(by_bus=False)),
+    "deploy/systemd/README.md": _marked("roles", role_table()),
     "deploy/zenoh/router.json5": router_file,
 }
 """Maps each file to the function that writes its generated parts again."""
