@@ -135,23 +135,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     ):
         words = f"file to write (default: {default})"
         action.add_argument("new", nargs="?", metavar=name, help=words)
-    form = exported.add_mutually_exclusive_group()
-    form.add_argument(
-        "--csv",
-        dest="kind",
-        action="store_const",
-        const="csv",
-        default="mcap",
-        help="write a table with one row per feedback line; its first columns are those that "
-        "`acsard calibrate --log` reads",
-    )
-    form.add_argument(
-        "--rosbag2",
-        dest="kind",
-        action="store_const",
-        const="rosbag2",
-        help="write a directory with metadata.yaml, as `ros2 bag` does",
-    )
+    _export_forms(exported)
     report.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     for action in (replay, exported):
         action.add_argument(
@@ -168,6 +152,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     # For `replay` and `export`, --config is the configuration that they try.
     for action in (shown, recover, report):
         _own_config(action, argparse.SUPPRESS)
+
+
+def _export_forms(parser: argparse.ArgumentParser) -> None:
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument(
+        "--csv",
+        dest="kind",
+        action="store_const",
+        const="csv",
+        default="mcap",
+        help="write a table with one row per feedback line; its first columns are those that "
+        "`acsard calibrate --log` reads",
+    )
+    form.add_argument(
+        "--rosbag2",
+        dest="kind",
+        action="store_const",
+        const="rosbag2",
+        help="write a directory with metadata.yaml, as `ros2 bag` does",
+    )
 
 
 def _directory(parser: argparse.ArgumentParser, default: object) -> None:
