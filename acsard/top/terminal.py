@@ -27,8 +27,8 @@ from acsard.terminal.output import has_screen, plain
 from acsard.top.feed import Feed
 from acsard.top.keyboard import Ride
 from acsard.top.roster import Roster, table
+from acsard.top.screen import screen
 from acsard.top.teleop import HELP, Teleop, lines, moves, news, parting
-from acsard.top.view import screen
 
 PERIOD_S = 0.25
 """Period in which a screen is drawn, s."""

@@ -20,8 +20,8 @@ from acsard.core.messages.schema import (
     Time,
 )
 from acsard.daemon.latencies import NAMES
+from acsard.top.screen import screen
 from acsard.top.text import ScreenData
-from acsard.top.view import screen
 
 MEASURED = Latency(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))
 UNMEASURED = Latency(Spread(0, 0.0, 0.0, 0.0), Spread(0, 0.0, 0.0, 0.0))
