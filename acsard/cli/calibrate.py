@@ -51,9 +51,6 @@ from acsard.terminal.output import SENTENCES, plain, show
 from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
-DRIVEN = "the drive"
-"""The name of a guided drive in messages and reports, where a log has its file name."""
-
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 """The options that only a guided drive takes."""
 
@@ -110,7 +107,8 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     where, mine = load(args.config)
     if args.write:
         writable(args.config)
-    source = str(args.log) if args.log else DRIVEN
+    # A log has its file name in messages and reports.
+    source = str(args.log) if args.log else "the drive"
     try:
         if args.log:
             found, config = calibrated(args.log, mine, args.distance, _choice(args)), mine

@@ -36,9 +36,6 @@ def json_line(encoding: str, payload: bytes) -> str:
         return msgspec.json.encode({"undecodable": repr(payload)}).decode()
 
 
-AT_ONCE = 32
-"""Largest number of robots that are called at the same time."""
-
 Replies = Mapping[str, ServiceReply | AcsardError]
 """The reply of each robot, or the reason why there is none."""
 
@@ -58,7 +55,7 @@ def of_each(
         except AcsardError as error:  # the robot did not answer, or its answer cannot be decoded
             return error
 
-    with ThreadPoolExecutor(min(len(wanted), AT_ONCE)) as calls:
+    with ThreadPoolExecutor(min(len(wanted), 32)) as calls:
         return dict(zip(wanted, calls.map(called, wanted), strict=True))
 
 

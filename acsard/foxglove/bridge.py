@@ -38,10 +38,6 @@ from acsard.foxglove.server import (
 )
 from acsard.host import clock
 
-GATHER_S = 0.015
-"""Time to gather messages before a round. A screen shows 60 frames a second, and gathering for less
-than one frame makes the rounds a third cheaper. Commands do not wait for it."""
-
 GONE = "daemon"
 """Id of the status message that the daemon is gone."""
 
@@ -91,7 +87,10 @@ class Bridge:
             if dead.done():
                 dead.result()
             self._wake.wait(0.5)
-            time.sleep(GATHER_S)
+            # Time to gather messages before a round. A screen shows 60 frames a second, and
+            # gathering for less than one frame makes the rounds a third cheaper. Commands do not
+            # wait for it.
+            time.sleep(0.015)
             self._wake.clear()
             self._round()
 

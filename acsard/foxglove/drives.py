@@ -27,12 +27,6 @@ SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
 """Thresholds for a panel that publishes too seldom: this many messages in a row after a silence of
 the commander, none longer than `SLOW_NS`."""
 
-TOO_SLOW = (
-    "the panel publishes so seldom that the robot stops in between: set its publish rate to 10 "
-    "Hz or more"
-)
-
-
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 """Decoder for twists only. They depend on neither joints nor wheels, so the defaults are
 sufficient."""
@@ -139,7 +133,12 @@ class Drives:
                 viewer.commander, lambda due: self._send(robot, due), wished
             )
         if viewer.is_slow(silence_ns):
-            self._notices.say("warning", "drive", TOO_SLOW)
+            self._notices.say(
+                "warning",
+                "drive",
+                "the panel publishes so seldom that the robot stops in between: set its publish "
+                "rate to 10 Hz or more",
+            )
 
     def withdrawn(self, client: int, channel: int) -> None:
         """Release the robot, because the viewer closed this channel or disconnected."""

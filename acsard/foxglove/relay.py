@@ -31,17 +31,7 @@ from acsard.foxglove.robot_facts import Facts, key_of
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-MOST = 100
-"""Maximum number of messages of a topic per round; a second's worth at 100 Hz."""
-
-MOST_COMMANDS = 100
-"""Maximum number of waiting commands per source, about one second of the highest accepted rate; the
-oldest are dropped."""
-
 EVENTS = "events"
-
-KEPT = ("tf_static", "diagnostics", "state")
-"""Keys that are published seldom; a viewer that starts to look receives the last message."""
 
 
 class News:
@@ -179,7 +169,8 @@ class _Heard:
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
     ) -> None:
         self._ways = by_key
-        self._box = Mailbox[tuple[Arrival, int]](MOST_COMMANDS, wake)
+        # About one second of the highest accepted rate; the oldest are dropped.
+        self._box = Mailbox[tuple[Arrival, int]](100, wake)
         handler = zenoh.handlers.Callback(self._take)
         self._declared = [session.declare_subscriber(key, handler) for key in by_key]
 
@@ -274,7 +265,8 @@ class Relay:
                 continue
             if out.key == EVENTS:
                 self._robot.ask(EVENTS, self._followed[EVENTS].add)
-            elif out.key in KEPT and out.last:
+            elif out.key in ("tf_static", "diagnostics", "state") and out.last:
+                # These keys are published seldom, so a new viewer receives the last message.
                 out.channel.log(out.last)
         for key in keys - self._followed.keys():
             self._followed[key] = self._subscribed(key)
@@ -307,7 +299,8 @@ class Relay:
             out.log(line)
 
     def _messages(self, key: str, samples: Subscription) -> list[msgspec.Struct]:
-        held: deque[zenoh.Sample] = deque(maxlen=MOST)
+        # A round takes a second's worth at 100 Hz.
+        held: deque[zenoh.Sample] = deque(maxlen=100)
         try:
             while (sample := samples.try_recv()) is not None:
                 held.append(sample)

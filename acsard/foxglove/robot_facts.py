@@ -14,11 +14,6 @@ from acsard.core.ros.channels import CMD_VEL_IN, SOURCE, Channel, published_chan
 from acsard.core.ros.transports import left_out
 from acsard.host.errors import ReplyError
 
-DEAF = (
-    "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…): see them with "
-    "`acsard foxglove` on the robot, or later with `acsard recording export`"
-)
-
 
 class Facts(Struct, frozen=True):
     """The configuration, sources and permissions.
@@ -57,7 +52,10 @@ def learn(robot: Client) -> Facts:
     """
     forbidden, role, deaf = "", "maintainer", ""
     if robot.where.tls:
-        deaf = DEAF
+        deaf = (
+            "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…): see them "
+            "with `acsard foxglove` on the robot, or later with `acsard recording export`"
+        )
         us = robot.whoami()
         role = us.role
         forbidden = "" if has(role, COMMAND_ROLE) else us.words()

@@ -32,17 +32,9 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 
-BACKLOG = 256
-"""Maximum number of waiting messages for a slow viewer; the oldest are dropped."""
-
 POLL_NS = 5 * NS_PER_S
 """Interval at which the settings are read while a viewer follows them, because other clients change
 them too."""
-
-REFUSED = (
-    "a client was refused: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 does not), "
-    "or is not a Foxglove viewer"
-)
 
 
 class Shown:
@@ -238,7 +230,7 @@ def start(
             supported_encodings=["json", "cdr"],
             services=services,
             context=context,
-            message_backlog_size=BACKLOG,
+            message_backlog_size=256,
         )
     except RuntimeError as error:
         another = f"--address {host}:{max(1024, port % 65535 + 1)}"
@@ -262,7 +254,12 @@ class Refusals(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Take a line of the library's log."""
         if "handshake failed" in record.getMessage():
-            self._notices.say("warning", "refused", REFUSED)
+            self._notices.say(
+                "warning",
+                "refused",
+                "a client was refused: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 "
+                "does not), or is not a Foxglove viewer",
+            )
 
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")

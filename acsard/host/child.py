@@ -43,9 +43,6 @@ SILENT_NS = 3 * NS_PER_S
 START_NS = 15 * NS_PER_S
 """Time for the first sign of life: the start of Python on a busy machine."""
 
-LINE_BYTES = 65536
-"""Length of the longest line of output that a child may send."""
-
 
 class Silence:
     """Silence of a peer, judged again and again.
@@ -129,7 +126,7 @@ async def running(
         stdin=stdin,
         stdout=stdout,
         stderr=stderr,
-        limit=LINE_BYTES,
+        limit=65536,
         start_new_session=True,
         env=environment(),
     )

@@ -30,11 +30,6 @@ def steady_ns() -> int:
     return mono_ns() + asleep_ns()
 
 
-TOGETHER_NS = 50_000
-"""Longest time between two readings that belong together, ns. Two readings take 1 us, unless
-another process gets the core between them.
-"""
-
 NS_PER_US = 1000
 
 
@@ -42,7 +37,8 @@ def now() -> Instant:
     """Read both clocks as close together as possible."""
     for _ in range(5):
         mono, wall = mono_ns(), time.time_ns()
-        if mono_ns() - mono < TOGETHER_NS:
+        # Two readings take 1 us, unless another process gets the core between them.
+        if mono_ns() - mono < 50_000:
             break
     return Instant(mono - mono % NS_PER_US, wall - wall % NS_PER_US)
 

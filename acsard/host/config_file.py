@@ -106,20 +106,14 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
         raise _left(file, error) from None
 
 
-TRIES = 3
-"""Number of times that a change is computed before the daemon leaves the file to another program.
-
-The computation takes 0.2 s, and a person's editor may write the file meanwhile.
-"""
-
-
 def keep(edit: Edit) -> None:
     """Write the change. It is computed again if another program has changed the file meanwhile.
 
     Raises `MendableError` and leaves the file unchanged if that is impossible.
     """
     try:
-        for _ in range(TRIES):
+        # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
+        for _ in range(3):
             place = edit.file.resolve(strict=True)
             _require_writable(place)
             if place.read_bytes() == edit.before:
@@ -146,10 +140,6 @@ def _require_writable(place: Path) -> None:
         raise ValueError(f"the daemon has no permission to write to {place.parent}")
 
 
-GIT_S = 2.0
-"""Time limit of git, s. It takes some milliseconds."""
-
-
 def is_tracked(place: Path) -> bool:
     """Return whether git tracks the file at this resolved path, as far as git can say it."""
     if not any((parent / ".git").exists() for parent in place.parents):
@@ -158,7 +148,7 @@ def is_tracked(place: Path) -> bool:
     # that user's programs with the rights of the daemon. Such a file counts as not tracked.
     words = ["git", "-C", str(place.parent), "ls-files", "--error-unmatch", "--", place.name]
     try:
-        asked = subprocess.run(words, capture_output=True, timeout=GIT_S)
+        asked = subprocess.run(words, capture_output=True, timeout=2.0)
     except (OSError, subprocess.TimeoutExpired):
         return _is_reference(place)
     return asked.returncode == 0 or _is_reference(place)

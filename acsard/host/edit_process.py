@@ -24,9 +24,6 @@ from acsard.host.extras import install
 EDIT_S = 2.0
 """Time limit of the process, s. It takes 0.2 s on a computer that is not busy."""
 
-NICE = 10
-"""Niceness of the process: everything of the robot comes first."""
-
 
 class Task(Struct, frozen=True):
     """The text of a file, and its new values by dotted key."""
@@ -70,7 +67,8 @@ def main() -> None:
     """Read a `Task` from standard input, and write a `Result` to standard output."""
     # The unit of the service blocks this call.
     with suppress(OSError):
-        os.nice(NICE)
+        # Everything of the robot comes first.
+        os.nice(10)
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=Task)
     try:
         result = Result(edited(task.text, task.keys))

@@ -18,19 +18,9 @@ from msgspec.structs import replace
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
-SLOW_CLOCK = 0.6
-"""Share of the processor's full clock below which a limit of it counts as slow."""
-
-UNDERVOLTAGE_BIT = 1
-"""Bit of the Raspberry Pi's `get_throttled`: the supply voltage is too low now."""
-
 SLOWED_BITS = 0b1110
 """Bits of `get_throttled`: the clock is limited, the processor is throttled, the soft temperature
 limit is active. All of them are about the present."""
-
-NICER = 9
-"""Largest nice value, above that of a thread, of a process that can delay the thread noticeably. At
-10 more the kernel gives it a tenth of the thread's weight."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
 """Drivers whose governor `powersave` chooses the clock by the load. That of every other driver
@@ -178,7 +168,9 @@ def busiest(
     Return None if it used less than a quarter of a processor. A process that a thread of this
     `priority` displaces does not count.
     """
-    least = priority + NICER if priority >= 0 else priority
+    # A process that is 9 nicer can delay the thread noticeably. At 10 more the kernel gives it a
+    # tenth of the thread's weight.
+    least = priority + 9 if priority >= 0 else priority
     ran = {(one.pid, one.name): one.ran_ns for one in before}
     grown = [
         replace(one, ran_ns=one.ran_ns - ran[one.pid, one.name])
@@ -192,7 +184,7 @@ def busiest(
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
     """Return the limit of a processor's clock from the files of its directory `cpufreq`.
 
-    Return None if the limit is at least `SLOW_CLOCK` of the full clock. The present clock does not
+    Return None if the limit is at least 0.6 of the full clock. The present clock does not
     matter, because a processor at rest runs slowly and speeds up when there is work.
     """
     governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
@@ -201,7 +193,7 @@ def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
     if governor == "userspace":
         limit = policy.get("scaling_setspeed", limit)
     full = policy.get("cpuinfo_max_freq", "")
-    if not (limit.isdigit() and full.isdigit()) or int(limit) >= SLOW_CLOCK * int(full):
+    if not (limit.isdigit() and full.isdigit()) or int(limit) >= 0.6 * int(full):
         return None
     return SlowClock(governor, int(limit) // 1000, int(full) // 1000)
 
@@ -255,7 +247,8 @@ class Kernel:
         bits = 0
         for path in self._firmware:
             bits |= _number(path, 16)
-        low = bool(bits & UNDERVOLTAGE_BIT) or any(_number(path) for path in self._alarms)
+        # Bit 0 of the Raspberry Pi's `get_throttled`: the supply voltage is too low now.
+        low = bool(bits & 1) or any(_number(path) for path in self._alarms)
         cooled = any(_number(path) > 0 for path in self._coolers)
         slow = (slow_clock(_policy(path)) for path in self._policies)
         return Conditions(

@@ -32,8 +32,6 @@ import structlog  # noqa: E402
 if sys.modules["rich"] is None:
     del sys.modules["rich"]
 
-SOCKET = "/run/systemd/journal/socket"
-
 _PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}
 """Priorities of syslog."""
 
@@ -69,7 +67,7 @@ def _message(line: Mapping[str, Any]) -> str:
 class JournalStream(io.StringIO):
     """Stream that sends each write as a datagram. Raises `OSError` without a journal."""
 
-    def __init__(self, path: str = SOCKET) -> None:
+    def __init__(self, path: str = "/run/systemd/journal/socket") -> None:
         super().__init__()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         try:

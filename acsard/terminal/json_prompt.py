@@ -48,8 +48,6 @@ LINE_BYTES = 65536
 faulty.
 """
 
-KEY = " "
-
 
 class Line(Struct, frozen=True):
     """An input line. Unknown fields are ignored."""
@@ -190,7 +188,7 @@ class JsonPrompt:
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)
             pressed, self._pressed = self._pressed, False
-            return KEY if pressed else ""
+            return " " if pressed else ""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file.

@@ -28,9 +28,6 @@ minimum, unless the first would fall below its own."""
 BATTERY = HEADS.index("BATTERY")
 """Column of the state of charge. The table has it only if a robot has a battery."""
 
-LEFT_OUT = ("VERSION", "PLACE", "LINK", "BATTERY")
-"""Columns that a narrow terminal lacks. The first is the first to go."""
-
 URGENT = ("fault", "stopped", "GONE", "SILENT")
 """Modes that need attention; they are listed first, because the lines may not all fit. The robots
 with a warning come next."""
@@ -46,7 +43,8 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
     powered = any(row[BATTERY] for row in cells[1:])
     shown = [n for n in range(len(HEADS)) if n != BATTERY or powered]
-    for column in map(HEADS.index, LEFT_OUT):
+    # A narrow terminal lacks these columns; the first is the first to go.
+    for column in map(HEADS.index, ("VERSION", "PLACE", "LINK", "BATTERY")):
         if column in shown and sum(rooms[n] + 2 for n in shown) - 2 > width:
             shown.remove(column)
     rest = sum(rooms[n] + 2 for n in shown[1:])

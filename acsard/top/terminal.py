@@ -42,9 +42,6 @@ NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
 In this order, they apply after a change, while the robot moves, and while nothing happens.
 """
 
-PART_S = 2.0
-"""Time within which a robot usually stands after its own ramp, s."""
-
 NO_END = 10**9
 
 LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -83,7 +80,7 @@ def drive(ride: Ride) -> None:
 
 
 def part(ride: Ride) -> None:
-    """Wait until the robot stands, at most `PART_S`, and print a last report.
+    """Wait until the robot stands, at most 2 s, and print a last report.
 
     Without the wait, this report would say that the robot drives although it stops a moment later.
     """
@@ -92,7 +89,8 @@ def part(ride: Ride) -> None:
         ride.take()
         seen, took = ride.seen(), time.monotonic() - left
         rests = seen.state is not None and seen.age < took and not moves(seen.state)
-        if rests or took > PART_S:
+        # A robot usually stands within 2 s after its own ramp.
+        if rests or took > 2.0:
             print("\n".join(parting(seen, output_size().columns)), flush=True)
             return
         time.sleep(KEYS_S)

@@ -48,15 +48,13 @@ class ScreenData(Struct, frozen=True):
     the network delay only if the robot's clock was set."""
 
 
-MOST = 256
-"""Maximum number of characters of a text; a screen shows fewer."""
-
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def clean(text: str) -> str:
     """Return the text without control, invisible and zero-width characters."""
-    return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:MOST]))
+    # A screen shows fewer characters than this.
+    return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:256]))
 
 
 def count(number: int) -> str:

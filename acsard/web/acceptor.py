@@ -45,45 +45,20 @@ HURRIED_S = 0.3
 """Time limit for a TLS handshake of the most crowded network while others wait. Clients that fall
 silent in their handshakes must not keep a phone waiting for `HANDSHAKE_S`."""
 
-HANDSHAKE_EVERY_S = 0.005
-"""Shortest interval between the begins of two handshakes. Each one occupies the server for 1 ms or
-two, and a stop must not wait for 32 of them in a row."""
-
 REQUEST_S = 10.0
 """Time limit from the accept to the head of the first request; the connection is cut after that."""
-
-HEAD_BYTES = 131072
-"""Bytes of a request after which its connection is cut if they are still only headers. Headers that
-never end would fill the memory."""
-
-AHEAD = 1
-"""Requests that a client may send before it has the answer to the last one. No browser does, and 32
-of them, as aiohttp allows, have megabytes of headers."""
 
 UNREAD_S = 5.0
 """Time limit for a client that does not read its answers, or whose network is lost. The kernel ends
 the connection when sent data have not been acknowledged, or the client's window has been closed,
 for so long."""
 
-CLOSE_S = 1.0
-"""Time limit for the client's answer to the end of TLS."""
-
 READ_BYTES = 16384
 """Size of asyncio's read buffer per TLS connection: one TLS record. Its default of 256 KiB is the
 larger part of the memory of an idle connection."""
 
-ACCEPTS = 32
-"""Connections that are accepted before other work of the event loop has its turn."""
-
 PAUSE_S = 0.05
 """Pause of one listening address after the process has reached its limit of open files."""
-
-NO_HOST = "the request has no `Host`, the name of the robot"
-
-NO_REQUEST = "that is not an HTTP request"
-
-MISSING = "Missing 'Host'"
-"""Start of aiohttp's message for a missing `Host` header."""
 
 Factory = Callable[[], "Reader"]
 
@@ -117,7 +92,9 @@ class Acceptor:
         `secure` is None for plain HTTP.
         """
         sslproto.SSLProtocol.max_size = READ_BYTES
-        web_protocol.MAX_MSG_QUEUE_SIZE = AHEAD
+        # No browser sends a request before it has the last answer. 32 of them, as aiohttp allows,
+        # have megabytes of headers.
+        web_protocol.MAX_MSG_QUEUE_SIZE = 1
         self._listeners.append(opened)
         self._resume(opened, secure, make)
 
@@ -158,7 +135,8 @@ class Acceptor:
             loop.add_reader(opened, self._accept, opened, secure, make)
 
     def _accept(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        for _ in range(ACCEPTS):
+        # After this number of connections, other work of the event loop has its turn.
+        for _ in range(32):
             try:
                 accepted, place = opened.accept()
             except (BlockingIOError, InterruptedError):
@@ -232,7 +210,8 @@ class Acceptor:
                 self._waiting[network] = same  # behind the others
             self._starting[one] = loop.time()
             one.start()
-        self._again = loop.call_later(HANDSHAKE_EVERY_S, self._next)
+        # A handshake occupies the server for 1 ms or two, and a stop must not wait for 32 in a row.
+        self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
         """Return whether a handshake may start, after the oldest one was cut if it is too slow."""
@@ -317,7 +296,7 @@ class _Connection(asyncio.Protocol):
                 self._socket,
                 ssl=secure,
                 ssl_handshake_timeout=HANDSHAKE_S if secure else None,
-                ssl_shutdown_timeout=CLOSE_S if secure else None,
+                ssl_shutdown_timeout=1.0 if secure else None,
             )
         except OSError as error:
             # The frames hold the error, and with it the memory of TLS until the next collection.
@@ -378,7 +357,8 @@ class _Connection(asyncio.Protocol):
             self._head = 0
             return
         self._head += len(data)
-        if self._head > HEAD_BYTES:
+        # Headers that never end would fill the memory.
+        if self._head > 131072:
             self._acceptor.crowded(self)
 
     def eof_received(self) -> None:
@@ -433,10 +413,15 @@ class Reader(RequestHandler):
         """
         if status >= 500:
             return super().handle_error(request, status, exc, message)
-        nameless = (message or "").startswith(MISSING)
+        nameless = (message or "").startswith("Missing 'Host'")
         peer = unmapped(request.remote or "")
         self._counted.refuse("host" if nameless else "malformed", peer)
-        response = problem(status, NO_HOST if nameless else NO_REQUEST)
+        response = problem(
+            status,
+            "the request has no `Host`, the name of the robot"
+            if nameless
+            else "that is not an HTTP request",
+        )
         response.headers.update(HEADERS)
         response.force_close()
         return response

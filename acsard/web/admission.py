@@ -47,19 +47,9 @@ HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?
 """Pattern of a valid `Host` header. It is strict because the value is copied into a response
 header."""
 
-PROXIES = ("forwarded", "x-forwarded-", "x-real-ip", "via")
-"""Prefixes of the headers that a proxy adds when it forwards a request."""
-
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 """Refusal reason per HTTP status that aiohttp raises by itself. Every other status counts as
 `malformed`."""
-
-PREFLIGHT = {
-    "Access-Control-Allow-Methods": "GET, HEAD, POST",
-    "Access-Control-Allow-Headers": "Authorization, Content-Type, If-None-Match",
-    "Access-Control-Max-Age": "600",
-}
-"""Headers of the answer to a browser that asks which requests a page of another origin may send."""
 
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
@@ -255,7 +245,14 @@ class Admission:
     def _preflight(self, request: web.Request) -> web.Response:
         """Tell a browser that a page of a listed origin may send its request."""
         place(asked_of(request), self._names | {own_address(request)})
-        return web.Response(status=204, headers=PREFLIGHT)
+        return web.Response(
+            status=204,
+            headers={
+                "Access-Control-Allow-Methods": "GET, HEAD, POST",
+                "Access-Control-Allow-Headers": "Authorization, Content-Type, If-None-Match",
+                "Access-Control-Max-Age": "600",
+            },
+        )
 
     async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
         """Let a page of a listed origin read the answer."""
@@ -276,7 +273,11 @@ def asked_of(request: web.Request) -> Asked:
         hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
         request.headers.get("Origin"),
         request.headers.get("Sec-Fetch-Site"),
-        any(name.lower().startswith(PROXIES) for name in request.headers),
+        # A proxy adds these headers when it forwards a request.
+        any(
+            name.lower().startswith(("forwarded", "x-forwarded-", "x-real-ip", "via"))
+            for name in request.headers
+        ),
     )
 
 

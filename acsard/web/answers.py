@@ -152,9 +152,6 @@ INLINED = {
 """The files that another one contains when it is sent, each with the element that loads it in the
 source, and the name of the element that contains it."""
 
-PAYS = 1000
-"""Minimum size in bytes from which a file is compressed."""
-
 
 class File(Struct, frozen=True):
     """A file in the form in which it is sent."""
@@ -204,6 +201,7 @@ def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) 
         body = body.replace(loads, f"<{element}>".encode() + source + f"</{element}>".encode())
         digest = base64.b64encode(hashlib.sha256(source).digest()).decode()
         policy += f"; {element}-src 'self' 'sha256-{digest}'"
-    packed = gzip.compress(body, mtime=0) if len(body) >= PAYS else body
+    # Compression does not pay for a small file.
+    packed = gzip.compress(body, mtime=0) if len(body) >= 1000 else body
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     return File(kind, body, packed if len(packed) < len(body) else None, tag, policy, stamp)

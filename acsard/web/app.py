@@ -57,18 +57,8 @@ BODY_S = 5.0
 """Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
 connection."""
 
-FILE_S = 1.0
-"""Time for which a file of the page is sent without a look at the disk. A look starts a thread, for
-which the whole server waits."""
-
-SEND_BUFFER = 65536
-"""Size of the kernel's send buffer for one client. A larger buffer would deliver stale data."""
-
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status for each state of a report."""
-
-NO_TOKEN = "send the token as a form, token=..., or as JSON, both in UTF-8"
-
 
 DEFAULT = WebConfig()
 
@@ -171,7 +161,8 @@ class Page:
     async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
         now = asyncio.get_running_loop().time()
         file, read = self._sent.get(name, (None, 0.0))
-        if file is None or now > read + FILE_S:
+        # A look at the disk starts a thread, for which the whole server waits.
+        if file is None or now > read + 1.0:
             if file is not None:
                 self._sent[name] = file, now  # until the disk has answered
             file = await in_thread(lambda: self._files.get(name), READ_S)
@@ -379,13 +370,16 @@ async def _token_posted(request: web.Request) -> TokenForm:
             return msgspec.convert(fields, TokenForm, strict=False)
     except (msgspec.MsgspecError, ValueError, LookupError, RecursionError):
         pass
-    raise RefusedError("malformed", NO_TOKEN)
+    raise RefusedError(
+        "malformed", "send the token as a form, token=..., or as JSON, both in UTF-8"
+    )
 
 
 def _limit_buffer(request: web.Request) -> None:
     at = None if request.transport is None else request.transport.get_extra_info("socket")
     if at is not None:
-        at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        # A larger send buffer of the kernel would deliver stale data.
+        at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
 
 
 ROUTES: tuple[Route, ...] = (

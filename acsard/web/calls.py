@@ -37,9 +37,6 @@ MERGE_S = 0.02
 """Shortest interval between two stops of one client to one robot. A stop within it is sent at its
 end, together with all others of that interval."""
 
-ANSWERED = 200
-"""Maximum number of other robots of which it is known that they answer a stop."""
-
 ANSWER_S = 8.0
 """Time limit for an answer from the bus. The bus client gives up sooner, so the caller gets its
 error message."""
@@ -150,7 +147,7 @@ class Calls:
         with self._elsewhere.held() as free:
             if free:
                 reply = await in_thread(request, ANSWER_S)
-                if len(self._answered) < ANSWERED:
+                if len(self._answered) < 200:
                     self._answered.add(robot)
                 return reply
         await in_thread(

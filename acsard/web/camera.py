@@ -26,12 +26,6 @@ from acsard.web.answers import TroubleError
 WAIT_S = 1.0
 """Longest wait for a picture that the client has not seen."""
 
-IDLE_S = 5.0
-"""Time without a client after which the server stops reading the stream."""
-
-AGAIN_S = 0.5
-"""Delay before the stream is opened again."""
-
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits for the connection to the camera's server, and for its next byte."""
 
@@ -163,7 +157,7 @@ class Camera:
                 except (aiohttp.ClientError, TimeoutError, OSError, ValueError) as error:
                     self._trouble = f"the camera's stream cannot be read: {error or 'no answer'}"
                     self.newest = None  # clients get the reason instead of an old picture
-                await asyncio.sleep(AGAIN_S)
+                await asyncio.sleep(0.5)
         self.newest = None  # the next client must not see a picture from before
 
     async def _read(self, session: aiohttp.ClientSession) -> None:
@@ -188,4 +182,4 @@ class Camera:
         self._changed.clear()
 
     def _idle(self) -> bool:
-        return clock.mono_ns() - self._asked_ns > IDLE_S * NS_PER_S
+        return clock.mono_ns() - self._asked_ns > 5.0 * NS_PER_S

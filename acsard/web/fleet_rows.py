@@ -18,9 +18,6 @@ from acsard.web.streams import DECLARE_S, STATE, UNREADY
 
 MOST = 200
 
-FORGET_S = 30.0
-"""A robot that has been silent for longer is dropped, unless its liveliness token is present."""
-
 UNROUTED = (
     "this page sees only robots that are connected to the daemon of {robot}, because daemons "
     "forward no messages. To see all robots of a router, connect this page's server to the "
@@ -34,9 +31,6 @@ BY_NAME = (
     "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
 )
 """Note for a server that is connected over TLS, which limits it to its own robot."""
-
-LONG = 40
-"""Maximum number of characters of a version that the page shows."""
 
 
 class Fleet:
@@ -92,7 +86,9 @@ class Fleet:
             by_name = robots.endpoint.startswith("tls/")
             why = BY_NAME if by_name else "" if client.session.info.routers_zid() else UNROUTED
             self.note = why.format(robot=robots.id, endpoint=robots.endpoint)
-            return fleet.Fleet(client, [robots.id if by_name else ALL], MOST, FORGET_S)
+            # A robot that has been silent for this long is dropped, unless its liveliness token is
+            # present.
+            return fleet.Fleet(client, [robots.id if by_name else ALL], MOST, 30.0)
 
         try:
             self._tracked = await in_thread(declare, DECLARE_S, lambda late: late.end())
@@ -118,7 +114,7 @@ async def _within_time(call: Callable[[], None]) -> None:
 
 def _row(one: fleet.Row) -> Row:
     state = one.state if math.isfinite(one.age) else None
-    version = one.version[:LONG]
+    version = one.version[:40]
     if state is None:
         mode, reason = ("gone", "its daemon has ended") if one.here is False else (None, "")
         return Row(one.robot_id, mode, reason, None, "", None, version)

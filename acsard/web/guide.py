@@ -29,23 +29,8 @@ from acsard.machine.serial_ports import serial_devices
 from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
-ENDING_S = 1.0
-"""Longest time that the answer to a STOP waits for the child to end."""
-
-LAST_BYTES = 4000
-"""Number of bytes that are kept from the end of the child's standard error."""
-
-RELAYED = Rate(20.0)
-"""Rate of the signs of life that are relayed to the child. The browser sends them at about half
-this rate (page/guide.js), so none is lost."""
-
 PATIENCE_S = 6.0
 """Time for the child to send zeros and exit after an interrupt, before it is killed."""
-
-CLOSING_S = 2.0
-"""Time for the child to exit when this server ends."""
-
-BOARDS_S = 5.0
 
 SIMULATOR = "sim"
 
@@ -176,7 +161,7 @@ class Guide:
             return Ending()
         self._errand.leave()
         what = f"the {self._errand.name} of {self._errand.by}"
-        done, _ = await asyncio.wait([self._task], timeout=ENDING_S)
+        done, _ = await asyncio.wait([self._task], timeout=1.0)
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
     def heard(self, viewer: object) -> None:
@@ -185,12 +170,12 @@ class Guide:
             errand.relay()
 
     async def close(self) -> None:
-        """End the running child; kill it after `CLOSING_S`."""
+        """End the running child; kill it after 2 s."""
         if self._task is None or self._errand is None:
             return
         self._errand.leave()
         try:
-            async with asyncio.timeout(CLOSING_S):
+            async with asyncio.timeout(2.0):
                 await asyncio.shield(self._task)
         except TimeoutError:
             self._errand.kill()
@@ -217,7 +202,7 @@ class Guide:
         return [one.port for one in await self._boards()]
 
     async def _boards(self) -> list[Board]:
-        return await in_thread(lambda: boards(self._configured), BOARDS_S)
+        return await in_thread(lambda: boards(self._configured), 5.0)
 
     def _tell_all(self) -> None:
         for viewer, say in self._viewers.items():
@@ -288,7 +273,8 @@ class _Errand:
         self._question = 0
         """Number of the open question; 0 if none is open."""
         self._leg = self._rides = False
-        self._relayed = Bucket(RELAYED)
+        # The browser sends signs of life at about half this rate (page/guide.js), so none is lost.
+        self._relayed = Bucket(Rate(20.0))
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
@@ -382,7 +368,7 @@ class _Errand:
     async def _overhear(self, process: Process) -> None:
         assert process.stderr is not None
         while said := await process.stderr.read(4096):
-            self._last = (self._last + said)[-LAST_BYTES:]
+            self._last = (self._last + said)[-4000:]
 
     def _words(self) -> str:
         lines = self._last.decode(errors="replace").splitlines()

@@ -15,8 +15,6 @@ from acsard.web.callers import is_loopback
 TRIES = 20
 """Number of ports that are tried, starting with the requested one."""
 
-BACKLOG = 128
-
 EVERYWHERE_4, EVERYWHERE_6 = "0.0.0.0", "::"
 """Wildcard addresses: all IPv4 addresses, and all addresses of this machine."""
 
@@ -136,7 +134,7 @@ def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.soc
         try:
             found = socket.getaddrinfo(one.host, port, type=socket.SOCK_STREAM)[0]
             opened = socket.create_server(
-                found[4][:2], family=found[0], backlog=BACKLOG, dualstack_ipv6=both
+                found[4][:2], family=found[0], backlog=128, dualstack_ipv6=both
             )
         except OSError as error:
             trouble = error

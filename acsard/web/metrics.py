@@ -26,10 +26,6 @@ Sample = tuple[Mapping[str, str], float]
 
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 
-US = 1e-6
-
-DAY_S = 86400.0
-
 
 def text(
     robot: str,
@@ -79,7 +75,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
     subjects = [({"what": what}, float(what in warned)) for what in WHATS]
     yield "warning", "gauge", "1 while the robot warns of this, else 0", subjects
     if state.certificate_days is not None:
-        left: list[Sample] = [({}, state.certificate_days * DAY_S)]
+        left: list[Sample] = [({}, state.certificate_days * 86400.0)]
         yield "certificate_seconds", "gauge", "until the first TLS certificate ends", left
     if state.emergency_stop:
         pressed = float(state.emergency_stop != "released")
@@ -109,7 +105,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
     for name, figure in state.latencies.items():
         spread = figure.last_minute
         for at, value in (("p50", spread.p50), ("p99", spread.p99), ("max", spread.max)):
-            figures.append(({"latency": name, "at": at}, value * US))
+            figures.append(({"latency": name, "at": at}, value * 1e-6))
     yield "latency_seconds", "gauge", "latencies of the daemon, over the last minute", figures
 
 

@@ -52,19 +52,12 @@ BYTES = 32 << 20
 MEMORY = 256 << 20
 """Limit of the child's data memory, bytes."""
 
-SAID = 2000
-"""Number of characters that are kept from the end of the child's error output."""
-
 TOO_LONG = (
     f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
     "faster machine with acsard recording report"
 )
 TOO_MUCH = (
     f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, with "
-    "acsard recording report"
-)
-KILLED = (
-    "the system ended it, most likely because memory ran out: draw it on another machine, with "
     "acsard recording report"
 )
 TOO_BIG = (
@@ -298,7 +291,10 @@ class Reports:
                 listening.cancel()
             code = await child.wait()
         if code == -signal.SIGKILL:
-            raise _FailedError(KILLED)
+            raise _FailedError(
+                "the system ended it, most likely because memory ran out: draw it on another "
+                "machine, with acsard recording report"
+            )
         if code:
             raise _FailedError(_why(said) or f"the drawing program {how_it_ended(code)}")
         return body
@@ -338,5 +334,5 @@ async def _listened(child: Process, one: _Drawing) -> str:
         words = [line for line in lines if not line.isdecimal()]
         numbers = [int(line) for line in lines if line.isdecimal() and len(line) <= 3]
         one.percent = min(100, max([one.percent, *numbers]))
-        said = "\n".join([*words, rest])[-SAID:]
+        said = "\n".join([*words, rest])[-2000:]
     return said.strip().removeprefix("acsard: ")

@@ -36,14 +36,8 @@ ASK_S, ASK_SOON_S = 10.0, 1.0
 """Interval of queries for the daemon's version and limits: after an answer, and until the first
 answer."""
 
-WISHED_NS = 2 * NS_PER_S
-"""Maximum age of a commanded twist in the plots."""
-
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
 """Age and number of the points of a path at most, and the distance of two points at least."""
-
-JUMP_M = 1.0
-"""Step of the pose between two states that no robot can drive, m: the pose was set."""
 
 T = TypeVar("T")
 
@@ -68,7 +62,8 @@ class About(Struct, frozen=True):
 
 
 def _path() -> Track:
-    return Track(PATH_POINTS, PATH_STEP_M, PATH_S, JUMP_M)
+    # No robot can drive the last distance, 1 m, between two states: the pose was set.
+    return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
 
 
 class _Asking:
@@ -199,7 +194,8 @@ class Robots:
         """Return the commanded twist if it is recent and a viewer of this server follows it."""
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
-        if stream is None or raw is None or now_ns - stream.at_ns > WISHED_NS:
+        # A commanded twist that is older than this is not plotted.
+        if stream is None or raw is None or now_ns - stream.at_ns > 2 * NS_PER_S:
             return None
         try:
             return self._wishes.decode(*raw).twist

@@ -37,21 +37,12 @@ from acsard.web.viewer import Parts
 
 TIDY_S, TELL_S = 1.0, 1.0
 
-NICE = 5
-"""Niceness when the daemon starts this server: the daemon must come first."""
-
 FIELD_BYTES, FIELDS = 8190, 64
 """Maximum size of the request line and of a header, bytes, and maximum number of headers. A browser
 sends the cookies of all ports of the host in one header, so a lower limit could lock it out."""
 
-IDLE_S = 20.0
-"""Time limit for an idle HTTP connection between two requests."""
-
 LEAVE_S = 0.3
 """Time limit at shutdown for the zero commands of viewers that were driving."""
-
-SWITCH_INTERVAL_S = 0.0005
-"""Longest time that one thread may hold the interpreter while a command or a stop waits for it."""
 
 
 class Wanted(Struct, frozen=True):
@@ -76,13 +67,15 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
 
     Raises `MendableError`s.
     """
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    # A command or a stop waits at most this long while another thread holds the interpreter.
+    sys.setswitchinterval(0.0005)
     leaving = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
     if wanted.supervised:
         end_with_parent(signal.SIGTERM)
-        os.nice(NICE)
+        # The daemon, which started this server, must come first.
+        os.nice(5)
     counts = Counts()
     # Take note of the files before they are read, so that no change of them is missed.
     files = CertificateFiles(*files_in(wanted.tls))
@@ -93,7 +86,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
     page = Page(parts, vault, names, acceptor, wanted.config.web)
     runner = web.AppRunner(
-        page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
+        page.app, access_log=None, handle_signals=False, keepalive_timeout=20.0,
         shutdown_timeout=LEAVE_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
         max_headers=FIELDS, read_bufsize=READ_BYTES,
     )  # fmt: skip

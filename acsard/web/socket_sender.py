@@ -28,12 +28,6 @@ from acsard.web.robots import AGAIN_S, Robots
 from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import KEYS, UNREADY, Stream
 
-UNREAD_FRAMES = 200
-"""Maximum number of waiting answers; beyond it the oldest are dropped."""
-
-CLOSES_S = 1.0
-"""Time limit for the client's answer to a close; the connection is cut after that."""
-
 REPORTS = Rate(1.0)
 """Rate of the reported refusals of one kind of message with the same reason. All refusals are
 counted."""
@@ -66,7 +60,8 @@ class Outgoing:
         self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
         """Subscribed keys by (robot, key)."""
-        self._out: deque[bytes] = deque(maxlen=UNREAD_FRAMES)
+        # The oldest of many waiting answers are dropped.
+        self._out: deque[bytes] = deque(maxlen=200)
         self._news = asyncio.Event()
         self._reports = Buckets(REPORTS)
         self._closing = False
@@ -113,14 +108,15 @@ class Outgoing:
     async def close(self, why: str) -> None:
         """Tell the client to end the connection; `why` is at most 120 characters.
 
-        The client gets `CLOSES_S` to answer. If the connection were cut at once, many programs
+        The client gets a second to answer. If the connection were cut at once, many programs
         would report a lost network instead of the reason.
         """
         if self._closing:
             return
         self._closing = True
         if self._transport is not None:
-            asyncio.get_running_loop().call_later(CLOSES_S, self._transport.abort)
+            # A client that does not answer the close in time is cut off.
+            asyncio.get_running_loop().call_later(1.0, self._transport.abort)
         said = aiohttp.WSCloseCode.POLICY_VIOLATION.to_bytes(2, "big") + why.encode()
         with suppress(ConnectionError):
             await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
@@ -174,9 +170,6 @@ MOST = 32
 FRAMES_HZ = 300.0
 """Maximum message rate of all keys of one connection together. The limit keeps viewers from taking
 the processor time that driving needs."""
-
-CLIENT_S = 0.2
-"""Interval at which a subscription checks whether the connection to the bus exists."""
 
 
 class Keys:
@@ -277,7 +270,7 @@ class Keys:
         """
         client = self._robots.client
         if client is None:
-            await asyncio.sleep(CLIENT_S)
+            await asyncio.sleep(0.2)
             return None
         try:
             return await self._robots.streams.follow(client, one.robot, one.name)

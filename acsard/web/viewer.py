@@ -66,9 +66,6 @@ FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
 """Key of the fleet's rows, their interval, and the time that the robots have to appear before the
 first report. Without it each look at the robots began with an empty list."""
 
-LOOK_S = 0.25
-"""Interval at which a viewer checks whether the robot became unreachable or its facts changed."""
-
 
 class Hand:
     """Puts the newest velocity command of each viewer on the bus.
@@ -370,7 +367,7 @@ class Viewer:
         if self._fleet_due is not None and now >= self._fleet_due:
             self._fleet_due = now + FLEET_S
             self._out.say(socket_messages.Rows(self._fleet.rows(), self._fleet.note))
-        return now + LOOK_S
+        return now + 0.25
 
     def _start(
         self, work: Coroutine[Any, Any, None], among: set[asyncio.Task[None]] | None = None
