@@ -155,7 +155,7 @@ def _counts(result: Result) -> list[tuple[str, str]]:
     said = "" if r.lines_said is None else f" of {r.lines_said}"
     waiting = ""
     if r.lines_waiting_max is not None:
-        waiting = f", at most {r.lines_waiting_max} newer waiting"
+        waiting = f", at most {r.lines_waiting_max} newer lines waiting"
     start = "not measured" if r.start_up_ms is None else f"{r.start_up_ms:.0f} ms"
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),

@@ -286,16 +286,16 @@ def _columns(header: list[str], number: int) -> list[str]:
         raise LogError(f"{where}: there are no commas between the names: write {EXAMPLE}")
     if missing := [name for name in wanted if name not in header]:
         raise LogError(
-            f"{where}: no column {', '.join(missing)}{_near(missing, header)}; it must name t, "
-            f"and fr, fl, rl, rr or left, right, for example {EXAMPLE}"
+            f"{where}: no column {', '.join(missing)}{_near(missing, header)}; the header "
+            f"must name t, and fr, fl, rl, rr or left, right, for example {EXAMPLE}"
         )
     sensors: list[str] = [name for name in ("yaw_rate", "yaw") if name in header]
     if {"x", "y"} <= set(header):
         sensors += ["x", "y"]
     if not sensors:
         raise LogError(
-            f"{where}: no column with which to compare the wheels: it must name yaw_rate (a gyro, "
-            f"rad/s), or x and y (positions, m){_near(['yaw_rate', 'x', 'y'], header)}"
+            f"{where}: no column with which to compare the wheels: the header must name yaw_rate "
+            f"(a gyro, rad/s), or x and y (positions, m){_near(['yaw_rate', 'x', 'y'], header)}"
         )
     commands = APPLIED if set(APPLIED) <= set(header) else ()
     used = {*wanted, *sensors, *commands, "run"}

@@ -33,7 +33,7 @@ class Deviations(Struct, frozen=True):
 
     @classmethod
     def of(cls, odometry: OdometryConfig, base: Base) -> Deviations:
-        """Return the configured ones."""
+        """Return the standard deviations that `[odometry]` declares for the geometry `base`."""
         sides = (
             odometry.left_wheel_radius_multiplier_std / base.left,
             odometry.right_wheel_radius_multiplier_std / base.right,

@@ -144,7 +144,7 @@ class Windows(Struct, frozen=True):
         )  # fmt: skip
 
     def covariance(self, noise: Floats) -> Floats:
-        """Return V of each window."""
+        """Return the covariance matrix of the residuals of each window, for this noise."""
         return np.asarray(np.tensordot(self.effects, noise, (1, 0)) + self.known)
 
     def search(self, start: Floats, free: Mask, steps: int = STEPS) -> Floats:

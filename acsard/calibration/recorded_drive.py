@@ -86,7 +86,8 @@ def _files_of(directory: Path) -> list[Path]:
             if any(path.suffix == suffix for path in directory.iterdir()):
                 raise LogError(_other_bag(what))
         raise LogError(
-            f"it is a directory without an MCAP file: name that of a ROS 2 bag, or {AS_CSV}"
+            f"it is a directory without an MCAP file: name the directory of a ROS 2 bag, "
+            f"or {AS_CSV}"
         )
     return sorted(files, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
 

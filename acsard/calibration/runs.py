@@ -409,7 +409,7 @@ def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
 
 
 class Block(Struct, frozen=True):
-    """A part of a run."""
+    """A few seconds of a run, the unit of the jackknife."""
 
     run: int
     """Number of the run."""

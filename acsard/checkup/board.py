@@ -52,7 +52,10 @@ class Wire(Protocol):
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Return the pieces received until then with their times, ns. Raises `WireLostError`."""
+        """Return the pieces received until `until_ns`, each with its time, ns.
+
+        Raises `WireLostError`.
+        """
 
 
 class Operator(Protocol):
@@ -80,7 +83,10 @@ KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced",
 
 
 class Board:
-    """One wire. Entering opens it; leaving always sends zeros and then falls silent."""
+    """The board at the end of a wire.
+
+    Entering this context opens the wire. Leaving it always sends zeros and then falls silent.
+    """
 
     def __init__(
         self, wire: Wire, mcu: McuConfig, rate_hz: float, longest_reply: float = LONGEST_REPLY_S

@@ -39,7 +39,7 @@ class Lateness:
             self._seen.append((now_s, late_s))
 
     def since(self, began_s: float) -> float:
-        """Return the largest delay since then, s."""
+        """Return the largest delay that ended at `began_s` or later, s; 0 if there was none."""
         return max((late_s for at_s, late_s in self._seen if at_s >= began_s), default=0.0)
 
 

@@ -228,7 +228,7 @@ def _patience_s(board: Board, told: list[int]) -> float:
 
 
 def channel(board: Board, motor: int) -> Channel:
-    """Turn a motor forth and back."""
+    """Turn a motor forth and back, and return how the encoders moved."""
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
         found = _with_other_comma(board, found)

@@ -167,7 +167,10 @@ def explained(
 
 
 def silence_explained(robot: Client, key: str = "") -> AbstractContextManager[Callable[[], None]]:
-    """Explain why nothing arrives on a key, and each later silence. "" explains only the latter."""
+    """Explain why nothing arrives on a key, and each later silence.
+
+    If `key` is "", only later silences are explained.
+    """
     return explained(lambda: _none_yet(robot, key) if key else "", lambda: _ceased(robot))
 
 

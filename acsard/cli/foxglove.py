@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def loopback(text: str) -> tuple[str, int]:
-    """Return host and port.
+    """Return the host and the port in a loopback address such as `127.0.0.1:8765`.
 
     Raises `UsageError` for a malformed address and for one that other machines can reach.
     """

@@ -13,7 +13,7 @@ from acsard.host.extras import missing
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Declare none."""
+    """Declare no options."""
 
 
 def main(args: argparse.Namespace) -> int:

@@ -243,7 +243,7 @@ def _address(text: str) -> str:
 
 _ADDED = """\
 {place} is for {name}. Add the name to its role in the robot's acsard.toml, and keep the names
-that are there. The lines below have those of {where}; --write FILE changes a file
+that are there. The lines below have the names of {where}; --write FILE changes a file
 itself. Behind a fleet's router leave the lines out, because router.json5 has the roles.
 """
 

@@ -63,7 +63,7 @@ class Follower:
         self._answer: RobotState | None = None
 
     def published(self, state: RobotState, now: float) -> None:
-        """Take a state that arrived unqueried."""
+        """Take a state that the daemon published."""
         self.state, self.last_seen, self.heard = state, now, True
         self.due, self.unreadable = now + self._ask_s, 0
 

@@ -373,7 +373,7 @@ class Client:
         )
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """Convert the error to its documented type.
+        """Return the documented error that stands for `error`.
 
         If no command arrives, the text also names the role of this client's certificate.
         """

@@ -192,7 +192,7 @@ class Handover:
 
     @property
     def held(self) -> bool:
-        """Return whether the daemon would restart with these latches if it were killed now."""
+        """Whether the daemon would restart with these latches if it were killed now."""
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:

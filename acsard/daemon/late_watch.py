@@ -122,7 +122,7 @@ class LateWatch:
     # The control loop's thread calls these methods.
 
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
-        """Take a period whose step began `late_ns` late, after `missed` without a step."""
+        """Take a period whose step began `late_ns` late, after `missed` periods without a step."""
         before, times = self._times, b""
         with suppress(OSError):  # a lateness without its times only has fewer causes
             times = os.pread(self._file, 64, 0) if self._file >= 0 else b""

@@ -130,7 +130,7 @@ class Figure:
 
 
 class LastMinute:
-    """A counter of events in the last minute, in the same slots."""
+    """A counter of events in the last minute, to the 10 s of a slot."""
 
     def __init__(self) -> None:
         self._slots: deque[tuple[int, int]] = deque(maxlen=SLOTS)
@@ -184,7 +184,11 @@ class Stopwatch:
             self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
-        """Record a feedback line, queued for the bus at `told_ns`, None without subscribers."""
+        """Record the delays of a feedback line.
+
+        `told_ns` is the time at which its messages were queued for the bus, or None if no client
+        subscribes to them.
+        """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
             self.figures["mcu_round_trip"].add(at_ns, at_ns - asked_ns)

@@ -83,7 +83,7 @@ class Pace:
 
     @property
     def waits(self) -> bool:
-        """Whether a new command waits for its distance to the line before."""
+        """Whether a new command waits, because the last line has only just left."""
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:

@@ -70,7 +70,7 @@ class Alarm(_Timer):
 
 
 class Ticker(_Timer):
-    """A timer that wakes every period while entered; `take` tells the ended ones."""
+    """A timer that wakes every period while entered; `take` returns the ended periods."""
 
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)

@@ -65,7 +65,7 @@ class Viewer:
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
-        """Take the silence before a message, None for a short one.
+        """Take the silence before a message, ns, or None if it was too short to count.
 
         Return whether messages come so seldom that the robot stops in between.
         """

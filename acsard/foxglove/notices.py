@@ -90,7 +90,7 @@ class Notices:
 
 
 class Objections:
-    """The objection to one viewer's commands. The class is pure."""
+    """Decides when to report why the robot does not follow a viewer. The class is pure."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None

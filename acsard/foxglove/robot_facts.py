@@ -16,7 +16,7 @@ from acsard.host.errors import ReplyError
 
 
 class Facts(Struct, frozen=True):
-    """The configuration, sources and permissions.
+    """The configuration and the sources of a robot, and the permissions of this client.
 
     `config` holds defaults if this program may not read the robot's.
     """
@@ -46,7 +46,7 @@ def key_of(row: Channel, source: str) -> str:
 
 
 def learn(robot: Client) -> Facts:
-    """Query the robot.
+    """Query the robot for its configuration, its sources and the permissions of this client.
 
     Raises the errors of `Client.get`, and `ReplyError` if its version differs.
     """

@@ -45,7 +45,7 @@ START_NS = 15 * NS_PER_S
 
 
 class Silence:
-    """Silence of a peer, judged again and again.
+    """Judges again and again whether a peer has been silent for too long.
 
     A machine or a CPU quota that stops this process too does not count as silence of the peer.
     """

@@ -42,7 +42,7 @@ WORDS: dict[int, str] = {
 
 
 class MendableError(AcsardError):
-    """Base class of these errors."""
+    """Base class of the errors that a person can mend. The text says how."""
 
     code: Exit = Exit.FAILURE
     """Exit code of a subcommand that ends with this error."""

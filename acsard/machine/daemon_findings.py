@@ -103,7 +103,11 @@ class Running(Struct, frozen=True):
 
 
 def asked(config: Config, address: Address) -> Running:
-    """Ask the daemon at this address. `config` is the file's. Raises an `AcsardError`."""
+    """Query the daemon at this address for its configuration, its state and its events.
+
+    `config` is the content of the configuration file. It stands in for the daemon's configuration
+    if this client may not query that. Raises an `AcsardError`.
+    """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
@@ -135,7 +139,7 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
-        yield Finding("configuration", "ok", f"the running daemon ({who}) has that of the file")
+        yield Finding("configuration", "ok", f"the running daemon ({who}) uses that of the file")
         return
     for belongs, level, how, mend in WAYS:
         its = {key: one for key, one in others.items() if belongs(key)}
@@ -155,7 +159,7 @@ def _tables(its: Mapping[str, Difference]) -> str:
 
 
 def answers(endpoint: str) -> bool:
-    """Return whether a program listens there. Raises `UsageError` if it is not an endpoint."""
+    """Return whether a program listens at this endpoint; raise `UsageError` for another text."""
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)
@@ -357,7 +361,10 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the reached daemon, or a finding. Raises `UsageError` if it is not an endpoint."""
+    """Return the answers of the daemon at this address, or a finding that it cannot be reached.
+
+    Raises `UsageError` if the address has no valid endpoint.
+    """
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):

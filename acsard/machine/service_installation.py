@@ -155,7 +155,7 @@ class Remove(Struct, frozen=True):
         return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        """Remove it, and acsard's own directories that become empty."""
+        """Remove the path, and acsard's own directories that become empty."""
         if self._is_directory:
             shutil.rmtree(self.path)
         else:

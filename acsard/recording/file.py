@@ -400,14 +400,20 @@ class Recording:
 
     @property
     def ending(self) -> str:
-        """Why it ended other than by a normal end of the daemon, or "". Read it before."""
+        """How the recording ended, in words, or "" if the daemon ended normally.
+
+        This is known only after `messages` has been read to its end.
+        """
         if not self.ended:
             return UNFINISHED
         return how_it_ends(self.cut, self.why)
 
     @property
     def missing(self) -> str:
-        """The damaged places and the ending in words, or "". Read it before."""
+        """The damaged places and the ending in words, or "" if the recording is whole.
+
+        This is known only after `messages` has been read to its end.
+        """
         places = many(self.damaged, "damaged place is", "damaged places are")
         damaged = f"{places} left out" if self.damaged else ""
         return "; ".join(filter(None, [damaged, self.ending]))

@@ -62,7 +62,7 @@ class Found(NamedTuple):
 
 
 class Search(Struct):
-    """Result of a search."""
+    """The recordings that have steps in a range of time, and the gaps between them."""
 
     found: list[Found] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)

@@ -47,7 +47,7 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A moment, s since 1970. A whole day has two: it begins at `begin` and ends at `end`."""
+    """A day, from `begin` to `end`, or a moment, at which both are equal; s since 1970."""
 
     begin: float
     end: float

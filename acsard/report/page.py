@@ -135,7 +135,7 @@ def escaped(text: str) -> str:
 def page(
     data: ReportData, origin: Origin, library: str, clock: Clock, offset_s: float = 0.0
 ) -> str:
-    """Return the text of the HTML file.
+    """Return the report as the text of one HTML file.
 
     `library` is the code of plotly, and `offset_s` the offset of the local time from UTC, s.
     """

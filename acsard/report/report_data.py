@@ -97,7 +97,7 @@ class Marks:
 
 
 class Driven(Struct):
-    """For how long, and how far, one source drove the robot."""
+    """The time and the distance for which one source drove the robot."""
 
     seconds: float = 0.0
     metres: float = 0.0

@@ -83,7 +83,7 @@ class Prompt(Protocol):
         """Return one of the answers, or None if no person watches the robot."""
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Return when the leg may begin.
+        """Show the text, and wait until the person lets the leg begin.
 
         `by_key` says that a key press is the intended end of the leg.
         """

@@ -172,7 +172,7 @@ class Roster(Fleet):
 
     @property
     def seen(self) -> str:
-        """Number of present robots and where they were found; "" if the robots were named."""
+        """A sentence with the number of visible robots, or "" if the user named the robots."""
         with self._lock:
             here = sum(bool(one.here) for one in self._known.values())
         return seen(self._robot.where.endpoint, here) if ALL in self._ids else ""

@@ -26,7 +26,7 @@ HELP = (
 
 
 class Teleop(Struct, frozen=True):
-    """Everything that is shown."""
+    """Everything that `acsard drive` shows."""
 
     robot_id: str
     endpoint: str

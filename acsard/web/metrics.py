@@ -36,7 +36,7 @@ def text(
     counts: Mapping[str, int],
     refused: Mapping[str, int],
 ) -> str:
-    """Return the whole exposition.
+    """Return all metrics in the text format of Prometheus.
 
     Robot metrics come from the last state, and only while `heard` is true.
     """

@@ -46,7 +46,7 @@ LEAVE_S = 0.3
 
 
 class Wanted(Struct, frozen=True):
-    """Configuration of the server."""
+    """The configuration and the options of the page's server."""
 
     config: Config
     address: Address

@@ -209,7 +209,7 @@ class Greeting(Struct, frozen=True):
 
 
 class Hello(Struct, frozen=True):
-    """The first message, repeated whenever its content changes."""
+    """The first message to a client, repeated whenever its content changes."""
 
     hello: Greeting
 
@@ -260,7 +260,7 @@ class Row(Struct, frozen=True):
 
 
 class Rows(Struct, frozen=True):
-    """All known robots."""
+    """All known robots of the fleet."""
 
     fleet: Sequence[Row]
     note: str

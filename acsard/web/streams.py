@@ -40,7 +40,7 @@ UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 
 
 class Stream:
-    """One key of one robot."""
+    """The newest message on one key of one robot."""
 
     def __init__(self) -> None:
         self._taking = threading.Lock()

@@ -277,7 +277,7 @@ class Viewer:
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._hand.give(owner, frame.source, commander, self._sender, wish):
-            text = f"more than {COMMANDS.hz:g} commands a second of this token"
+            text = f"more than {COMMANDS.hz:g} commands a second with this token"
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:

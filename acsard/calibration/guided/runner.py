@@ -49,7 +49,7 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 
 
 def angle_before(leg: Leg) -> str:
-    """Return the leg after which the angle was measured that this leg alone adds to, or ""."""
+    """Return the earlier leg from whose measured angle this leg alone turns on; "" without one."""
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")
 

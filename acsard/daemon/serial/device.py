@@ -181,7 +181,10 @@ _JOIN = (
 
 
 def require(path: str) -> None:
-    """Raise `refusal` unless the path is a character device. The daemon would wait for it."""
+    """Raise the error of `refusal` unless the path is a character device.
+
+    Tools call this. The daemon does not, because it waits for a device that is not there.
+    """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):
             raise OSError(errno.ENOTTY, "not a character device")

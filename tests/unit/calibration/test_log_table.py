@@ -187,7 +187,7 @@ def test_what_others_write_is_the_same_table(how: str) -> None:
         (written(";").replace(".", "'").encode(), "write numbers with a point"),
         (written().replace("0.", "12:00:00.").encode(), "a date, but t must be in s"),
         (written(" ").encode(), "no commas between"),
-        (written().replace("yaw_rate", "gyro_z").encode(), "it must name yaw_rate"),
+        (written().replace("yaw_rate", "gyro_z").encode(), "the header must name yaw_rate"),
         (written().replace("t,l", "time_ms,l").encode(), "is time_ms it? rename it t, in s"),
         (b"%time,field.left,field.right\n1,2,3\n", "is time it? rename it t"),
         (b"", "it is empty"),
