@@ -472,10 +472,9 @@ def test_the_gateway_grants_each_role_its_permissions_and_the_daemon_everything(
                 assert gateway.lets("local", message, key, flow)
 
 
-@each("page", ["web", "systemd", "zenoh"])
 @each("role", ROLES)
-def test_each_page_names_the_services_of_a_role(page: str, role: Role) -> None:
-    text = (Path(__file__).parents[4] / "deploy" / page / "README.md").read_text()
+def test_the_page_about_access_names_the_services_of_a_role(role: Role) -> None:
+    text = (Path(__file__).parents[4] / "deploy" / "systemd" / "README.md").read_text()
     (row,) = re.findall(rf"^\| {role} \| .*$", text, re.M)
     named = {verb for verb in SERVICES if re.search(rf"[`*]{verb}[`*]", row)}
     assert named == {verb for verb, least in SERVICE_ROLES.items() if least == role}
