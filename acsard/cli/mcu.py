@@ -14,7 +14,7 @@ from acsard.checkup.board import Wire
 from acsard.checkup.checkup_report import changes, report, summary, withheld
 from acsard.checkup.findings import Finding
 from acsard.cli.common import add_config, add_outcome, load, require_asking
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.daemon.serial.blocking import BlockingPort
@@ -24,8 +24,6 @@ from acsard.host.processes import master_of
 from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.prompt import Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
-
-SIMULATOR = "sim"
 
 DESCRIPTION = """\
 Test the microcontroller on your own robot with its wheels lifted. The tool finds its protocol and

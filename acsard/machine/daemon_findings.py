@@ -21,7 +21,7 @@ from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config
 from acsard.core.config.validation import write
 from acsard.core.formatting import listed, many
-from acsard.core.link.link_diagnosis import BUSY, is_ours
+from acsard.core.link.link_diagnosis import BUSY, LOST, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import (
     BatterySummary,
@@ -168,10 +168,6 @@ def answers(endpoint: str) -> bool:
     except OSError:
         return False
     return True
-
-
-LOST = 0.02
-"""Largest fraction of lines that may be lost. A sound link loses none."""
 
 
 def link(running: Running) -> Iterator[Finding]:

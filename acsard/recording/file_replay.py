@@ -430,11 +430,11 @@ class EventCopies:
         self._events: list[TimelineEntry] = []
         """The events of the last batch of steps."""
         self._copies: list[TimelineEntry] = []
-        """The copies that followed that batch."""
+        """The copies that followed the last batch."""
         self._number: int | None = None
-        """Number of the step after that batch."""
+        """Number of the step that follows the last batch."""
         self._damaged = 0
-        """Number of damaged places before that batch."""
+        """Number of damaged places before the last batch."""
 
     def batch(self, steps: list[Step]) -> None:
         """Take a batch of steps; its copies follow."""

@@ -11,6 +11,7 @@ from collections.abc import Awaitable, Callable, Hashable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 from acsard.client import Client
+from acsard.core.incoming.queries import BUSY
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.schema import ServiceReply
@@ -40,8 +41,6 @@ end, together with all others of that interval."""
 ANSWER_S = 8.0
 """Time limit for an answer from the bus. The bus client gives up sooner, so the caller gets its
 error message."""
-
-BUSY = "busy: too many queries at once; ask again"
 
 T = TypeVar("T")
 

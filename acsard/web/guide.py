@@ -20,6 +20,7 @@ import msgspec
 from msgspec import Struct
 
 from acsard.calibration.guided.drive_plan import NEEDS, SIMULATED
+from acsard.core.config.settings import SIMULATOR
 from acsard.host import clock
 from acsard.host.child import acsard, running
 from acsard.host.errors import WORDS, Exit
@@ -31,8 +32,6 @@ from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, 
 
 PATIENCE_S = 6.0
 """Time for the child to send zeros and exit after an interrupt, before it is killed."""
-
-SIMULATOR = "sim"
 
 NO_DEVICE = (
     "No serial port is visible from here. Is the board plugged in? If the page runs as a "

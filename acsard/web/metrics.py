@@ -14,7 +14,7 @@ from acsard.core.link.link_state import State
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import WHATS, warnings
 from acsard.core.motion.modes import Mode
-from acsard.core.values import Event
+from acsard.core.values import WHEELS, Event
 from acsard.web.callers import Reason
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -23,8 +23,6 @@ Kind = Literal["gauge", "counter"]
 
 Sample = tuple[Mapping[str, str], float]
 """The labels and the value of one sample."""
-
-WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 
 
 def text(
