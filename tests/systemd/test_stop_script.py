@@ -202,7 +202,7 @@ def test_a_port_that_takes_nothing_does_not_hold_it_up(tmp_path: Path, wire: Wir
 def test_a_device_that_is_not_a_port_is_reported(tmp_path: Path) -> None:
     ended = stop(config(tmp_path, '[mcu]\nport = "/dev/null"\n'))
     assert ended.code == 0
-    assert "cannot set up all of /dev/null" in ended.err
+    assert "cannot set every option of /dev/null" in ended.err
 
 
 def processor_s() -> float:
