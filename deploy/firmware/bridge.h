@@ -1,5 +1,5 @@
-/* What one H-bridge is told, tick by tick: it never changes direction but at rest, and never gets
- * full voltage at once. Falling to zero is immediate. */
+/* The duty of one H-bridge, one control tick at a time. The bridge changes its direction only at rest,
+ * and its voltage rises slowly. It falls to zero at once. */
 #ifndef BRIDGE_H
 #define BRIDGE_H
 
@@ -9,13 +9,13 @@
 struct bridge {
     int16_t duty;    /* 0 to PWM_TOP */
     int8_t direction; /* 1 forward, -1 reverse, 0 off: both inputs low */
-    uint8_t rest;    /* ticks it must still stay at zero before another direction */
+    uint8_t rest;    /* remaining ticks at zero before it may change its direction */
 };
 
-/* Off at once. */
+/* Switches the bridge off at once. */
 void bridge_off(struct bridge *bridge);
 
-/* One control tick towards `wanted`, -PWM_TOP to PWM_TOP. True when it delivers that in full. */
+/* Takes one control tick towards `wanted`, -PWM_TOP to PWM_TOP. Returns true if it reaches that. */
 bool bridge_step(struct bridge *bridge, int16_t wanted);
 
 #endif

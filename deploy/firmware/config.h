@@ -1,7 +1,7 @@
 /* Everything that depends on the robot: pins, encoders, motors, gains, times, the serial line.
  *
- * Written for the ATmega2560 at 16 MHz (Arduino Mega 2560). README.md says what to measure and
- * which of these to change; nothing else needs a change for another robot with the same wiring.
+ * It is written for the ATmega2560 at 16 MHz (Arduino Mega 2560). README.md says which values to
+ * measure and change. No other file needs a change for another robot with the same wiring.
  */
 #ifndef CONFIG_H
 #define CONFIG_H
@@ -15,9 +15,9 @@
 #endif
 #define COMMAND_WATCHDOG_MS 300 /* without a valid line for this long the motors stop; at most 500 */
 #ifndef REQUIRE_CHECK
-#define REQUIRE_CHECK 0        /* 1: once a checked line was taken, plain ones are refused until reset,
-                                * but for a stop (all zero), which is never refused. A host restarted
-                                * with link_check = "off" then can stop and cannot drive. */
+#define REQUIRE_CHECK 0        /* 1: after the first checked line, plain lines are refused until a reset,
+                                * except a stop (all zero), which is never refused. A host restarted
+                                * with link_check = "off" can then stop the robot but not drive it. */
 #endif
 
 /* The wheels. Bit 0 is motor a, bit 3 motor d. */
@@ -45,7 +45,7 @@
 #define RISE_TICKS 10          /* control ticks from zero to full duty; falling is immediate */
 #define REVERSE_TICKS 2        /* control ticks at zero duty before a bridge changes direction */
 
-/* What no healthy wheel does: see supervise.h. All motors are off then, until the host is silent. */
+/* Behaviour that no healthy wheel shows (supervise.h). All motors are then off until the host is silent. */
 
 #define RUNAWAY_DUTY 0.75f     /* of full voltage, against which it turns ... */
 #define RUNAWAY_MS 150         /* ... without getting slower for this long */
@@ -111,7 +111,7 @@
 #define CONTACTS_IN PINC       /* Mega pins 37, 36 to 33, 32 */
 #define CONTACTS_PULL_UPS PORTC
 
-/* What follows is derived. */
+/* The values below follow from those above. */
 
 #define HAS_CONTACTS (ESTOP_INPUT || BUMPER_INPUTS || DRIVER_INPUT)
 #define HAS_ANALOGS (BATTERY_TOP_OHM || CURRENT_UV_PER_A)

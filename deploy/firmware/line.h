@@ -1,6 +1,6 @@
-/* Serial lines: bytes -> line -> command, and reading -> reply. Knows nothing of the hardware.
+/* Serial lines: bytes become a line and a command, and a reading becomes a reply. Pure logic.
  *
- * All or nothing: what is not a whole valid line changes nothing.
+ * A line counts as a whole or not at all: an invalid line changes nothing.
  */
 #ifndef LINE_H
 #define LINE_H
@@ -8,33 +8,33 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#define LINE_MAX 128  /* bytes with the line end; the longest line is under 70, more is noise */
+#define LINE_MAX 128  /* bytes with the line end; the longest valid line has under 70 */
 #define REPLY_MAX 64  /* bytes of the longest reply with CR LF: 62 */
-#define IDENTITY_MAX 128 /* the host takes no longer line; with all counters full it has 126 */
+#define IDENTITY_MAX 128 /* the host accepts no longer line; with full counters it has 126 */
 #define LETTERS "abcd"
 
 struct line_reader {
     char text[LINE_MAX];
     uint8_t length;
     bool discarding;
-    uint16_t too_long; /* lines thrown away whole, up to 65535 */
+    uint16_t too_long; /* number of lines that were too long, up to 65535 */
 };
 
-/* Takes a byte. Returns the length of the line it completes, whose text (without its end) stays in
- * `reader->text` until the next call; 0 when it completes none. Empty lines are none. */
+/* Takes a byte. If it completes a line, returns the line's length; the text, without the line end, stays
+ * in `reader->text` until the next call. Otherwise returns 0, also for an empty line. */
 uint8_t line_feed(struct line_reader *reader, uint8_t byte);
 
 struct command {
     int16_t hundredths[4]; /* of a rad/s, motors a to d */
-    bool checked;           /* it had a right suffix, so it is answered with one */
-    bool sample;            /* ... which asks for the sample fields */
+    bool checked;           /* the line had a valid suffix, so the reply gets one too */
+    bool sample;            /* the suffix asks for the sample fields */
     uint8_t sequence;
 };
 
-/* True and `*out` set when the line is a valid command; else false and `*out` untouched. */
+/* Returns true and sets `*out` if the line is a valid command; otherwise leaves `*out` as it is. */
 bool line_parse(const char *text, uint8_t length, struct command *out);
 
-/* True when the line asks who we are. */
+/* Returns true if the line asks for the identification. */
 bool line_asks(const char *text, uint8_t length);
 
 struct reading {
@@ -46,19 +46,19 @@ struct reading {
 /* Writes the answer to `command` with CR LF, no terminator; returns its length, at most REPLY_MAX. */
 uint8_t line_reply(char *out, const struct command *command, const struct reading *reading);
 
-/* What became of the lines since boot, and of the wheels. */
+/* Counters since boot. */
 struct record {
-    uint32_t lines;    /* commands executed; begins again after 2^32: 497 days at 100 Hz */
-    uint16_t refused;  /* lines that are neither a command taken nor a question; up to 65535 */
-    uint16_t trips;    /* silences that cut motors which had voltage; up to 65535 */
-    uint16_t runaways; /* how often a wheel that did not do as told has cut them; up to 65535 */
+    uint32_t lines;    /* executed commands; restarts at 0 after 2^32, which is 497 days at 100 Hz */
+    uint16_t refused;  /* lines that are neither an executed command nor a question; up to 65535 */
+    uint16_t trips;    /* silences of the host that stopped driven motors; up to 65535 */
+    uint16_t runaways; /* times that a wheel which did not obey has stopped all motors; up to 65535 */
 };
 
-/* Adds one, but stays at the largest: a counter that wrapped would say that all is well. */
+/* Adds one, except at the largest value: a counter that wraps to 0 would hide its events. */
 void count_up(uint16_t *counter);
 
-/* Writes who we are, our record and why we were reset with CR LF; returns its length. For want of room
- * `refused` and `trips` say 999 for more than that, and `runaways` 9. */
+/* Writes the identification line with the counters, the cause of the last reset and CR LF. Returns its
+ * length. The line has room for at most 999 in `refused` and `trips`, and for at most 9 in `runaways`. */
 uint8_t line_identity(char *out, const struct record *record, const char *reset);
 
 #endif

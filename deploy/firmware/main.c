@@ -1,9 +1,8 @@
 /* The robot's microcontroller: a line comes in, four wheels turn at its speeds, a line goes out.
  *
- * It keeps the motors stopped from boot until a whole valid line came, stops them when none came for
- * COMMAND_WATCHDOG_MS, when a wheel runs away and when the emergency stop is pressed, and is reset by
- * its own hardware watchdog when this loop or the control in it hangs; after a reset they are stopped
- * again.
+ * After boot the motors stand until a whole valid line has arrived. They are stopped if no line arrives
+ * for COMMAND_WATCHDOG_MS, if a wheel runs away, and while the emergency stop is pressed. If this loop
+ * or its control hangs, the hardware watchdog resets the board, and the motors stand again.
  *
  * The interrupts only count edges, milliseconds and bytes; all else happens in the loop below, so
  * nothing but its own data needs a guard.
@@ -24,8 +23,8 @@
 #include "supervise.h"
 #include "watchdog.h"
 
-/* A reading is sent again within REPORT_MS, and renewed without being asked after RENEW_MS, so that
- * the speed in a reply is of a window of 5 to 25 ms, whatever the host's rate. */
+/* Replies within REPORT_MS repeat a reading. After RENEW_MS it is renewed without a line of the host. So
+ * the speed in a reply covers 5 to 25 ms at any rate of the host. */
 #define REPORT_MS 5
 #define RENEW_MS 20
 
@@ -37,7 +36,7 @@ static struct {
     bool limited;
 } wheels[MOTORS];
 
-/* What the wheels shall do, hundredths of a rad/s. The bench finds it by its name. */
+/* Commanded speeds of the wheels, hundredths of a rad/s. The bench finds this array by its name. */
 static int16_t targets[MOTORS] __attribute__((used));
 
 static struct watchdog watchdog;
@@ -45,14 +44,14 @@ static struct snapshot latest;
 static struct reading report;
 static uint32_t report_ms, control_ms;
 static bool checked_seen, stop_seen; /* since boot */
-static bool astray; /* a wheel did not do as told: off until the host is silent */
+static bool astray; /* a wheel did not obey: motors off until the host is silent */
 static bool halted; /* the emergency stop was pressed: off until it is released and a stop came */
 static struct status status;
 static struct line_reader reader;
 static struct record record;
 static uint8_t reset_flags __attribute__((section(".noinit"))); /* set before the rest is zeroed */
 
-/* The hardware watchdog survives the reset it causes, with 16 ms: off before anything else. */
+/* The hardware watchdog stays on after the reset that it causes, with 16 ms. Switch it off first. */
 void watchdog_off(void) __attribute__((naked, used, section(".init3")));
 void watchdog_off(void)
 {
@@ -61,7 +60,7 @@ void watchdog_off(void)
     wdt_disable();
 }
 
-/* A bootloader may have cleared the flags. With the power come others too. */
+/* A bootloader may have cleared the flags. Switching the power on sets other flags too. */
 static const char *reset_cause(void)
 {
     if (reset_flags & _BV(PORF))
@@ -160,8 +159,8 @@ static void look_at_inputs(void)
         halted = true;
 }
 
-/* Only behind all replies: so a status line never takes the place of one, and a reply waits for one
- * status line at most. */
+/* A status line is sent only after all replies, so it never takes the place of a reply, and a reply waits
+ * for one status line at most. */
 static void report_inputs(void)
 {
     char text[STATUS_MAX];
@@ -194,7 +193,7 @@ static void on_millisecond(void)
         if (latest.milliseconds - control_ms >= CONTROL_MS)
             control_ms = latest.milliseconds; /* late: go on from here, do not catch up */
         control(allowed);
-        wdt_reset(); /* only here: neither a dead loop nor dead control may live on */
+        wdt_reset(); /* only here, so that a hanging loop or control causes a reset */
     }
 }
 
@@ -208,13 +207,13 @@ static bool is_stop(const struct command *command)
     return true;
 }
 
-/* After a boot nothing counts but a stop, until one came: a host that has not noticed the reset goes
- * on asking for speeds, and the robot would lurch on with the next line. It is told of the reset
- * instead, in case the line we booted with was lost. */
+/* After a boot only a stop is accepted, until one has arrived. A host that has not noticed the reset goes
+ * on commanding speeds, and the robot would lurch with its next line. The board sends the identification
+ * again instead, in case the one after boot was lost. */
 static bool takes(const struct command *command)
 {
     if (is_stop(command))
-        return true; /* whoever says it, and however */
+        return true; /* from any host and in any form */
     if (REQUIRE_CHECK && checked_seen && !command->checked)
         return false;
     if (!stop_seen)
@@ -243,13 +242,13 @@ static void on_command(const struct command *command)
 #ifdef TEST_HANG
 #include <util/delay.h>
 
-/* Never in a real build: the ways to hang that the hardware watchdog must catch, and one it must not. */
+/* For tests only: the kinds of hang that the hardware watchdog must catch, and one that it must not. */
 static void hang(const char *text, uint8_t length)
 {
     if (length != 2 || text[0] != '!')
         return;
     if (text[1] == 'c')
-        TIMSK0 = 0; /* the clock: no control tick any more, the loop goes on */
+        TIMSK0 = 0; /* stop the clock: no more control ticks, but the loop goes on */
     if (text[1] == 'p')
         _delay_ms(60.0);
     if (text[1] == 'i')
@@ -275,7 +274,7 @@ static void on_line(const char *text, uint8_t length)
     }
 }
 
-/* Sleep is left by any interrupt; testing and falling asleep cannot be split by one. */
+/* Any interrupt ends the sleep. None can come between the test and the begin of the sleep. */
 static void wait(void)
 {
     cli();

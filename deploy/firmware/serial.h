@@ -1,4 +1,4 @@
-/* UART0 with a ring either way. Main loop only, but for its own interrupts. */
+/* UART0 with a ring buffer in each direction. Only the main loop and its own interrupts use it. */
 #ifndef SERIAL_H
 #define SERIAL_H
 
@@ -7,18 +7,18 @@
 
 void serial_start(void);
 
-/* The next byte received. A damaged one is a NUL, which no line holds; where bytes were lost there are
- * a NUL and a line end, so that the pieces do not make a line together. */
+/* Takes the next received byte. A damaged byte becomes a NUL, which no line contains. Lost bytes become a
+ * NUL and a line end, so that the pieces around them do not form a line. */
 bool serial_read(uint8_t *byte);
 
-/* Interrupts off: is there nothing to read? */
+/* Returns whether there is nothing to read. Call it with interrupts off. */
 bool serial_idle(void);
 
-/* Sends all of it, or nothing when the host has not taken the last replies off the wire yet: half a
- * line would be noise, and an old one no use. */
+/* Sends the whole text, or nothing while too many bytes still wait to be sent: half a line would be
+ * invalid, and an old reply useless. */
 bool serial_write(const char *text, uint8_t length);
 
-/* Is all that was written on its way? */
+/* Returns whether everything that was written has left the ring buffer. */
 bool serial_sent(void);
 
 #endif

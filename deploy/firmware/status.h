@@ -13,9 +13,9 @@
 #define CONTACTS 6    /* bits of their port: 0 emergency stop, 1 to 4 bumpers, 5 driver fault */
 #define ANALOGS 2     /* 0 battery, 1 current */
 
-/* Samples of a contact. Three that are pressed press it. Only 20 in a row that are free release it, and
- * only those make the next press need three again: so a contact that bounces, or a loose wire, counts
- * as pressed, and a single disturbance does not. */
+/* Number of samples that change a contact. Three pressed samples make it count as pressed. Only 20 free
+ * samples in a row release it, and only after them the next press needs three samples again. So a
+ * bouncing contact or a loose wire counts as pressed, and a single disturbance does not. */
 #define PRESS_SAMPLES 3
 #define FREE_SAMPLES 20
 
@@ -34,7 +34,7 @@ struct status {
     int16_t sent;                    /* the emergency stop and the bumpers in the last one; -1: none yet */
 };
 
-/* As after boot: nothing is known of the inputs. */
+/* Sets the state after boot: the inputs are unknown. */
 void status_start(struct status *status);
 
 /* A sample of all contacts: the levels of their pins, 1 is high. Call it once a millisecond. */
@@ -43,11 +43,11 @@ void status_contacts(struct status *status, uint8_t levels);
 /* A reading of an analog input, 0 to 1023. */
 void status_reading(struct status *status, uint8_t analog, uint16_t value);
 
-/* Is the emergency stop pressed? Not before that is known, 20 ms after boot. */
+/* Returns whether the emergency stop is pressed; false until it is known, 20 ms after boot. */
 bool status_stopped(const struct status *status);
 
-/* Writes the line that is due with CR LF, no terminator, and takes it as sent. Returns its length, at
- * most STATUS_MAX; 0 when none is due. */
+/* Writes the status line that is due, with CR LF and without a terminator, and counts it as sent. Returns
+ * its length, at most STATUS_MAX, or 0 if none is due. */
 uint8_t status_line(struct status *status, uint32_t now_ms, char *out);
 
 #endif

@@ -1,15 +1,16 @@
-/* Does a wheel do what its motor is told? Pure logic, a control tick at a time.
+/* Decides whether a wheel obeys its motor. Pure logic, one control tick at a time.
  *
- * A healthy motor pulls the wheel the way of its voltage. Two things it cannot do:
+ * A motor pulls a wheel in the direction of its voltage. A healthy wheel does neither of these:
  *
- * - turn against RUNAWAY_DUTY of full voltage for RUNAWAY_MS without getting slower. So turns a wheel
- *   whose encoder or motor is connected the wrong way round, faster and faster, fed by its own control:
- *   even when it shall stand, once it was touched. For a healthy wheel to do so, a force of over three
- *   quarters of what stalls its motor would have to push it, for all that time: it brakes down any
- *   slope it can climb. A wheel that is being reversed turns against its voltage too, but gets slower.
- * - stand at full voltage for STUCK_MS, but for a count or two. So seems to do a wheel whose encoder is
- *   dead, or has one dead channel, and so does one that is blocked: neither may be fed for ever. A
- *   robot that pushes against a wall is stopped by its host before (`fault_time`, 0.5 s), or gives way.
+ * - It turns against at least RUNAWAY_DUTY of full voltage for RUNAWAY_MS without getting slower. This
+ *   is a wheel whose encoder or motor is connected the wrong way round: once it is touched, its own
+ *   control makes it faster and faster, even if it shall stand. A healthy wheel does this only if a
+ *   force of over three quarters of its motor's stall force pushes it for all that time. That does not
+ *   happen on a slope that the robot can climb. A wheel that is being reversed turns against its
+ *   voltage too, but gets slower.
+ * - It stands at full voltage for STUCK_MS, except for a count or two. This is a wheel that is blocked,
+ *   or one whose encoder is dead or has a dead channel. Its motor must not get voltage for ever. If a
+ *   robot pushes against a wall, its host stops it earlier (`fault_time`, 0.5 s), or the wheels slip.
  */
 #ifndef SUPERVISE_H
 #define SUPERVISE_H
@@ -18,16 +19,16 @@
 #include <stdint.h>
 
 struct supervisor {
-    uint16_t against; /* ticks it has turned against its voltage without getting slower */
-    uint16_t stuck;   /* ticks it has stood at full voltage */
-    uint16_t count;   /* where it stood when that began */
-    float size;       /* how fast it turned when the other began, rad/s */
+    uint16_t against; /* ticks for which it has turned against its voltage without getting slower */
+    uint16_t stuck;   /* ticks for which it has stood at full voltage */
+    uint16_t count;   /* encoder count at the first of the `stuck` ticks */
+    float size;       /* speed at the first of the `against` ticks, rad/s */
 };
 
 void supervise_start(struct supervisor *supervisor);
 
-/* One control period: the duty it really had, -PWM_TOP to PWM_TOP; what it did. True when all motors
- * must be switched off. */
+/* Takes one control period: the duty that the motor really had, -PWM_TOP to PWM_TOP, then the speed and
+ * the count of its wheel. Returns true if all motors must be switched off. */
 bool supervise_step(struct supervisor *supervisor, int16_t duty, float speed, uint16_t count);
 
 #endif
