@@ -107,7 +107,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         await _until(leaving, parts, page, wanted)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
-        await asyncio.to_thread(parts.hand.outbox.flush, LEAVE_S)
+        await asyncio.to_thread(parts.commands.outbox.flush, LEAVE_S)
 
 
 async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
@@ -116,7 +116,7 @@ async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wante
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(parts.robots.run()),
         asyncio.create_task(_tidy(page)),
-        asyncio.wrap_future(parts.hand.outbox.dead),
+        asyncio.wrap_future(parts.commands.outbox.dead),
     ]
     if wanted.supervised:
         work.append(asyncio.create_task(_held(leaving)))

@@ -67,7 +67,7 @@ FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
 first report. Without it each look at the robots began with an empty list."""
 
 
-class Hand:
+class ViewerCommands:
     """Puts the newest velocity command of each viewer on the bus.
 
     A command is sent once, with the stamp of its sender, or it is dropped. The server repeats
@@ -122,7 +122,7 @@ class Parts:
 
     def __init__(self, robots: Robots, guide: Guide, counts: Counts) -> None:
         self.robots, self.guide, self.counts = robots, guide, counts
-        self.hand, self.fleet = Hand(lambda: robots.client, counts), Fleet(robots)
+        self.commands, self.fleet = ViewerCommands(lambda: robots.client, counts), Fleet(robots)
         self.calls = Calls(robots, guide.stop, self.fleet.sees)
 
 
@@ -139,7 +139,7 @@ class Viewer:
         camera: bool,
     ) -> None:
         self.who, self._camera = who, camera
-        self._robots, self._hand, self._calls = parts.robots, parts.hand, parts.calls
+        self._robots, self._commands, self._calls = parts.robots, parts.commands, parts.calls
         self._fleet, self._guide, self._counts = parts.fleet, parts.guide, parts.counts
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
@@ -276,7 +276,7 @@ class Viewer:
         wish = Wish(Twist(frame.cmd.linear_x, frame.cmd.angular_z), stamp_ns, frame.steady)
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
-        if not self._hand.give(owner, frame.source, commander, self._sender, wish):
+        if not self._commands.give(owner, frame.source, commander, self._sender, wish):
             text = f"more than {COMMANDS.hz:g} commands a second with this token"
             self._out.refuse("cmd", "too_fast", text)
 
@@ -287,7 +287,7 @@ class Viewer:
         """
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
-            self._hand.outbox.release(commander, timeouts.get(source, LONGEST_S))
+            self._commands.outbox.release(commander, timeouts.get(source, LONGEST_S))
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":

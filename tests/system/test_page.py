@@ -1038,15 +1038,15 @@ def test_a_first_look_is_small_and_the_second_one_smaller(page: Phone, tmp_path:
     assert second.ms < 15 * bare_ms + 500.0
 
 
-HAND = """import('/page/hand.js').then(({Hand, ZERO, twist, objection}) => {
+COMMANDER = """import('/page/commander.js').then(({Commander, ZERO, twist, objection}) => {
     const ours = {name: 'teleop', waits_for: ''};
     const driving = {mode: 'driving', source: 'teleop', sender: 'me', reason: '', sources: [ours]};
     const ready = {...driving, mode: 'ready', source: '', sender: '', reason: 'no commands'};
     const stopped = {...ready, mode: 'stopped', reason: 'stopped by request'};
     const out = [];
-    const hand = new Hand();
+    const commander = new Commander();
     const look = (now, state) => {
-        const {send, ended} = hand.look(now, state, now, 'teleop', 'me');
+        const {send, ended} = commander.look(now, state, now, 'teleop', 'me');
         out.push([send ? send.linear_x : null, ended ?? null]);
     };
     SCRIPT
@@ -1054,9 +1054,9 @@ HAND = """import('/page/hand.js').then(({Hand, ZERO, twist, objection}) => {
 })"""
 
 
-def by_hand(page: Phone, script: str) -> list[Any]:
+def commanded(page: Phone, script: str) -> list[Any]:
     """Run the page's pure part in the browser and return its results."""
-    return list(page.browser.js(HAND.replace("SCRIPT", script)))
+    return list(page.browser.js(COMMANDER.replace("SCRIPT", script)))
 
 
 STOPPING = """(async () => {
@@ -1135,12 +1135,12 @@ def test_a_page_that_is_hidden_says_its_zero_once(page: Phone) -> None:
 
 
 def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Phone) -> None:
-    script = """hand.press(0); hand.wish(0.2, 0);
+    script = """commander.press(0); commander.wish(0.2, 0);
         for (const now of [0, 10, 20, 40]) look(now, ready);
         for (let now = 50; now < 260; now += 10) look(now, driving);
-        out.push([hand.release()?.linear_x, null], [hand.release(), null]);
+        out.push([commander.release()?.linear_x, null], [commander.release(), null]);
         look(270, driving);"""
-    told = by_hand(page, script)
+    told = commanded(page, script)
     assert told[:4] == [[0, None], [None, None], [0, None], [0, None]]
     sent = [one[0] for one in told[4:25]]
     assert set(sent) == {0.2, None}
@@ -1151,14 +1151,14 @@ def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Ph
 @pytest.mark.parametrize(
     ("script", "why"),
     [
-        ("hand.press(0); look(0, ready); look(1100, ready)", "this page was suspended"),
-        ("hand.press(0); look(0, stopped)", "stopped by request"),
+        ("commander.press(0); look(0, ready); look(1100, ready)", "this page was suspended"),
+        ("commander.press(0); look(0, stopped)", "stopped by request"),
         (
-            "hand.press(0); for (let now = 0; now <= 2100; now += 100) look(now, null)",
+            "commander.press(0); for (let now = 0; now <= 2100; now += 100) look(now, null)",
             "nothing is received",
         ),
         (
-            "hand.press(-1); look(0, driving);"
+            "commander.press(-1); look(0, driving);"
             "for (let now = 100; now <= 600; now += 100)"
             " look(now, {...driving, sender: 'other'})",
             "other drives",
@@ -1168,7 +1168,7 @@ def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Ph
 def test_a_hand_that_is_not_followed_lets_go_and_says_why(
     page: Phone, script: str, why: str
 ) -> None:
-    told = by_hand(page, script)
+    told = commanded(page, script)
     assert told[-1][0] == 0
     assert why in json.dumps(told[-1][1])
     assert all(one[1] is None for one in told[:-1])
@@ -1177,7 +1177,7 @@ def test_a_hand_that_is_not_followed_lets_go_and_says_why(
 def test_a_robot_that_may_only_turn_is_turned_slowly(page: Phone) -> None:
     for linear, turn in ((1, -0.8), (0, -0.4)):
         script = f"out.push(...twist(1, 0, 0.2, {{linear: {linear}, angular: 4}}))"
-        assert by_hand(page, script)[1] == pytest.approx(turn)
+        assert commanded(page, script)[1] == pytest.approx(turn)
 
 
 READ = """import('/page/settings.js').then(({read}) => [

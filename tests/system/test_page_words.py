@@ -66,7 +66,7 @@ def test_a_page_that_has_shown_no_stop_releases_none(tmp_path: Path, browser: Br
             daemon.signal(signal.SIGCONT)
 
 
-STILL = """import('/page/hand.js').then(({still}) => still(
+STILL = """import('/page/commander.js').then(({still}) => still(
     {mode: MODE, link: 'up', source: SOURCE, sender: 'joy/0123456789abcdef', sources: SOURCES},
     'teleop', 'here/0123456789abcdef'))"""
 

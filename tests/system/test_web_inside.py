@@ -92,7 +92,7 @@ async def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: 
             await asyncio.sleep(0.01)
         await ours.say(ping=1)
         await asyncio.sleep(0.2)
-        inside.parts.hand.outbox.flush(PATIENCE_S)
+        inside.parts.commands.outbox.flush(PATIENCE_S)
         assert inside.counts.all() == before
         wire.abort()
 
@@ -203,7 +203,7 @@ async def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_
 async def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
     address = Address("tcp/127.0.0.1:1", "acsar", "")
     wanted = Wanted(Config(), address, (), "", tmp_path)
-    inside.parts.hand.outbox.dead.set_exception(MemoryError("no room"))
+    inside.parts.commands.outbox.dead.set_exception(MemoryError("no room"))
     with pytest.raises(MemoryError):
         await _until(asyncio.Event(), inside.parts, inside.page, wanted)
 

@@ -1,8 +1,8 @@
-// Connects stick, keys and gamepad to one hand. The robot stops when the operator's finger or view leaves the
+// Connects stick, keys and gamepad to one commander. The robot stops when the operator's finger or view leaves the
 // control.
 
 import { awake } from "./awake.js";
-import { Hand, twist, ZERO } from "./hand.js";
+import { Commander, twist, ZERO } from "./commander.js";
 
 export const SOURCE = "teleop"; // a person; a program is "app", which has a lower priority
 const LOOK = 10;
@@ -16,7 +16,7 @@ const STRANGE =
   "this gamepad does not drive, because the browser does not know its axes. Try the gamepad's mode switch (X, XInput) or another browser";
 
 export class Drive {
-  #hand = new Hand();
+  #commander = new Commander();
   #link;
   #told;
   #timer = null;
@@ -46,7 +46,7 @@ export class Drive {
   }
 
   get held() {
-    return this.#hand.held;
+    return this.#commander.held;
   }
 
   /** Whether a gamepad is connected that does not drive. */
@@ -59,18 +59,18 @@ export class Drive {
     this.#by = this.#pointer = null;
     this.#pressed.clear();
     this.#show(0, 0);
-    const zero = this.#hand.release();
+    const zero = this.#commander.release();
     if (!zero) return;
     this.#send(zero);
     this.#end(why);
   }
 
   #press(by) {
-    if (!this.allowed || this.barred || !this.shown || this.#hand.held) return;
+    if (!this.allowed || this.barred || !this.shown || this.#commander.held) return;
     clearTimeout(this.#again);
     this.#by = by;
     this.#told("");
-    this.#hand.press(performance.now());
+    this.#commander.press(performance.now());
     this.stick.classList.add("held");
     awake("stick", true);
     this.#timer = setInterval(() => this.#look(), LOOK);
@@ -79,9 +79,9 @@ export class Drive {
 
   /** Show whether the robot follows this page. While another sender drives, the ring is not blue. */
   #look() {
-    this.stick.classList.toggle("follows", this.#hand.phase === "driving");
-    this.#hand.wish(...twist(...this.#push, this.limit, this.limits));
-    const { send, ended } = this.#hand.look(performance.now(), this.state, this.heard, SOURCE, this.sender);
+    this.stick.classList.toggle("follows", this.#commander.phase === "driving");
+    this.#commander.wish(...twist(...this.#push, this.limit, this.limits));
+    const { send, ended } = this.#commander.look(performance.now(), this.state, this.heard, SOURCE, this.sender);
     if (send) this.#send(send);
     if (ended === undefined) return;
     this.#by = this.#pointer = null;
@@ -158,7 +158,7 @@ export class Drive {
     this.stick.setPointerCapture(event.pointerId);
     this.#move(event);
     this.#press("stick");
-    if (!this.#hand.held) this.release();
+    if (!this.#commander.held) this.release();
   }
 
   /** A mouse reports a change of a second button by a move event, so check the buttons on each move. */

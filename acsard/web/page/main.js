@@ -4,7 +4,7 @@ import { barred, hint, invited, permit, refusal } from "./access.js";
 import { Camera } from "./camera.js";
 import { Drive, SOURCE } from "./drive.js";
 import { Guide } from "./guide.js";
-import { boarded, driving, objection, still } from "./hand.js";
+import { boarded, driving, objection, still } from "./commander.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Minute } from "./plots.js";

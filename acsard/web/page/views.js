@@ -1,6 +1,6 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
-import { boarded } from "./hand.js";
+import { boarded } from "./commander.js";
 import { RELEASE, age, ago, clock, logged, person, reason, said, signed, spot } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";

@@ -10,7 +10,7 @@ from acsard.core.messages.signature import unpack
 from acsard.core.values import Twist
 from acsard.web.limits import COMMANDS
 from acsard.web.metrics import Counts
-from acsard.web.viewer import Hand
+from acsard.web.viewer import ViewerCommands
 
 PATIENCE_S = 20.0
 
@@ -22,13 +22,13 @@ def test_what_cannot_be_sent_is_dropped_and_the_next_one_is_looked_at() -> None:
         raise OverflowError("no room in 64 bits")
 
     counts = Counts()
-    hand = Hand(broken, counts)
+    commands = ViewerCommands(broken, counts)
     senders = {name: (Commander(), Sender(name)) for name in "ab"}
     for name in "aba":
-        hand.give(name, "app", *senders[name], AHEAD)
-        hand.outbox.flush(PATIENCE_S)
+        commands.give(name, "app", *senders[name], AHEAD)
+        commands.outbox.flush(PATIENCE_S)
     assert counts.all() == {"commands_dropped": 3}
-    assert not hand.outbox.dead.done()
+    assert not commands.outbox.dead.done()
 
 
 def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
@@ -41,11 +41,12 @@ def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
 
     fake: Any = Fake()
     counts = Counts()
-    hand, commander, sender = Hand(lambda: fake, counts), Commander(), Sender("joe/aa")
+    commands = ViewerCommands(lambda: fake, counts)
+    commander, sender = Commander(), Sender("joe/aa")
     for stamp_ns in (1000, 2000):
         wish = Wish(Twist(0.2, -0.5), stamp_ns, steady=True)
-        assert hand.give("joe", "teleop", commander, sender, wish)
-        hand.outbox.flush(PATIENCE_S)
+        assert commands.give("joe", "teleop", commander, sender, wish)
+        commands.outbox.flush(PATIENCE_S)
     assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
     signed = [one for *_, one in put]
     assert [one.stamp for one in signed] == [1000, 2000]
@@ -55,13 +56,13 @@ def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
 
 
 def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_speed() -> None:
-    hand, sender = Hand(lambda: None, Counts()), Sender("joe/aa")
+    commands, sender = ViewerCommands(lambda: None, Counts()), Sender("joe/aa")
     flooding, driving, other = Commander(), Commander(), Commander()
     rest = Wish(Twist(0.0, 0.0), 1000, steady=True)
-    assert hand.give("token", "teleop", driving, sender, AHEAD)
-    given = [hand.give("token", "app", flooding, sender, rest) for _ in range(1000)]
+    assert commands.give("token", "teleop", driving, sender, AHEAD)
+    given = [commands.give("token", "app", flooding, sender, rest) for _ in range(1000)]
     assert COMMANDS.most - 1 <= given.count(True) < COMMANDS.most + 100
-    assert not hand.give("token", "teleop", driving, sender, AHEAD)
-    assert hand.give("token", "teleop", driving, sender, rest)
-    assert not hand.give("token", "teleop", driving, sender, rest)
-    assert hand.give("another", "teleop", other, sender, AHEAD)
+    assert not commands.give("token", "teleop", driving, sender, AHEAD)
+    assert commands.give("token", "teleop", driving, sender, rest)
+    assert not commands.give("token", "teleop", driving, sender, rest)
+    assert commands.give("another", "teleop", other, sender, AHEAD)

@@ -70,7 +70,7 @@ export function objection(state, source, sender) {
   return "";
 }
 
-export class Hand {
+export class Commander {
   phase = "idle"; // "idle", "opening" or "driving"
   #wish = ZERO;
   #begun = 0;
