@@ -1134,7 +1134,7 @@ def test_a_page_that_is_hidden_says_its_zero_once(page: Phone) -> None:
     assert [one["cmd"]["linear_x"] for one in sent if "cmd" in one] == [0]
 
 
-def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Phone) -> None:
+def test_a_commander_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Phone) -> None:
     script = """commander.press(0); commander.wish(0.2, 0);
         for (const now of [0, 10, 20, 40]) look(now, ready);
         for (let now = 50; now < 260; now += 10) look(now, driving);
@@ -1165,7 +1165,7 @@ def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Ph
         ),
     ],
 )
-def test_a_hand_that_is_not_followed_lets_go_and_says_why(
+def test_a_commander_that_is_not_followed_lets_go_and_says_why(
     page: Phone, script: str, why: str
 ) -> None:
     told = commanded(page, script)
