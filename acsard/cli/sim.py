@@ -12,12 +12,23 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from acsard.cli.common import add_config, load
-from acsard.core.config.named_faults import FAULTS, RESET, NamedFault, forms, named
+from acsard.core.config.named_faults import FAULTS, INPUTS, RESET, NamedFault, forms, named
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.daemon.serial.simulated_board import SimPty
 from acsard.host import clock
 from acsard.host.errors import UsageError
+
+NUMBERS = {
+    "bias": "MOTOR:FACTOR",
+    "wrong_baud": "RATE",
+    "pushed": "M/S",
+    "stalls": "EVERY:SECONDS",
+    **dict.fromkeys(INPUTS, "START:SECONDS"),
+    "bumper_pressed": "BUMPER:START:SECONDS",
+    "battery": "PERCENT:MINUTES",
+}
+"""Names of the arguments of each fault with numbers. The help of `--fault` shows them."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -29,11 +40,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=fault,
         metavar="NAME",
         help=f"simulate a fault; may be repeated: {', '.join(FAULTS)}; with motors (a to d) or "
-        f"numbers: {', '.join(forms())}; reset=SECONDS (repeatedly)",
+        f"numbers: {', '.join(_with_names())}; reset=SECONDS (repeatedly). START is the time in "
+        "seconds until the fault begins; with 0 SECONDS it stays. EVERY is the time in seconds "
+        "from one stall to the next. BUMPER is 1 to 4. The battery begins with PERCENT of its "
+        "charge, and a full one lasts MINUTES at rest",
     )
     parser.add_argument(
         "--link", metavar="PATH", help="also make a symbolic link at PATH to the device"
     )
+
+
+def _with_names() -> list[str]:
+    """Return the faults with arguments, each with the names of its arguments."""
+    names = [form.partition("=")[::2] for form in forms()]
+    return [f"{name}={NUMBERS.get(name, kinds)}" for name, kinds in names]
 
 
 def fault(text: str) -> NamedFault:
