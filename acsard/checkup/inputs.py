@@ -29,11 +29,16 @@ class Input(Struct, frozen=True):
 
 
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
-    """Let the operator press each input that the configuration names or the board reports."""
+    """Let the operator press each input that the configuration names or the board reports.
+
+    Bumpers without places in the configuration have the numbers of the board.
+    """
     board.ask(NEWS_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
     places = () if safety.bumper == "off" else safety.bumpers
+    counted = 0 if safety.bumper == "off" else sum(number > 0 for number in board.inputs)
     names = [f"{place} bumper" for place in places]
+    names = names or [f"bumper {number}" for number in range(1, counted + 1)]
     # Two bumpers at one place are distinguished by their numbers.
     same = [names.count(name) > 1 for name in names]
     inputs = [Input(0, "emergency stop")] if estop else []
@@ -43,7 +48,6 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     if not inputs:
         return outcomes.find("inputs: none")
     listed = ", ".join(each.name for each in inputs)
-    counted = sum(number > 0 for number in board.inputs)
     if (estop and 0 not in board.inputs) or (places and counted != len(places)):
         fields = [*["estop=ok"] * estop, *["bumpers=" + "." * len(places)] * bool(places)]
         return outcomes.find("inputs: missing", listed=listed, fields=" ".join(fields))

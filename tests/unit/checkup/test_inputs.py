@@ -65,6 +65,13 @@ def test_an_emergency_stop_that_is_only_reported_is_pressed_too() -> None:
     assert checked("estop", "bumpers", presses=ALL, safety=off)[0].verdict == "SKIPPED"
 
 
+def test_bumpers_that_are_only_reported_are_pressed_by_their_numbers() -> None:
+    presses = {"bumper 1": 1, "bumper 2": 2}
+    assert checked("bumpers", presses=presses)[0].figure == "bumper 1, bumper 2"
+    found, _ = checked("bumpers", presses={"bumper 1": 2, "bumper 2": 2})
+    assert found.text == "bumper 1: no press was reported but of the bumper 2"
+
+
 def test_without_a_person_the_check_names_what_it_did_not_check() -> None:
     found, _ = checked("estop", "bumpers", safety=SAFETY)
     assert (found.verdict, found.figure) == ("SKIPPED", "not checked")
