@@ -32,6 +32,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.motion import bumpers
 from acsard.core.motion.battery import MISSING as NO_BATTERY
+from acsard.core.motion.battery import Battery
 from acsard.core.motion.battery import words as battery_words
 from acsard.core.motion.emergency_stop import CHECK, MISSING, PRESSED, RELEASE, SILENT
 from acsard.core.motion.gyro import WORDS
@@ -254,7 +255,8 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
     elif level == "unknown":
         yield Finding("battery", "warning", text, mend)
     elif level == "stop":
-        yield Finding("battery", "failure", text, "charge it, then `acsard call clear`")
+        mend = f"{Battery(config).mend}, then `acsard call clear`"
+        yield Finding("battery", "failure", text, mend)
     else:
         yield Finding("battery", "warning", text, "charge it")
 

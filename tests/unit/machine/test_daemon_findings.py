@@ -374,7 +374,7 @@ THRESHOLDS = BatteryConfig(warning_below=22.0, stop_below=21.0)
          "21.50 V; the mean is below battery.warning_below = 22 V", "charge it"),
         (BatterySummary(20.5, None, None, "stop"), "failure",
          "20.50 V; the mean is below battery.stop_below = 21 V",
-         "charge it, then `acsard call clear`"),
+         "charge it to 21.5 V, then `acsard call clear`"),
         (BatterySummary(None, None, None, "unknown"), "warning",
          "the board has not reported its battery for 5 s", CHECK),
         (None, "warning", "the board has not reported its battery, but [battery] has thresholds",
