@@ -263,7 +263,7 @@ def test_the_map_shows_the_robot_and_its_direction_beside_the_buttons_and_a_scal
 SHOWN = "!!document.getElementById({!r}).checkVisibility()"
 
 
-def test_a_pressed_emergency_stop_and_a_low_battery_have_signs_and_the_mend_is_at_the_stick(
+def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_the_mend_at_the_stick(
     tmp_path: Path, browser: Browser
 ) -> None:
     """Release STOP is refused while the button is pressed, and the page says what to do first."""
@@ -305,6 +305,10 @@ def test_a_pressed_emergency_stop_and_a_low_battery_have_signs_and_the_mend_is_a
         shows(browser, "hint", "Stopped. Press Release STOP first.")
         browser.tap("clear")
         shows(browser, "mode", "READY")
+        says(b"estop=ok bumpers=.X")
+        shows(browser, "mode", "STOPPED")
+        shows(browser, "reason", "bumper 2 pressed")
+        shows(browser, "doubt", "bumper 2 pressed")
         browser.open("about:blank")
 
 
