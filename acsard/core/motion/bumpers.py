@@ -18,7 +18,7 @@ from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.formatting import many
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.motion.emergency_stop import SILENT_S, TABLE, BoardInput
-from acsard.core.values import REST, Twist
+from acsard.core.values import REST, EstopState, Twist
 
 AWAY_SPEED = 0.1
 """Highest speed away from a pressed bumper, m/s."""
@@ -121,11 +121,13 @@ class Bumpers(BoardInput):
         """Return what follows from a press, for the log."""
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
-    def released(self, first: bool) -> str:
-        """Return the text that logs a release or, if `first`, the first report."""
-        if first:
+    def released(self, before: EstopState) -> str:
+        """Return the text that logs a release or, if `before` is "", the first report."""
+        if not before:
             count = len(self.pressed or ())
             return f"the board reports {many(count, 'bumper')}, and none is pressed"
+        if self._away and before == "pressed":
+            return "released; the bumpers allow every direction again"
         return "released; a stop stays latched until srv/clear"
 
     def _direction(self) -> int:

@@ -133,8 +133,11 @@ class BoardInput(ABC):
         """Return which inputs are pressed, as a reason."""
 
     @abstractmethod
-    def released(self, first: bool) -> str:
-        """Return the text that logs a release or, if `first`, the first report of the inputs."""
+    def released(self, before: EstopState) -> str:
+        """Return the text that logs a release or, if `before` is "", the first report.
+
+        `before` is the state before it.
+        """
 
     def advice(self) -> str:
         """Return what follows from a press, for the log."""
@@ -150,7 +153,7 @@ class BoardInput(ABC):
         if why:
             self.pressed_now = why
             return [Event(self.events[0], f"{why}; {self.advice()}", "error")]
-        return [Event(self.events[1], self.released(not before))]
+        return [Event(self.events[1], self.released(before))]
 
 
 class EmergencyStop(BoardInput):
@@ -166,9 +169,9 @@ class EmergencyStop(BoardInput):
         """Return the reason of a press."""
         return PRESSED
 
-    def released(self, first: bool) -> str:
-        """Return the text that logs a release or, if `first`, the first report."""
-        if first:
+    def released(self, before: EstopState) -> str:
+        """Return the text that logs a release or, if `before` is "", the first report."""
+        if not before:
             return "the board reports an emergency-stop input, which is released"
         return "released; the robot stays stopped until srv/clear"
 

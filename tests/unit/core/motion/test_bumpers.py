@@ -169,6 +169,17 @@ def test_half_a_second_of_silence_latches_with_both_choices(
     assert pins.step("..") == "released"
 
 
+def test_a_release_says_that_a_stop_stays_only_if_there_is_one() -> None:
+    pins = away("front", "rear")
+    pins.step("..")
+    pins.step("X.")
+    pins.step("..")
+    assert pins.events[-1].text == "released; the bumpers allow every direction again"
+    pins.quiet(600)
+    pins.step("..")
+    assert pins.events[-1].text == "released; a stop stays latched until srv/clear"
+
+
 def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() -> None:
     pins = stop("front", "rear")
     assert pins.bumpers.missing
