@@ -198,7 +198,7 @@ TOPICS: tuple[Topic, ...] = (
         latched=True, urdf=True,
     ),
     _out("wheel_states", "JointState", "every feedback", "wheel angles and speeds"),
-    _out("battery", "Battery", "1 Hz, on change", "voltage, current and charge of the battery"),
+    _out("battery", "Battery", "1 Hz, on change", "voltage, current and state of charge"),
     _out("cmd_vel_out", "TwistStamped", "every period", "the twist applied after limits"),
     _out("state", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     _out("diagnostics", "DiagnosticArray", "1 Hz, on change", "health of every part"),
