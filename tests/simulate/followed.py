@@ -137,9 +137,8 @@ class Followed:
         if learned_ns != witness.ages.learned_ns:
             least = age
         if age < least - FALL_NS:
-            self._fell_ns[sample.clock] = (
-                wish.arrived_ns
-            )  # a backlog pours in, or the clock was set
+            # A backlog pours in, or the clock was set.
+            self._fell_ns[sample.clock] = wish.arrived_ns
         # The daemon may know a clock that it has never followed, also behind a silence.
         least = min(least, age)
         self._least[sample.clock] = witness.ages.learned_ns, least
@@ -203,8 +202,10 @@ class Followed:
         priority = witness.priority
         left_ns = witness.timeout[holder.who[0]] - (decided_ns - holder.arrived_ns)
         if priority[found.who[0]] <= priority[holder.who[0]] and left_ns > witness.period_ns:
-            if holder.sender["way"] in FOREIGN and not stable(holder.sender):
-                return  # it was set, so it must send a zero again
+            if holder.sender["way"] in FOREIGN and (
+                not stable(holder.sender) or self._fell_ns.get(holder.clock, -1) >= holder.true_ns
+            ):
+                return  # it was set, or looks so behind a congestion: it must send a zero again
             raise BrokenError(
                 "the first of equal priority keeps the robot", true_ns,
                 f"{found.who} is followed, {holder.who} was, {left_ns / NS:.3f} s before its end",
