@@ -22,7 +22,7 @@ from tests.simulate.bumpers import Bumpers
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
-from tests.simulate.liveness import Liveness
+from tests.simulate.liveness import QUIET_FAULTS, TROUBLE_NS, Liveness
 from tests.simulate.log_lines import LogLines
 from tests.simulate.plan import Plan
 from tests.simulate.plugging import Plugging
@@ -266,7 +266,7 @@ class Run:
     ) -> None:
         product, verb, witness = self.product, event["verb"], self.witness
         if "pose" not in verb and "odometry" not in verb:
-            self.liveness.event()
+            self.liveness.event(disarms=False)
         if not product.alive:
             return
         at_ns = self._arrival(due_ns)
@@ -302,6 +302,8 @@ class Run:
         def answered(reply: bytes) -> None:
             success, text = read_reply(reply, via, service.endswith("set_parameters"))
             self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
+            if asks_for_zeros(verb, event, success, text):
+                self.liveness.event()
             if not success:
                 return
             match verb:
@@ -328,7 +330,7 @@ class Run:
     def _do(self, event: dict[str, Any]) -> None:
         product = self.product
         if event["do"] not in ("wall", "disk", "call"):
-            self.liveness.event()
+            self.liveness.event(disarms=disarms(event))
         lasts_ns = min(
             int(event.get("for", 0.0) * NS),
             max(0, int(self.plan["seconds"] * NS) - self.true_ns),
@@ -355,6 +357,7 @@ class Run:
                 self.pose.doubt()
                 self._troubled("reset")
                 deaf_ns = int(event["deaf"] * NS)
+                self.liveness.event(deaf_ns + TROUBLE_NS)
                 if deaf_ns > 12 * NS // 10:
                     self.at(self.true_ns + deaf_ns, self._hears_again)
             case "unplug":
@@ -369,6 +372,7 @@ class Run:
                 product.tear(event["taken"])
             case "stall" | "stall in step":
                 self._stalled_ns = after_ns
+                self.liveness.stalls(after_ns)
                 self.witness.stalls(self.true_ns, after_ns)
                 if self.true_ns > event["at"] * NS + NS // 1000:
                     # One stall behind another: the daemon could read between, but take no step,
@@ -406,7 +410,7 @@ class Run:
         self.liveness.weigh()
 
     def _block(self, blocked: bool) -> None:
-        self.liveness.event()
+        self.liveness.event(disarms=not blocked)
         self.product.block(blocked)
         self.witness.blocked_ns = self.true_ns if blocked else None
 
@@ -429,7 +433,7 @@ class Run:
         if fault[0] == "endless" and self.product.alive:
             self._weigh()
         self.active.remove(fault)
-        self.liveness.event()
+        self.liveness.event(TROUBLE_NS, disarms=fault[0] not in QUIET_FAULTS)
         self._troubled(fault[0])
         self.pose.mended(fault[0], self.true_ns)
         self._board()
@@ -441,7 +445,7 @@ class Run:
 
     def plug(self, new: bool) -> None:
         """Plug the board in again, unless it is plugged in."""
-        self.liveness.event()
+        self.liveness.event(TROUBLE_NS if new else 0)
         if not self.product.plugged:
             self.product.plug(new)
             if self.witness.blocked_ns is not None:
@@ -515,6 +519,8 @@ class Run:
         before, self._ended = self._ended, data[-1:]
         if b"!acsard-mcu " in data and b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
             self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
+        if b"!acsard-mcu" in data:
+            self.liveness.event()  # also as the first bytes of all, and if the line is damaged
         if self._plain:
             self.damage.fed(data)
         self.bumpers.fed(at_ns - START_NS + self.slept_ns, data)
@@ -524,6 +530,10 @@ class Run:
             return  # A line from just before may still arrive.
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
+        if not self._plain and gap_ns > 6 * NS // 10:
+            # The next good line is the first one with the check, for which the daemon asks again.
+            self.liveness.event(NS // 2)
+            self.witness.disarmed_ns = true_ns + NS // 2
         if gap_ns > 9 * NS // 10:
             # Behind a stall of the host the kernel may hold lines, so the link may not be lost.
             self.liveness.event()
@@ -634,3 +644,22 @@ class Run:
                     "odometry": seen.estimates,
                 }
             )  # fmt: skip
+
+
+def disarms(event: dict[str, Any]) -> bool:
+    """Return whether this event of a plan may ask each sender for a zero when it begins."""
+    if event["do"] == "board":
+        return event["fault"][0] not in QUIET_FAULTS
+    return event["do"] not in ("stall", "stall in step", "block", "tear")
+
+
+def asks_for_zeros(verb: str, event: dict[str, Any], success: bool, text: str) -> bool:
+    """Return whether a call with this answer may have asked each sender for a zero."""
+    match verb:
+        case "clear":
+            return success and not text.startswith("nothing")
+        case "activate":
+            return success
+        case "set":
+            return any(key.startswith("commands.") for key in event["settings"])
+    return False

@@ -161,6 +161,11 @@ class Followed:
         """The speeds of the command that the robot follows, None if that is not known."""
         return None if self._holder is None else (self._holder.v, self._holder.w)
 
+    @property
+    def sender(self) -> dict[str, Any] | None:
+        """The sender of the command that the robot follows, None if that is not known."""
+        return None if self._holder is None else self._holder.sender
+
     def forget(self) -> None:
         """Note that the daemon may have forgotten all commands."""
         self._sure.clear()

@@ -1,18 +1,21 @@
 """The promises that something happens: a lawful sender drives, nothing is lost without a count.
 
 While a plan runs, a sender that keeps all rules and has the highest priority must move the robot,
-if nothing has happened for 3 s. At the end of each plan all faults end, an operator releases all
-latches, and a lawful sender drives.
+if nothing has happened for 3 s. Only the events that the pages name ask it for another zero. At the
+end of each plan all faults end, an operator releases all latches, and a lawful sender drives.
 """
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from tests.simulate.ages import MARGIN_NS, Wish
 from tests.simulate.product import START_NS, WALL_OFFSET_NS
 from tests.simulate.promises import BrokenError
+from tests.simulate.reasons import kind_of
 from tests.simulate.reports import judge_counts
-from tests.simulate.roads import NS, Message, Sample
+from tests.simulate.roads import NS, STEADY, Message, Sample
 
 if TYPE_CHECKING:
     from tests.simulate.actors import Run
@@ -38,6 +41,21 @@ PROOF_NS = 2 * NS
 PAUSE_NS = 3 * NS // 20
 """Longest time between two commands of a sender that does not pause."""
 
+UNSHARED = (*STEADY, "plain", "bridge")
+"""Ways without a foreign clock, whose adjustment would ask its sender for a zero."""
+
+QUIET_FAULTS = {
+    "mute", "pushed", "slow_reply", "ftdi", "stalls", "sparse_replies", "lost_replies",
+    "stuck_encoder", "frozen_encoder", "dead_motor", "reversed_motor", "reversed_encoder", "bias",
+    "swapped_motors", "swapped_encoders", "late_watchdog", "no_watchdog",
+}  # fmt: skip
+"""Faults of the board that ask no sender for a zero, unless the board is silent for 1 s or a fault
+is latched. Others damage lines, so that they may look like a silent board or a reset."""
+
+TROUBLE_NS = 2 * NS
+"""After another fault of the board, and after a reset, the daemon knows within this time that the
+link was lost or that the board has started again."""
+
 
 class Liveness:
     """Judges that a lawful sender drives, and counts and memory at the end of a plan."""
@@ -45,39 +63,84 @@ class Liveness:
     def __init__(self, run: Run) -> None:
         self.run = run
         self._event_ns = 0
+        self._disarmed_ns = 0
+        """Until then an event may ask each sender for a zero."""
+        self._stall = -NS, -NS
+        """Begin and end of the host's last stall. Zeros that came meanwhile may be lost."""
+        self._armed: dict[str, int] = {}
+        """Arrival of the zero by which each lawful sender is certainly armed."""
         self._since: dict[str, int] = {}
         """Since when each lawful sender has wished a speed without a pause."""
         self._began: dict[str, int] = {}
         """Time of the first command behind each lawful sender's last silence."""
         self._latest: dict[str, tuple[int, str]] = {}
-        self._lawful: set[str] | None = None
+        self._followed_ns: dict[str, int] = {}
+        """When the robot last followed each of these senders."""
 
     @property
     def event_ns(self) -> int:
         """Return the time of the last event."""
         return self._event_ns
 
-    def event(self) -> None:
-        """Note an event that is not a command."""
-        self._event_ns = self.run.true_ns
+    def event(self, lasts_ns: int = 0, *, disarms: bool = True) -> None:
+        """Note an event that is not a command.
+
+        If it `disarms`, it may ask each sender for a zero from now on for `lasts_ns`.
+        """
+        now_ns = self._event_ns = self.run.true_ns
+        if disarms:
+            # The daemon sees it behind a stall only.
+            until_ns = max(now_ns + lasts_ns, self._stall[1])
+            self._disarmed_ns = max(self._disarmed_ns, until_ns)
+
+    def stalls(self, until_ns: int) -> None:
+        """Note that the host stalls, so that the daemon sees what has just happened later."""
+        now_ns = self.run.true_ns
+        begun_ns = self._stall[0] if now_ns <= self._stall[1] else now_ns
+        self._stall = begun_ns, max(self._stall[1], until_ns)
+        if self._disarmed_ns > now_ns - self._tick_ns:
+            self._disarmed_ns = max(self._disarmed_ns, until_ns)
+        for name, zero_ns in list(self._armed.items()):
+            if zero_ns > begun_ns - self._tick_ns:
+                del self._armed[name]
+
+    @cached_property
+    def lawful(self) -> set[str]:
+        """The names of the senders that keep all rules and have no rival."""
+        return {one["name"] for one in self.run.plan["senders"] if self._keeps_rules(one)}
+
+    @property
+    def _tick_ns(self) -> int:
+        return self.run.witness.period_ns + MARGIN_NS
 
     def command(self, sender: dict[str, Any], sample: Sample) -> None:
         """Take note of a command of a lawful sender."""
-        if self._lawful is None:
-            self._lawful = {s["name"] for s in self.run.plan["senders"] if self._keeps_rules(s)}
         name = sender["name"]
-        if name not in self._lawful:
+        if name not in self.lawful:
             return
         wish = self.run.witness.wishes[-1][1]
         before_ns, _ = self._latest.get(name, (0, ""))
         if wish.arrived_ns - before_ns > PAUSE_NS:
             self._since.pop(name, None)
             self._began[name] = wish.arrived_ns
-        if wish.armed_ns <= self._event_ns or not (wish.v or wish.w):
+        self._take_zero(name, wish)
+        if not self._is_armed(name) or not (wish.v or wish.w):
             self._since.pop(name, None)
         else:
             self._since.setdefault(name, max(wish.arrived_ns, self._began.get(name, 0) + PROOF_NS))
         self._latest[name] = wish.arrived_ns, sample.identity
+
+    def _is_armed(self, name: str) -> bool:
+        return self._armed.get(name, -1) > self._disarmed_ns + self._tick_ns
+
+    def _take_zero(self, name: str, wish: Wish) -> None:
+        """Note the zero that arms this sender, unless the daemon may not have taken it."""
+        zero_ns, (begun_ns, ended_ns) = wish.armed_ns, self._stall
+        if self._is_armed(name):
+            return
+        settled_ns = zero_ns + (self.run.witness.pause_ns if wish.shared else 0)
+        if zero_ns > ended_ns or settled_ns < begun_ns - self._tick_ns:
+            self._armed[name] = zero_ns
 
     def _keeps_rules(self, sender: dict[str, Any]) -> bool:
         """Return whether this sender has a good network, a clock of its own and no rival."""
@@ -99,9 +162,11 @@ class Liveness:
     def look(self, now_ns: int) -> None:
         """Have a lawful sender drive if it has wished so for long enough."""
         run = self.run
+        self._stays_armed(now_ns)
         if not self._since or run.active != run.lasting or run.witness.held is not None:
             return
-        if not run.product.plugged or run.witness.perhaps_latched:
+        # A `deactivate` that waits for the disk is in force before its answer.
+        if not run.product.plugged or run.witness.perhaps_latched or run.witness.pending:
             return
         for name, since_ns in self._since.items():
             heard_ns, identity = self._latest[name]
@@ -111,6 +176,37 @@ class Liveness:
                 if now_ns - run.moved_ns > NS // 2:
                     text = f"{identity} since {since_ns / NS:.3f} s; {run.witness.reason}"
                     raise BrokenError("a lawful sender drives", now_ns, text)
+
+    def _stays_armed(self, now_ns: int) -> None:
+        """A sender that the robot has followed is armed until an event asks it for a zero."""
+        run = self.run
+        sender = run.followed.sender
+        if sender is not None and self._sole_senders.get(sender["source"]) == sender["name"]:
+            self._followed_ns[sender["source"]] = now_ns
+        witness = run.witness
+        if witness.mode != "ready" or "must send a zero" not in witness.reason or witness.pending:
+            return
+        _, source = kind_of(witness.reason)
+        if not QUIET_FAULTS.issuperset(name for name, _ in run.active[len(run.lasting) :]):
+            return
+        followed_ns = self._followed_ns.get(source, -1)
+        if followed_ns > max(self._disarmed_ns, self._stall[1]) + self._tick_ns:
+            text = f"{source} was followed at {followed_ns / NS:.3f} s; {witness.reason}"
+            raise BrokenError("an armed sender stays armed", now_ns, text)
+
+    @cached_property
+    def _sole_senders(self) -> dict[str, str]:
+        """The name of the sender of each source that has one only, without a foreign clock.
+
+        The reason of a source names no sender, so it may be about another one of its senders.
+        """
+        found: dict[str, str] = {}
+        senders = self.run.plan["senders"]
+        for source in {one["source"] for one in senders} - self.run.witness.churned:
+            one, *others = [one for one in senders if one["source"] == source]
+            if not others and one["way"] in UNSHARED and not one.get("bad_stamps"):
+                found[source] = one["name"]
+        return found
 
     def end(self) -> None:
         """End all faults, release all latches and have a lawful sender drive."""
@@ -195,6 +291,8 @@ class Liveness:
         moving = run.true_ns - run.moved_ns < NS // 5
         if mode == "stopped" and run.witness.stops:
             return  # a stop of the plan was still under way
+        if mode == "inactive" and run.witness.offs and run.witness.offs[-1] > begin_ns:
+            return  # a switching off of the plan was still under way (seed 182028330)
         if run.witness.armed_since_ns > begin_ns:
             return  # an event of the plan that came late asks each sender for a new zero
         if mode != "driving" or not moving:

@@ -87,10 +87,56 @@ def made(seed: int, seconds: float | None = None) -> Plan:
             if dice.random() < 0.5:
                 first = plan["senders"][0]
                 sender.update(id=first["id"], way=first["way"], source=first["source"])
+    _draw_lawful_driver(random.Random(f"lawful driver {seed}"), plan)
     events = _events(dice, kinds, length, config, plan["senders"])
     plan["events"] = sorted(events, key=lambda one: one["at"])
     bumpers.add(plan)
     return plan
+
+
+def _draw_lawful_driver(dice: random.Random, plan: Plan) -> None:
+    """In a quarter of the plans make the first sender keep all rules, and nobody outrank it.
+
+    `liveness.py` judges inside a plan that such a sender drives. Few plans have one by chance.
+    """
+    if dice.random() >= 0.25:
+        return
+    seconds: float = plan["seconds"]
+    first: dict[str, Any] = plan["senders"][0]
+    source = max(plan["config"]["commands"]["sources"], key=lambda one: one["priority"])
+    below = {
+        one["name"]
+        for one in plan["config"]["commands"]["sources"]
+        if one["priority"] < source["priority"]
+    }
+    hz = dice.choice((20.0, 50.0)) if source["timeout"] > 0.1 else 50.0
+    first |= {
+        "way": dice.choice(("client", "plain", "bridge")), "source": source["name"],
+        "wheels": False, "hz": hz, "from": 0.0, "to": seconds,
+        "jitter": min(first["jitter"], 0.002), "phases": _drives(dice, seconds),
+        "congestion": [], "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0,
+        "churn": False, "loss": 0.0, "twice": 0.0, "swap": 0.0,
+    }  # fmt: skip
+    plan["senders"] = [first] + [
+        one
+        for one in plan["senders"][1:]
+        if one["source"] in below and not (one["junk"] or one["churn"]) and one["id"] != first["id"]
+    ]
+
+
+def _drives(dice: random.Random, seconds: float) -> list[list[Any]]:
+    """Return the phases of a sender that drives for up to minutes, rests, and often reverses."""
+    phases: list[list[Any]] = []
+    t = 0.0
+    while t < seconds:
+        phases.append([round(t, 3), 0.0, 0.0])
+        t += dice.choice((1.3, 2.5, 5.5))
+        for _ in range(dice.choice((1, 2, 3, 12))):
+            speed = dice.choice((-1, 1)) * round(dice.uniform(0.1, 1.2), 3)
+            turn = dice.choice((0.0, round(dice.uniform(-3.0, 3.0), 3)))
+            phases.append([round(t, 3), speed, turn])
+            t += dice.uniform(3.0, 15.0)
+    return phases
 
 
 def _config(

@@ -260,6 +260,36 @@ FAULTS = (
         "            return\n"
         "        self.twist, self.arrived_ns, self._doubted_ns",
     ),
+    fault(
+        "neutral gap",
+        "a board that was silent for half a second asks each sender for a zero",
+        SESSION,
+        "LONG_GAP_NS = 1 * NS_PER_S",
+        "LONG_GAP_NS = NS_PER_S // 2",
+    ),
+    fault(
+        "neutral nothing",
+        "a clear that finds nothing to release asks each sender for a zero",
+        ROBOT,
+        "                if not released:\n",
+        "                if not released:\n"
+        "                    self._arbiter.require_neutral(asked_ns)\n",
+    ),
+    fault(
+        "neutral expires",
+        "a sender must send a zero again after 20 s",
+        NEUTRAL,
+        "        self._settle(now_ns)\n        return self._armed\n",
+        "        self._settle(now_ns)\n"
+        "        recent = not self._neutral_first or now_ns - self._rested_ns < 20_000_000_000\n"
+        "        return self._armed and recent\n",
+        Edit(
+            NEUTRAL,
+            "        now_ns, zero = command.arrived_ns, is_zero(command)\n",
+            "        now_ns, zero = command.arrived_ns, is_zero(command)\n"
+            "        self._rested_ns = now_ns if zero else getattr(self, '_rested_ns', now_ns)\n",
+        ),
+    ),
     # freshness
     Fault(
         "freshness age",

@@ -162,6 +162,8 @@ class Witness:
         """Jerk is limited: the plans limit it on both axes, or on none."""
         self.linked = True
         """The daemon says that the link to the board is up."""
+        self.disarmed_ns = -1
+        """Until then a gap between the lines with a check may have disarmed every sender."""
         self.cut = False
         """The link was lost since the last line, so the speed starts over from zero."""
         self.pending: dict[str, int] = {}
@@ -727,9 +729,10 @@ class Witness:
         if self.churned:
             return 0
         # A call without an answer may be in force.
-        found, since_ns = 0, max(self.armed_since_ns, *self.pending.values(), 0)
+        found, armed_ns = 0, max(self.armed_since_ns, self.disarmed_ns)
+        since_ns = max(armed_ns, *self.pending.values(), 0)
         for source, wish in self.wishes:
-            if self.neutral_first and wish.shared and wish.armed_ns <= self.armed_since_ns:
+            if self.neutral_first and wish.shared and wish.armed_ns <= armed_ns:
                 continue  # a zero of a shared identity counts only behind its pause
             age = at_ns - wish.arrived_ns
             live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS

@@ -229,6 +229,49 @@ def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_doe
     )  # fmt: skip
 
 
+def driven(**changes: Any) -> Plan:
+    """A plan in which a sender that keeps all rules drives from 1.3 s on."""
+    source = max(PLAIN["config"]["commands"]["sources"], key=lambda one: one["priority"])
+    clean = {
+        "wheels": False, "hz": 50.0, "from": 0.0, "to": 12.0, "jitter": 0.0, "congestion": [],
+        "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0, "churn": False, "loss": 0.0,
+        "twice": 0.0, "swap": 0.0, "phases": [[0.0, 0.0, 0.0], [1.3, 0.3, 0.0]],
+    }  # fmt: skip
+    sender = PLAIN["senders"][0] | clean | {"way": "plain", "source": source["name"]}
+    return quiet() | {"seconds": 12.0, "senders": [sender]} | changes
+
+
+def test_in_a_quarter_of_the_plans_nobody_outranks_a_sender_that_keeps_all_rules() -> None:
+    plans = [Run(plan).liveness for plan in map(made, range(80))]
+    assert 12 <= sum(bool(one.lawful) for one in plans) <= 32
+
+
+@pytest.mark.parametrize("noted", [True, False])
+def test_a_sender_that_must_send_a_zero_without_an_event_is_a_finding(noted: bool) -> None:
+    run = Run(driven(events=[{"at": 8.0, "do": "reset", "deaf": 0.3}]))
+    if not noted:
+        run.liveness.event = lambda *_, **__: None  # type: ignore[method-assign]
+    broken = pytest.raises(BrokenError, match="an armed sender stays armed")
+    with nullcontext() if noted else broken:
+        run.play()
+    assert run.counts["lawful looks"] > 100
+
+
+def test_a_zero_before_the_greeting_of_a_board_arms_nobody() -> None:
+    """The greeting may be the first bytes of all (seed 182028320)."""
+    config = PLAIN["config"] | {"sim": PLAIN["config"]["sim"] | {"boot_time": 0.5}}
+    result = played(driven(config=config))
+    assert (result.finding, result.counts["lawful looks"]) == ("", 0)
+
+
+def test_a_plan_may_switch_the_robot_off_behind_its_end() -> None:
+    """Seed 182028330."""
+    call = {"verb": "deactivate", "late": 0.0, "lost": False, "twice": False, "via": "native"}
+    plan = quiet() | {"events": [{"at": 8.0, "do": "call", "by": "op1", **call}]}
+    result = played(plan)
+    assert (result.finding, result.counts["deactivate done"]) == ("", 1)
+
+
 def ramp(witness: Witness, fastest: float, share: float) -> None:
     """Put lines on the wire that fall from this speed by a share of the deceleration."""
     radius, fall = witness.radius, witness.limits["linear_deceleration"]
