@@ -205,14 +205,20 @@ class Fit(Struct, frozen=True):
         free = np.eye(3) if sized else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(free @ three @ free.T)
 
-    def covariance(self) -> Floats:
-        """Return the covariance of the parameters by the jackknife and the prior assumptions."""
-        alone = self._jackknife(1)
-        size = np.sqrt(np.maximum(np.diag(alone), 1e-300))
-        # Leaving out neighbouring blocks together shows errors that last longer than a block.
-        paired = np.sqrt(np.diag(self._jackknife(2))) if len(self.score) >= MANY else size
-        wider = np.maximum(1.0, paired / size)
-        chance = alone * np.outer(wider, wider)
+    def covariance(self, runs: Sequence[int] = ()) -> Floats:
+        """Return the covariance of the parameters by the jackknife and the prior assumptions.
+
+        `runs` has the number of the run of each block, if the log has several runs.
+        """
+        alone = np.arange(len(self.score))
+        change, size = self._changes(alone)
+        # Leaving out whole runs or neighbouring blocks shows errors that last longer than a block.
+        longer = alone // 2 if len(alone) >= MANY else alone
+        longer = np.array(runs) if len(set(runs)) >= LEAST_BLOCKS else longer
+        wider = np.sqrt(
+            np.maximum(size, self._changes(longer)[1]) / np.maximum(change**2, 1e-150).sum(axis=0)
+        )
+        chance = change.T @ change * np.outer(wider, wider)
         usual = np.zeros(COUNT)
         usual[list(self.usual)] = np.array(list(self.usual.values())) ** -2
         total = self.normal.sum(axis=0) + self.known
@@ -220,18 +226,19 @@ class Fit(Struct, frozen=True):
         pull[list(self.active)] = _solved(total, np.diag(usual), self.active)
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
-    def _jackknife(self, together: int) -> Floats:
-        """Return the covariance from leaving out groups of `together` neighbouring blocks."""
-        group = np.arange(len(self.score)) // together
+    def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """Return the changes of the parameters without each group of blocks, and their variances.
+
+        A variance is that of the jackknife, widened to that of Student's t. If a few groups cause
+        most of it, it has only that many degrees of freedom. Their number is the estimate of
+        Satterthwaite (An approximate distribution of estimates of variance components, 1946).
+        """
         change = np.array(
-            [self.without(group == number) - self.parameters for number in range(group[-1] + 1)]
+            [self.without(group == number) - self.parameters for number in np.unique(group)]
         )
-        # If a few groups cause most of a variance, the variance has only that many degrees of
-        # freedom.
         squares = np.maximum(change**2, 1e-150)
-        wider = np.sqrt(student_factor(squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0)))
-        covariance = (1 - 1 / len(change)) * change.T @ change
-        return np.asarray(covariance * np.outer(wider, wider))
+        free = 3 * squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0) - 2
+        return change, (1 - 1 / len(change)) * student_factor(free) * squares.sum(axis=0)
 
 
 def fit(

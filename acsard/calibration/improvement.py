@@ -27,6 +27,12 @@ LEAST_RUNS = 3
 STRAIGHT = 0.1
 """Largest curvature of a straight drive according to the wheels, rad/m."""
 
+STRAIGHT_M = 1.0
+"""Smallest sum of the straight drives for which their error is given, m.
+
+From a few millimetres, the error after 10 m would be noise.
+"""
+
 
 class BeforeAfter(Struct, frozen=True):
     """An error with the configured and with the new multipliers; None if nothing measures it."""
@@ -46,6 +52,13 @@ HALVED = float(np.log(2.0))
 In a guided drive, a single leg may show nearly all of the error.
 """
 
+NEAR, FAR = 2.0, 3.0
+"""Distances of the new multipliers from the configured ones, in standard deviations.
+
+Below `NEAR` the log does not contradict the configured ones. Chance explains a distance beyond
+`FAR` in one log of thirty. Then a gain by one standard deviation is enough.
+"""
+
 LEAST_SQUARE = 1e-9
 """Sum of squares, m2 or deg2, that is added to both errors so that neither is 0."""
 
@@ -56,7 +69,10 @@ class Improvement(Struct, frozen=True):
     turn: BeforeAfter
     """Heading error after a turn of 360 deg, deg."""
     straight: BeforeAfter
-    """Heading error after 10 m straight ahead, deg, by turns that the wheels do not show."""
+    """Heading error after 10 m straight ahead, deg, by turns that the wheels do not show.
+
+    It is unknown if the straight drives are shorter than `STRAIGHT_M` in all.
+    """
     heading: BeforeAfter
     """RMS error of the heading over whole drives, deg. Each drive is rotated to fit best."""
     place: BeforeAfter
@@ -65,11 +81,14 @@ class Improvement(Struct, frozen=True):
     """Logarithm of the error before over that after, of whole drives: heading plus position."""
     chance: float = 0.0
     """Standard deviation of `gain` by the differences of the drives, as that of Student's t."""
+    apart: float = FAR
+    """Distance of the new multipliers from the configured ones, in standard deviations."""
 
     @property
     def sure(self) -> bool:
         """Whether the new multipliers are better by more than chance explains."""
-        return self.gain > min(SURE * self.chance, HALVED)
+        least = self.chance if self.apart > FAR else min(SURE * self.chance, HALVED)
+        return self.apart > NEAR and self.gain > least
 
 
 UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
@@ -150,6 +169,8 @@ def improvement(
     straight = ~turning & measured & (np.abs(by_wheels) < STRAIGHT * distance)
     block_and_side = 2 * rows.block + (rows.turned > 0.0)
     angle, metres = float(np.abs(rows.turned[turning]).sum()), float(distance[straight].sum())
+    if metres < STRAIGHT_M:
+        metres = 0.0
     squares = [_of_headings(held, before, after, rows)] if measured.any() else []
     squares += [_of_positions(held, configured, base, places, steps)] if steps else []
     gain, chance = _gain(squares)

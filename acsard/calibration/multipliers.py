@@ -21,6 +21,10 @@ SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
 """Indices into `values` and `covariance` of `Multipliers`."""
 
 
+SAME = 1e-4
+"""Difference of two multipliers that means nothing."""
+
+
 class Deviations(Struct, frozen=True):
     """Standard deviations of the geometry, as fractions."""
 
@@ -58,9 +62,15 @@ class Multipliers(Struct, frozen=True):
     @property
     def ratio_std(self) -> float:
         """Standard deviation of the ratio of both radii, as a fraction."""
-        shares = self.covariance / np.outer(self.values, self.values)
-        apart = np.array([0.0, 1.0, -1.0])
-        return float(np.sqrt(max(0.0, apart @ shares @ apart)))
+        return self.own().ratio
+
+    def apart(self, base: Base) -> float:
+        """Return how far these multipliers are from the configured ones, in standard deviations.
+
+        A combination that no sensor measures is equal in both.
+        """
+        off = self.values - (base.track, base.left, base.right)
+        return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
 
     def own(self) -> Deviations:
         """Return the standard deviations that the settings of `[odometry]` declare.

@@ -6,7 +6,6 @@ log gives no calibration, an error says why and what to do.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -47,11 +46,12 @@ from acsard.calibration.wheel_response import response
 from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryConfig
 from acsard.core.values import AcsardError
 
-LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0, 64.0)}
-"""Lengths of blocks that are tried, s, by whether the log has a heading sensor.
+LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
+"""Lengths of blocks that are tried with positions, s.
 
 Many short blocks are better for fine positions. Long blocks are better for coarse ones, and for
-wheels whose errors hide the small turns of a short block. Drives that were left out decide.
+wheels whose errors hide the small turns of a short block. Drives that were left out decide. The
+shortest length is enough for a heading sensor, and too short for positions alone.
 """
 
 ENOUGH_BLOCKS = 8
@@ -64,14 +64,6 @@ PERFECT = 1e-4
 """Fraction of the motion by which every true sensor differs from the wheels.
 
 Motion capture differs by less than 1e-3 on a good floor.
-"""
-
-
-EXPECTED = math.sqrt(0.5)
-"""Standard deviation that the odometry expects, as a fraction of that of the jackknife.
-
-The jackknife widens it, because a few blocks must not seem to know more than they do. On simulated
-robots of five kinds the mean square of the true error was 0.2 to 0.6 of the jackknife's variance.
 """
 
 
@@ -239,6 +231,8 @@ class Candidate(Struct, frozen=True):
 
     made: Prepared
     fitted: Fit
+    covariance: Floats
+    """Covariance of the parameters, shape (COUNT, COUNT)."""
     rows: Rows
     """The turns of the log, without the gyro's errors."""
     rate: Rates
@@ -256,7 +250,8 @@ def _calibrated(
     headings = heading.of_gyro(log.runs) or heading.of_yaw(log.runs, base.gain)
     candidates: list[Candidate] = []
     refusals: list[RefusedError] = []
-    for length in LENGTHS_S[headings is not None]:
+    places = any(len(run.place) for run in log.runs)
+    for length in LENGTHS_S[headings is None : None if places else 1]:
         try:
             made = prepared(log.runs, headings, base, length)
             if candidates and len(made.parts) < ENOUGH_BLOCKS:
@@ -286,9 +281,9 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
     base, own = best.made.base, best.result.own()
     now = Deviations.of(odometry, base)
     return Deviations(
-        now.track if TRACK in best.kept else EXPECTED * own.track,
-        now.ratio if RATIO in best.kept else EXPECTED * own.ratio,
-        EXPECTED * own.scale if best.made.segments and len(best.kept) < 2 else now.scale,
+        now.track if TRACK in best.kept else own.track,
+        now.ratio if RATIO in best.kept else own.ratio,
+        own.scale if best.made.segments and len(best.kept) < 2 else now.scale,
     )
 
 
@@ -329,7 +324,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
         )  # fmt: skip
         if fitted.converged:
             candidate = _candidate(made, fitted)
-            track = float(np.sqrt(fitted.covariance()[P.INVERSE_TRACK, P.INVERSE_TRACK]))
+            track = float(np.sqrt(candidate.covariance[P.INVERSE_TRACK, P.INVERSE_TRACK]))
             track /= abs(float(fitted.parameters[P.INVERSE_TRACK]))
             too_wide = plausibility.unsure(candidate.result, track)
             if not kept:
@@ -375,8 +370,10 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     held = folds(fitted, made.parts, drives(made.runs), rate)
     places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in held]
     better = improvement(held, present, base, rows, places, made.steps)
-    result = multipliers(fitted.parameters, fitted.covariance(), rate)
-    return Candidate(made, fitted, rows, rate, gyro_bias, result, better, {})
+    covariance = fitted.covariance([part.run for part in made.parts])
+    result = multipliers(fitted.parameters, covariance, rate)
+    better = replace(better, apart=result.apart(base))
+    return Candidate(made, fitted, covariance, rows, rate, gyro_bias, result, better, {})
 
 
 def _calibration(
@@ -412,7 +409,7 @@ def _calibration(
         reference=" and ".join(delays), drives=totals, configured=configured(base),
         multipliers=result, scale=" and ".join(scale),
         growth=float(fitted.parameters[P.TRACK_GROWTH]),
-        growth_std=float(np.sqrt(fitted.covariance()[P.TRACK_GROWTH, P.TRACK_GROWTH])),
+        growth_std=float(np.sqrt(best.covariance[P.TRACK_GROWTH, P.TRACK_GROWTH])),
         improvement=best.improvement, delays=delays, gyro_bias=best.gyro_bias, notes=tuple(notes),
         odometry=settings(
             known, float(result.values[SEPARATION]), best.kept, odometry,

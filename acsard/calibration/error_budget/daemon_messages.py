@@ -33,8 +33,7 @@ MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 SHARE_COARSE = 0.1
-"""Share of the lines that are those of coarse encoders, from which on the tool says so. The daemon
-takes seconds to find counts that the speeds show."""
+"""Share of the lines that are those of coarse encoders, from which on the tool says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
 """Number and fraction of the daemon's feedback lines that may be missing here.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -60,9 +60,12 @@ def log_of(log: str | Table) -> reading.Log:
     return reading.runs(read(log.encode()) if isinstance(log, str) else log)
 
 
-def log_of_runs(drives: Iterable[Drive], *, gyro: bool = True, places: bool = True) -> reading.Log:
-    """Return a log in which each drive is a run."""
-    runs = [log_of(table(seen, gyro=gyro, places=places)).runs[0] for seen in drives]
+def log_of_runs(
+    drives: Iterable[Drive], *, gyro: bool = True, places: bool = True,
+    recorded: Callable[..., Table] = table,
+) -> reading.Log:  # fmt: skip
+    """Return a log in which each drive is a run. `recorded` makes the table of a drive."""
+    runs = [log_of(recorded(seen, gyro=gyro, places=places)).runs[0] for seen in drives]
     named = [structs.replace(run, name=str(at + 1)) for at, run in enumerate(runs)]
     return reading.Log(tuple(named), ())
 

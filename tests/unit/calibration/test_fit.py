@@ -52,6 +52,24 @@ def test_its_deviations_cover_the_truth_however_errors_hang_together(
     assert 0.6 < np.std(z) < 1.2
 
 
+def test_errors_that_last_for_a_run_are_seen_by_leaving_out_runs() -> None:
+    """Each of six runs of four blocks has errors of its own, which neighbours alone do not show."""
+    known, runs = np.diag([0.0] * 3 + [1.0] * (COUNT - 3)), np.repeat(np.arange(6), 4)
+    normal = np.zeros((24, COUNT, COUNT))
+    normal[:, range(3), range(3)] = 1.0
+    z: dict[bool, list[float]] = {True: [], False: []}
+    for seed in range(30):
+        errors = np.random.default_rng(seed).normal(0.0, 0.02, (6, 3))[runs]
+        mean = errors.mean(axis=0)
+        score = np.pad(errors - mean, ((0, 0), (0, COUNT - 3)))
+        found = Fit(START, normal, score, known, tuple(P)[:3], True, {})
+        for by_run, told in z.items():
+            std = np.sqrt(np.diag(found.covariance(runs.tolist() if by_run else ())))
+            told += (mean / std[:3]).tolist()
+    with_runs, alone = (float(np.sqrt(np.mean(np.square(z[key])))) for key in (True, False))
+    assert 0.5 < with_runs < 1.0 < alone
+
+
 def test_without_a_block_is_what_a_fit_without_it_gives() -> None:
     found = fitted(np.random.default_rng(5), 0.01, 0.05)
     out = np.arange(20) == 4

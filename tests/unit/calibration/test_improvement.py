@@ -83,6 +83,13 @@ def test_a_slow_curve_is_no_straight() -> None:
     assert better.straight.before < 5.0
 
 
+def test_a_straight_of_half_a_metre_shows_no_error_after_ten() -> None:
+    curves = [(8.0, 0.2, 1.0), (8.0, 0.2, -1.0)] * 2
+    _, better = held(ideal([(3.0, 0.0, 0.0), *curves, (3.0, 0.17, 0.0), *curves]), places=False)
+    assert better.straight.before is None
+    assert better.turn.before is not None
+
+
 def test_one_track_for_all_rates_turns_as_far_at_the_mean_rate() -> None:
     fixed = with_constant_track(np.array([1, 1, 0.6, 0.1, 0, 0, 0]), RATE)
     assert fixed.tolist() == pytest.approx([1, 1, 0.6 * 0.95, 0, 0, 0, 0])
@@ -96,3 +103,14 @@ def test_a_gain_is_sure_beyond_two_deviations_or_if_the_error_is_halved(
     gain: float, chance: float, sure: bool
 ) -> None:
     assert replace(UNMEASURED, gain=gain, chance=chance).sure == sure
+
+
+@pytest.mark.parametrize(
+    ("apart", "gain", "sure"),
+    [(1.5, 0.8, False), (2.5, 0.8, True), (2.5, 0.15, False), (4.0, 0.15, True),
+     (4.0, 0.05, False), (4.0, -0.1, False)],
+)  # fmt: skip
+def test_multipliers_that_are_far_from_the_configured_ones_need_less_gain(
+    apart: float, gain: float, sure: bool
+) -> None:
+    assert replace(UNMEASURED, gain=gain, chance=0.1, apart=apart).sure == sure
