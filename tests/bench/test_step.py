@@ -18,7 +18,14 @@ from time import thread_time_ns
 
 import pytest
 
-from acsard.core.config.settings import Config, DriveConfig, OdometryConfig, SimConfig, WheelMap
+from acsard.core.config.settings import (
+    Config,
+    DriveConfig,
+    McuConfig,
+    OdometryConfig,
+    SimConfig,
+    WheelMap,
+)  # fmt: skip
 from acsard.core.link.codec import Codec
 from acsard.core.link.lines import LineReader
 from acsard.core.messages.encodings import encode
@@ -47,8 +54,9 @@ ALL = Config(
         distance_scale_std=0.002,
     ),
     sim=SimConfig(encoder_counts=400, track_multiplier=1.6, gyro_bias=0.01, gyro_noise=0.005),
+    mcu=McuConfig(encoder_counts=400, link_check="off"),
 )
-"""Every part has work: four parameters, a gyro at 100 Hz, and counts that the lines show."""
+"""Every part has work: four parameters, a gyro at 100 Hz, and counts that plain lines show."""
 
 
 class Timed:
