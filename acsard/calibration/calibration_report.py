@@ -210,31 +210,26 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
 
 def _better(report: Report) -> list[str]:
     """Return sentences about the improvement that the calibration brings."""
-    sentences = []
-    for before, after, words, unit, factor in (
-        (report.turn_error_before, report.turn_error_after,
-         "error of a turn of 360 deg: {} now, {} with the new values", "deg", 1),
-        (report.straight_error_before, report.straight_error_after,
-         "heading error after 10 m straight ahead: {} now, {} with the new values", "deg", 1),
-        (report.heading_error_before, report.heading_error_after,
-         "heading error over whole drives: {} now, {} with the new values", "deg", 1),
-        (report.position_error_before, report.position_error_after,
-         "position error over whole drives: {} now, {} with the new values", "cm", 100),
-    ):  # fmt: skip
-        if before is not None and after is not None:
-            sentences.append(
-                words.format(f"{_two(before * factor)} {unit}", f"{_two(after * factor)} {unit}")
-            )
-    for before, after, words, unit, factor in (
-        (report.heading_noise_before, report.heading_noise_after, "heading", "deg", 1),
-        (report.distance_noise_before, report.distance_noise_after, "distance", "cm", 100),
-    ):
-        if before is not None and after is not None:
-            sentences.append(
-                f"chance errors of the {words} after {METRES:g} m, as the odometry states them: "
-                f"{_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
-                "values"
-            )
+    noise = f"chance errors of the {{}} after {METRES:g} m, as the odometry states them"
+    sentences = [
+        f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
+        "values"
+        for before, after, words, unit, factor in (
+            (report.turn_error_before, report.turn_error_after,
+             "error of a turn of 360 deg", "deg", 1),
+            (report.straight_error_before, report.straight_error_after,
+             "heading error after 10 m straight ahead", "deg", 1),
+            (report.heading_error_before, report.heading_error_after,
+             "heading error over whole drives", "deg", 1),
+            (report.position_error_before, report.position_error_after,
+             "position error over whole drives", "cm", 100),
+            (report.heading_noise_before, report.heading_noise_after,
+             noise.format("heading"), "deg", 1),
+            (report.distance_noise_before, report.distance_noise_after,
+             noise.format("distance"), "cm", 100),
+        )
+        if before is not None and after is not None
+    ]  # fmt: skip
     return [*sentences, "(measured on drives that the fit did not use)"] if sentences else []
 
 

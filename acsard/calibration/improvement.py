@@ -56,7 +56,7 @@ NEAR, FAR = 2.0, 3.0
 """Distances of the new multipliers from the configured ones, in standard deviations.
 
 Below `NEAR` the log does not contradict the configured ones. Chance explains a distance beyond
-`FAR` in one log of thirty. Then a gain by one standard deviation is enough.
+`FAR` in one log of thirty. Beyond it the necessary gain falls: it is half as large at twice `FAR`.
 """
 
 LEAST_SQUARE = 1e-9
@@ -87,8 +87,8 @@ class Improvement(Struct, frozen=True):
     @property
     def sure(self) -> bool:
         """Whether the new multipliers are better by more than chance explains."""
-        least = self.chance if self.apart > FAR else min(SURE * self.chance, HALVED)
-        return self.apart > NEAR and self.gain > least
+        least = SURE * self.chance * min(1.0, FAR / max(NEAR, self.apart))
+        return self.apart > NEAR and self.gain > min(least, HALVED)
 
 
 UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)

@@ -107,8 +107,8 @@ def test_a_gain_is_sure_beyond_two_deviations_or_if_the_error_is_halved(
 
 @pytest.mark.parametrize(
     ("apart", "gain", "sure"),
-    [(1.5, 0.8, False), (2.5, 0.8, True), (2.5, 0.15, False), (4.0, 0.15, True),
-     (4.0, 0.05, False), (4.0, -0.1, False)],
+    [(1.5, 0.8, False), (2.5, 0.8, True), (2.5, 0.15, False), (3.5, 0.15, False), (6.0, 0.15, True),
+     (6.0, 0.05, False), (60.0, -0.01, False)],
 )  # fmt: skip
 def test_multipliers_that_are_far_from_the_configured_ones_need_less_gain(
     apart: float, gain: float, sure: bool

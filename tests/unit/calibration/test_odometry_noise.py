@@ -165,8 +165,11 @@ ONE_WAY = {
         replace(SKID, place_hz=10.0), recorded=held
     ),
     ("skid, IMU on its side", "gyro"): Set(SKID, recorded=lying),
+    ("skid, five minutes", "positions"): Set(SKID, seconds=300.0),
+    ("differential, five minutes", "positions"): Set(DIFFERENTIAL, seconds=300.0),
+    ("differential, five minutes", "both"): Set(DIFFERENTIAL, seconds=300.0),
 }
-"""Sets that are about one sensor."""
+"""Sets that are about some sensors only."""
 
 ROWS = {(name, way): kind for name, kind in SETS.items() for way in WAYS} | ONE_WAY
 
