@@ -168,7 +168,7 @@ def slow_drives(seed: int, **other: float) -> list[Drive]:
     return [drive(robot, slow_squares(turn=turn)) for turn in (0.3, -0.3) * 2]
 
 
-@pytest.mark.parametrize("seed", [3, 6])
+@pytest.mark.parametrize("seed", [1, 3, 6])
 def test_slow_squares_of_a_sound_robot_make_it_no_worse(seed: int) -> None:
     """The errors of the wheels hide the small turns of a short block, so its track is too wide."""
     log = log_of_runs(slow_drives(seed, wheel_noise=0.05), gyro=False)
