@@ -212,12 +212,12 @@ class Fit(Struct, frozen=True):
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
-        # Leaving out whole runs or neighbouring blocks shows errors that last longer than a block.
-        longer = alone // 2 if len(alone) >= MANY else alone
-        longer = np.array(runs) if len(set(runs)) >= LEAST_BLOCKS else longer
-        wider = np.sqrt(
-            np.maximum(size, self._changes(longer)[1]) / np.maximum(change**2, 1e-150).sum(axis=0)
-        )
+        # Leaving out neighbouring blocks or whole runs shows errors that last longer than a block.
+        if len(alone) >= MANY:
+            size = np.maximum(size, self._changes(alone // 2)[1])
+        if len(set(runs)) >= LEAST_BLOCKS:
+            size = np.maximum(size, self._changes(np.array(runs))[1])
+        wider = np.sqrt(size / np.maximum(change**2, 1e-150).sum(axis=0))
         chance = change.T @ change * np.outer(wider, wider)
         usual = np.zeros(COUNT)
         usual[list(self.usual)] = np.array(list(self.usual.values())) ** -2
@@ -238,6 +238,7 @@ class Fit(Struct, frozen=True):
         )
         squares = np.maximum(change**2, 1e-150)
         free = 3 * squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0) - 2
+        free = np.minimum(free, len(change) - 1)
         return change, (1 - 1 / len(change)) * student_factor(free) * squares.sum(axis=0)
 
 

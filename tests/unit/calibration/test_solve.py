@@ -129,8 +129,9 @@ def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> N
             ratios.append(off / found.multipliers.ratio_std)
     track, ratio = (float(np.sqrt(np.mean(np.square(z)))) for z in (tracks, ratios))
     print(f"{kind}, {way}: rms z {track:.2f} of the track, {ratio:.2f} of left to right")
-    assert 0.5 < track < 1.4
-    assert 0.5 < ratio < 1.4
+    least = 0.7 if way == "gyro" else 0.5
+    assert least < track < 1.4
+    assert least < ratio < 1.4
 
 
 @so_many
@@ -357,7 +358,7 @@ def test_coarse_positions_are_compared_over_a_longer_time() -> None:
     rng = np.random.default_rng(5)
     made = drive(Robot(place_noise=0.7, outliers=0.0, rng=rng), wander(rng, 600.0))
     found = calibrated(table(made, gyro=False)).multipliers
-    assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
+    assert abs(found.values[0] - 1.6 * 1.045) < 2 * found.std[0]
 
 
 @pytest.mark.slow
