@@ -327,9 +327,9 @@ def test_a_calibration_describes_drives_that_were_not_seen(name: str, way: str) 
         f"{row.track:.2f} | {row.ratio:.2f} | {row.refused} |"
     )
     coarse = name.startswith(COARSE)
-    assert (0.25 if coarse and way == "positions" else 0.5) < row.heading < 2.0
+    assert (0.25 if coarse and way != "gyro" else 0.5) < row.heading < 2.0
     if way != "gyro":
-        assert (1.3 if coarse else 1.5) < row.nees < 6.0
+        assert (1.0 if coarse else 1.5) < row.nees < 6.0
         assert (0.25 if coarse else 0.5) < row.distance < 2.0
     if shown:
         fine = (name, way) in FINE
