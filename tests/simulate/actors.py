@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from tests.simulate.bumpers import Bumpers
+from tests.simulate.board_inputs import Inputs
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
@@ -28,7 +28,7 @@ from tests.simulate.plan import Plan
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
-from tests.simulate.promises import DIALECTS, BrokenError, Witness
+from tests.simulate.promises import DIALECTS, INPUTS, BrokenError, Witness
 from tests.simulate.reasons import Reasons
 from tests.simulate.reports import Echo, Reports, judge_pose, judge_state
 from tests.simulate.roads import NS, Message, messages, parameters, read_reply, sample
@@ -40,6 +40,9 @@ counts from its arrival on."""
 
 PLACING = {"set_pose", "reset_odometry"}
 """Calls that set the pose."""
+
+NO_TROUBLE = DIALECTS | INPUTS
+"""Faults of the board that give no trouble."""
 
 
 class Result(NamedTuple):
@@ -95,7 +98,7 @@ class Run:
         self.liveness = Liveness(self)
         self.plugging = Plugging(self.witness.period_ns)
         self.reasons = Reasons(self)
-        self.bumpers = Bumpers(self.witness)
+        self.inputs = Inputs(self.witness, plan["board"])
         self.failure: BrokenError | None = None
         self.todo: list[tuple[int, int, Callable[[], None]]] = []
         self._order = 0
@@ -308,7 +311,7 @@ class Run:
                 return
             match verb:
                 case "clear":
-                    self.bumpers.cleared(true_ns)
+                    self.inputs.cleared(true_ns)
                     witness.cleared(true_ns, read_ns, text, event["by"])
                 case "activate":
                     witness.activated(true_ns, read_ns, event["by"])
@@ -361,6 +364,7 @@ class Run:
                 if deaf_ns > 12 * NS // 10:
                     self.at(self.true_ns + deaf_ns, self._hears_again)
             case "unplug":
+                self.inputs.lost()
                 product.unplug()
                 self.pose.doubt()
                 self.at(self.true_ns + NS // 2, self._look)
@@ -419,12 +423,12 @@ class Run:
         self.product.board(list(self.active))
         self._names = {name for name, _ in self.active}
         new = [one for one in self.active if one not in self.lasting]
-        self._troubling = [name for name, _ in new if name not in DIALECTS]
+        self._troubling = [name for name, _ in new if name not in NO_TROUBLE]
         added = self.active[len(self.lasting) :]
-        self.witness.lies = [fault for fault in added if fault[0] not in DIALECTS]
+        self.witness.lies = [fault for fault in added if fault[0] not in NO_TROUBLE]
 
     def _troubled(self, name: str) -> None:
-        if name not in DIALECTS:
+        if name not in NO_TROUBLE:
             self.witness.troubles[name] = self.true_ns
         if name in LIARS:
             self.pose.doubt(name == "mute")
@@ -440,6 +444,7 @@ class Run:
         self.echo.on = "echo" in self._names
         if fault[0] == "echo" and self.product.plugged:
             # The daemon asks for this, and drives no more until it was done.
+            self.inputs.lost()
             self.product.unplug()
             self.at(self.true_ns + NS // 10, lambda: self.plug(False))
 
@@ -459,6 +464,7 @@ class Run:
         product, true_ns = self.product, self.true_ns
         if not product.alive or not product.plugged:
             return
+        self.inputs.lost()
         product.unplug()
         product.reset(2 * NS)
         self.pose.doubt()
@@ -481,6 +487,7 @@ class Run:
             witness.ending_ns = self.true_ns
         product.end(event["way"])
         self._raise()
+        self.inputs.lost()
         if self._whole:
             witness.ended(self.true_ns, moving)
         self._take_answers()
@@ -506,6 +513,7 @@ class Run:
             self.reports, self.followed = Reports(), Followed(witness)
             self.log_lines = LogLines()
             self.spread.forget()
+            self.inputs.new_life()
             self.pose.latest = None
             self.damage.forget()
             self.reasons.restart()
@@ -523,7 +531,7 @@ class Run:
             self.liveness.event()  # also as the first bytes of all, and if the line is damaged
         if self._plain:
             self.damage.fed(data)
-        self.bumpers.fed(at_ns - START_NS + self.slept_ns, data)
+        self.inputs.fed(at_ns, data)
         if b"ap" not in data and b"an" not in data:
             return  # The board greets, or the line is noisy while it boots.
         if "endless" in self._names and b"\n" not in data and not self.echo.on:
@@ -586,6 +594,7 @@ class Run:
             self._full_ns = true_ns
         if witness.blocked_ns is not None:
             self._blocked_ns = true_ns
+        self.inputs.take(seen.decided_ns, offset, self._stalled_ns - offset)
         if self._calls:
             self._take_answers()
             self._late_answers(true_ns)
@@ -602,6 +611,11 @@ class Run:
             clock = self.reports.follows(true_ns, seen.followed_ns)
             if clock:
                 witness.ages.clocks[clock].followed = True
+        if self.inputs.limiting:
+            # Any command may disarm all senders, and the robot follows only a part of it.
+            witness.disarmed_ns = max(witness.disarmed_ns, true_ns)
+            self.followed.forget()
+            self.liveness.event()
         self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.linked = seen.link == "up"
@@ -615,7 +629,8 @@ class Run:
                 self.echo.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
-        driven = self.followed.wish if seen.mode == "driving" and not witness.pending else None
+        told = seen.mode == "driving" and not witness.pending and not self.inputs.limiting
+        driven = self.followed.wish if told else None
         whole = sum(line.endswith(b"\n") for _, line in seen.lines)
         self.course.step(true_ns, driven, witness.last, whole)
         self.liveness.look(true_ns)
@@ -633,8 +648,9 @@ class Run:
         if self.pose.end_step():
             self.spread.forget()
         self.log_lines.see(true_ns, seen)
-        self.bumpers.step(true_ns, seen.decided_ns + offset, seen.lines)
         calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
+        calm = seen.decided_ns - calm_ns > 3 * witness.period_ns
+        self.inputs.step(true_ns, seen, offset, calm, self.product.state)
         self.plugging.see(true_ns, seen, self.product, calm_ns)
         if self.log is not None:
             self.log(

@@ -126,7 +126,8 @@ class Followed:
             return False
         if not sample.clock:
             # A zero of a shared identity counts only behind its pause.
-            armed = not witness.neutral_first or wish.armed_ns > witness.armed_since_ns
+            since_ns = max(witness.armed_since_ns, witness.disarmed_ns)
+            armed = not witness.neutral_first or wish.armed_ns > since_ns
             return wish.certain and (armed or not sample.shared)
         if sample.clock in witness.shared_clocks or not stable(sender):
             return False

@@ -38,6 +38,9 @@ SETTLES_NS = 3 * NS
 PROOF_NS = 2 * NS
 """A new sender shows a steady delay for this time before its commands count."""
 
+CHARGED_NS = 15 * NS
+"""The mean of a battery that was empty rises above all thresholds within this time."""
+
 PAUSE_NS = 3 * NS // 20
 """Longest time between two commands of a sender that does not pause."""
 
@@ -225,6 +228,8 @@ class Liveness:
         boots_ns = int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS)
         # The last sender of a source keeps it for the source's timeout.
         run.run_to(run.true_ns + max(boots_ns, *run.witness.timeout.values()))
+        if "battery" in run.plan["config"]:
+            run.run_to(run.true_ns + CHARGED_NS)
         for _ in range(3):
             verbs = {"fault": "clear", "stopped": "clear", "inactive": "activate"}
             verb = verbs.get(product.state()["mode"])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from tests.simulate import bumpers
+from tests.simulate import board_inputs
 from tests.simulate.product import problems
 
 Plan = dict[str, Any]
@@ -90,7 +90,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     _draw_lawful_driver(random.Random(f"lawful driver {seed}"), plan)
     events = _events(dice, kinds, length, config, plan["senders"])
     plan["events"] = sorted(events, key=lambda one: one["at"])
-    bumpers.add(plan)
+    board_inputs.add(plan)
     return plan
 
 

@@ -26,6 +26,12 @@ class Fault(NamedTuple):
     """The symptom that a person would notice."""
     edits: tuple[Edit, ...]
 
+    @property
+    def kind(self) -> str:
+        """The kind of inputs of the plans that are played, "" for all plans."""
+        first = self.name.split()[0]
+        return first if first in ("estop", "away", "battery") else ""
+
 
 def fault(name: str, breaks: str, module: str, old: str, new: str, *more: Edit) -> Fault:
     return Fault(name, breaks, (Edit(module, old, new), *more))
@@ -45,6 +51,11 @@ COMMANDS, KINEMATICS, CODEC = (
     "core/incoming/commands.py",
     "core/motion/kinematics.py",
     "core/link/codec.py",
+)
+EMERGENCY_STOP, BUMPERS, BATTERY = (
+    "core/motion/emergency_stop.py",
+    "core/motion/bumpers.py",
+    "core/motion/battery.py",
 )
 
 JUDGING = """
@@ -702,5 +713,144 @@ FAULTS = (
         VALUES,
         "return Latches(stop, fault, inactive, self.lowered)",
         "return Latches(stop, None, inactive, self.lowered)",
+    ),
+    # inputs of the board
+    fault(
+        "estop ramp",
+        "a robot whose emergency stop is pressed ramps down",
+        ROBOT,
+        "        if estop.pressed_now or bumpers.pressed_now:\n",
+        "        if bumpers.pressed_now:\n",
+    ),
+    fault(
+        "estop latch",
+        "a robot drives again as soon as its emergency stop is released",
+        ROBOT,
+        "            self._life.press(estop.pressed_now, now)\n",
+        "            self._arbiter.require_neutral(now.mono_ns)\n",
+    ),
+    fault(
+        "estop short",
+        "a press that begins and ends during a stall of the host is not seen",
+        EMERGENCY_STOP,
+        "        for at_ns, status in reports:\n",
+        "        for at_ns, status in [*reports][-1:]:\n",
+    ),
+    fault(
+        "estop late",
+        "a pressed emergency stop waits up to 25 ms for its first zero",
+        ROBOT,
+        "        due = inputs.tick or (inputs.at_once and news)\n",
+        "        due = inputs.tick or (inputs.at_once and news)\n"
+        "        due = due and not (self._estop.why and inputs.now.mono_ns % 10**8 < 25 * 10**6)\n",
+    ),
+    fault(
+        "estop clear",
+        "a clear works while the emergency stop is pressed",
+        LIFECYCLE,
+        "        if self._held:\n",
+        "        if False:\n",
+    ),
+    fault(
+        "estop silent",
+        "a robot drives for 2 s without reports of its emergency stop",
+        EMERGENCY_STOP,
+        "SILENT_S = 0.5\n",
+        "SILENT_S = 2.0\n",
+    ),
+    fault(
+        "estop hasty",
+        "two lost status lines stop the robot",
+        EMERGENCY_STOP,
+        "SILENT_S = 0.5\n",
+        "SILENT_S = 0.25\n",
+    ),
+    fault(
+        "estop needed",
+        "a robot is ready before its board has reported the inputs that it needs",
+        ROBOT,
+        "            self._life.link(up=not (self._estop.missing or self._bumpers.missing))\n",
+        "            self._life.link(up=True)\n",
+    ),
+    fault(
+        "estop state",
+        "`state` calls a pressed emergency stop released",
+        ROBOT,
+        "            estop=self._estop.state,\n",
+        '            estop="released" if self._estop.state else "",\n',
+    ),
+    fault(
+        "away towards",
+        "a robot drives towards its pressed bumper",
+        BUMPERS,
+        '{"front": -1, "rear": 1, ',
+        '{"front": 1, "rear": -1, ',
+    ),
+    fault(
+        "away fast",
+        "a robot drives away from its bumper at 0.3 m/s",
+        BUMPERS,
+        "AWAY_SPEED = 0.1\n",
+        "AWAY_SPEED = 0.3\n",
+    ),
+    fault(
+        "away turns",
+        "a corner of the robot sweeps into the obstacle while it drives away",
+        BUMPERS,
+        "return Twist(self._direction() * min(speed, AWAY_SPEED)) if",
+        "return Twist(self._direction() * min(speed, AWAY_SPEED), twist.angular) if",
+    ),
+    fault(
+        "away pushes",
+        "a sender that pushes against the obstacle drives on at the release of the bumper",
+        ROBOT,
+        "            self._arbiter.require_neutral(now_ns)\n"
+        "            # Without the commands so far nothing is left to follow.\n"
+        "            self._choice = self._arbiter.choose(now_ns)\n",
+        "            self._choice = Choice()\n",
+    ),
+    fault(
+        "away silent",
+        "a robot that may drive away from its bumpers drives on without reports of them",
+        BUMPERS,
+        'return not self._away or self.state == "silent"',
+        "return not self._away",
+    ),
+    fault(
+        "battery stop",
+        "an empty battery does not stop the robot",
+        ROBOT,
+        "        if battery.stopped_now:\n",
+        "        if False:\n",
+    ),
+    fault(
+        "battery cut",
+        "an empty battery stops the robot without a ramp",
+        ROBOT,
+        "            self._life.press(battery.why, now)\n",
+        "            self._life.press(battery.why, now)\n"
+        "            self._limiter.cut()\n"
+        "            self._made = self._said = (self._limiter.state, self._made_ns)\n",
+    ),
+    fault(
+        "battery start",
+        "the current of a motor start changes the level of the battery",
+        BATTERY,
+        "TIME_CONSTANT_S = 10.0\n",
+        "TIME_CONSTANT_S = 0.5\n",
+    ),
+    fault(
+        "battery clear",
+        "a clear works while the battery is empty",
+        ROBOT,
+        "        elif battery.held:\n",
+        "        elif False:\n",
+    ),
+    fault(
+        "battery level",
+        "the level of the battery rises as soon as the motors stop",
+        BATTERY,
+        "            rise = self._config.hysteresis if",
+        "            rise = 0.0 if",
     ),
 )

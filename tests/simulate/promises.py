@@ -53,7 +53,6 @@ STAND_NS = 2 * NS
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
     "stalls", "sparse_replies", "echo", "plain_only", "endless", "wrong_baud", "reset", "suspend",
-    "bumpers", "bumper_pressed",
 }  # fmt: skip
 """Troubles of the board for which the robot may not latch a fault."""
 
@@ -66,6 +65,12 @@ CLEARLY = 4.0
 
 DIALECTS = {"unpadded", "spaces", "trailing_comma", "no_sample", "no_check"}
 """Forms of the protocol that give the daemon no trouble."""
+
+INPUTS = {
+    "estop", "estop_pressed", "estop_silent", "bumpers", "bumper_pressed", "bumpers_silent",
+    "battery",
+}  # fmt: skip
+"""Faults of the simulated board that report inputs. They give no trouble to lines and wheels."""
 
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
 """Refused messages that may have been speeds of a program that shares its identity, so a zero
@@ -163,7 +168,8 @@ class Witness:
         self.linked = True
         """The daemon says that the link to the board is up."""
         self.disarmed_ns = -1
-        """Until then a gap between the lines with a check may have disarmed every sender."""
+        """Until then a command towards a pressed bumper, or a gap between lines with a check, may
+        have disarmed every sender."""
         self.cut = False
         """The link was lost since the last line, so the speed starts over from zero."""
         self.pending: dict[str, int] = {}

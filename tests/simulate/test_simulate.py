@@ -25,7 +25,7 @@ from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
 from tests.simulate.ages import Ages
-from tests.simulate.bumpers import Bumpers
+from tests.simulate.board_inputs import Inputs, kinds
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.differences import CORRECTED, REWORDED
@@ -182,42 +182,162 @@ def test_the_witness_sees_what_must_not_be(what: Callable[[Witness], None], prom
 
 
 FREE, HIT = b"!status bumpers=..\r\n", b"!status bumpers=X.\r\n"
-MOVES = (0, b"ap00.02,bp00.02,cp00.02,dp00.02\r\n")
+OK, PRESSED = b"!status estop=ok*9C94\r\n", b"!status estop=pressed\r\n"
+RESTS, MOVES = [
+    (0, b",".join(letter + speed for letter in (b"a", b"b", b"c", b"d")) + b"\r\n")
+    for speed in (b"p00.00", b"p00.02")
+]
 
 
-def test_a_bumper_in_a_status_line_is_a_stop_behind_which_nothing_may_move() -> None:
-    witness = witnessed()
-    bumpers = Bumpers(witness)
-    bumpers.fed(NS, FREE + HIT[:8])
-    bumpers.step(NS, NS, [MOVES])
-    assert witness.stops == []
-    bumpers.fed(2 * NS, HIT[8:] + HIT)
-    assert witness.stops == [2 * NS]
-    bumpers.step(2 * NS + 1, 2 * NS, [MOVES])
+class Bench:
+    """The judge of the inputs beside a witness, without a product. Times are in s."""
+
+    def __init__(self, **safety: Any) -> None:
+        config = PLAIN["config"] | {"safety": safety}
+        self.witness = Witness(config)
+        self.witness.step(NS // 2, "driving", "driving: commanded by app")
+        self.inputs = Inputs(self.witness, [["estop"], ["bumpers"]])
+        self.state: dict[str, Any] = {}
+
+    def step(self, at: float, data: bytes = b"", mode: str = "stopped", *lines: Any) -> None:
+        """Have a step read these bytes and send these lines."""
+        at_ns = round(at * NS)
+        if not self.state:
+            self.inputs._looked_ns = at_ns  # `state` is not judged
+        if data:
+            self.inputs.fed(at_ns, data)
+        self.inputs.take(at_ns, 0, -NS)
+        seen = Seen(at_ns, at_ns, mode, "a reason", None, "up", [*lines], ())
+        self.inputs.step(at_ns, seen, 0, True, lambda: self.state)
+
+
+def test_a_pressed_input_is_a_stop_until_its_release_and_a_clear_behind_that() -> None:
+    bench = Bench(bumpers=["front", "rear"])
+    bench.step(1.0, FREE + OK + HIT[:8], "driving", MOVES)
+    assert bench.witness.stops == []
+    bench.step(1.2, HIT[8:] + HIT + OK, "stopped", RESTS)
+    assert bench.witness.stops == [12 * NS // 10]
     with pytest.raises(BrokenError, match="nothing moves while a bumper is pressed"):
-        bumpers.step(2 * NS + 1, 2 * NS + 1, [MOVES])
-    with pytest.raises(BrokenError, match="no clear works while a bumper is pressed"):
-        bumpers.cleared(2 * NS + 1)
-    bumpers.fed(3 * NS, FREE)
-    bumpers.step(3 * NS + 1, 3 * NS + 1, [MOVES])
-    bumpers.cleared(4 * NS)
+        bench.step(1.3, b"", "stopped", MOVES)
+    with pytest.raises(BrokenError, match="a bumper that is pressed stops the robot"):
+        bench.step(1.3, b"", "ready")
+    bench.step(1.4, FREE + PRESSED + OK, "stopped", RESTS)
+    assert len(bench.witness.stops) == 2
+    bench.step(1.5, OK.replace(b"9C94", b"9C95"))
+    bench.step(1.6, PRESSED, "stopped", RESTS)
+    with pytest.raises(BrokenError, match="no clear works while an emergency stop is pressed"):
+        bench.inputs.cleared(17 * NS // 10)
+    bench.step(1.8, OK)
+    bench.inputs.cleared(2 * NS)
     with pytest.raises(BrokenError, match="nothing moves after a stop"):
-        moves(witness, 3.0)
+        moves(bench.witness, 2.0)
 
 
-def test_some_plans_have_bumpers_and_no_other_trouble_of_the_board() -> None:
-    plans = [one for one in map(made, range(100)) if "safety" in one["config"]]
-    assert 3 <= len(plans) <= 16
-    for one in plans:
-        faults = {event["fault"][0] for event in one["events"] if event["do"] == "board"}
-        assert faults == {"bumper_pressed"}
-        assert not {"reset", "restart", "unplug"} & {event["do"] for event in one["events"]}
+@pytest.mark.parametrize(
+    ("at", "mode", "promise"),
+    [
+        (1.45, "stopped", "no stop without a cause"),
+        (1.53, "stopped", ""),
+        (1.53, "driving", ""),
+        (1.65, "driving", "an emergency stop that is pressed stops the robot"),
+    ],
+)
+def test_an_input_that_is_silent_for_half_a_second_counts_as_pressed(
+    at: float, mode: str, promise: str
+) -> None:
+    bench = Bench()
+    bench.step(1.0, OK, "driving", MOVES)
+    with pytest.raises(BrokenError, match=promise) if promise else nullcontext():
+        bench.step(at, b"", mode)
+
+
+def test_a_press_without_a_line_in_the_next_period_is_a_finding() -> None:
+    for line in (RESTS, None):
+        bench = Bench()
+        bench.step(1.0, OK, "driving", MOVES)
+        bench.step(1.01, PRESSED)
+        if line:
+            bench.step(1.02, b"", "stopped", line)
+        with nullcontext() if line else pytest.raises(BrokenError, match="within a period"):
+            bench.step(1.03)
+
+
+@pytest.mark.parametrize(
+    ("marks", "motors", "finding"),
+    [
+        (b"X...", (-1, -1), False),
+        (b"X...", (1, 1), True),
+        (b"X...", (-1, -0.9), True),
+        (b"X...", (-3, -3), True),
+        (b".X..", (1, 1), False),
+        (b"XX..", (-1, -1), True),
+        (b"..X.", (-1, -1), True),
+        (b"X..X", (-1, -1), False),
+    ],
+)
+def test_a_robot_drives_only_away_from_its_pressed_bumpers(
+    marks: bytes, motors: tuple[float, float], finding: bool
+) -> None:
+    bench = Bench(bumpers=["front", "rear", "left", "front"], bumper="away")
+    bench.step(1.0, b"!status bumpers=....\r\n", "driving", MOVES)
+    bench.step(1.1, b"!status bumpers=%b\r\n" % marks, "ready", RESTS)
+    assert bench.witness.stops == []
+    assert bench.witness.armed_since_ns == 11 * NS // 10
+    witness = bench.witness
+    right, left = (0.05 / witness.radius * motor for motor in motors)
+    words = [b""] * 4
+    for wheel, speed in enumerate((right, left, left, right)):
+        place, sign = witness.motors[wheel]
+        letter = b"n" if speed * sign < 0 else b"p"
+        words[place] = b"%c%b%05.2f" % (b"abcd"[place], letter, abs(speed))
+    with pytest.raises(BrokenError, match="towards a pressed") if finding else nullcontext():
+        bench.step(1.2, b"", "driving", (0, b",".join(words) + b"\r\n"))
+
+
+def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> None:
+    bench = Bench()
+    config = {"measure": "volts", "stop_below": 22.0, "hysteresis": 0.5}
+    bench.witness.config = bench.witness.config | {"battery": config}
+    bench.inputs = Inputs(bench.witness, [["battery"]])
+
+    def report(begin: int, end: int, volts: float, mode: str) -> None:
+        for tenth in range(begin, end):
+            bench.step(tenth / 10, b"!status volts=%05.2f amps=-1.00\r\n" % volts, mode)
+
+    report(10, 100, 23.0, "driving")
+    report(100, 103, 21.0, "driving")
+    with pytest.raises(BrokenError, match="no stop without a cause"):
+        bench.step(10.3, b"", "stopped")
+    bench.step(10.31, b"", "driving")
+    report(104, 160, 21.0, "driving")
+    with pytest.raises(BrokenError, match="an empty battery stops the robot"):
+        report(160, 200, 21.0, "driving")
+    report(200, 210, 21.0, "stopped")
+    assert len(bench.witness.stops) == 1
+    with pytest.raises(BrokenError, match="no clear works while the battery is empty"):
+        bench.inputs.cleared(21 * NS)
+    report(210, 400, 25.0, "stopped")
+    bench.inputs.cleared(40 * NS)
+
+
+def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -> None:
+    plans = list(map(made, range(200)))
+    with_inputs = [one for one in plans if kinds(one)]
+    for kind in ("estop", "stop", "away", "battery"):
+        assert 4 <= sum(kind in kinds(one) for one in plans) <= 30
+    for one in with_inputs:
+        assert problems(one["config"]) == []
+        if kinds(one) == {"stop"}:
+            faults = {event["fault"][0] for event in one["events"] if event["do"] == "board"}
+            assert faults == {"bumper_pressed"}
+            assert not {"reset", "restart", "unplug"} & {event["do"] for event in one["events"]}
         older = pairs.comparable(one)
-        assert "bumper" not in json.dumps([older["config"], older["board"], older["events"]])
+        text = json.dumps([older["config"], older["board"], older["events"]])
+        assert not {"safety", "battery", "estop", "bumper"} & set(re.findall("[a-z]+", text))
 
 
 def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_does() -> None:
-    plan = next(one for one in map(made, range(100)) if "safety" in one["config"])
+    plan = next(one for one in map(made, range(100)) if kinds(one) == {"stop"})
     result = played(plan)
     assert result.finding == ""
     assert result.counts["bumper pressed"] > 0
@@ -225,7 +345,7 @@ def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_doe
     ignored["config"]["safety"]["bumper"] = "off"
     assert played(ignored).promise in (
         "nothing moves after a stop", "nothing moves while a bumper is pressed",
-        "no clear works while a bumper is pressed",
+        "a bumper that is pressed stops the robot", "state has the inputs of the board",
     )  # fmt: skip
 
 

@@ -1,0 +1,588 @@
+"""Plans whose board reports inputs, and their promises: emergency stop, bumpers and battery.
+
+`deploy/firmware/README.md` says what each status line means. `Inputs` reads the bytes that reached
+the daemon and takes each line at the step that takes it, so it knows which lines the daemon has
+read. Where the pages leave open whether a line or a silence counts, it judges nothing.
+
+The plans have dice of their own, so the plans without inputs stay as they are.
+"""
+
+from __future__ import annotations
+
+import binascii
+import random
+import re
+from bisect import insort
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from tests.simulate.ages import MARGIN_NS
+from tests.simulate.product import Seen
+from tests.simulate.promises import INPUTS, LINE, ZERO, BrokenError, Witness
+from tests.simulate.roads import NS
+
+Plan = dict[str, Any]
+
+SHARE, OTHERS = 0.08, 1 / 15
+"""Share of the plans that have bumpers which stop the robot, and share of each other kind."""
+
+PLACES = ("front", "rear", "left", "right")
+
+AWAY = {"front": -1, "rear": 1}
+"""The sign of the speeds that lead away from a bumper. No speed leads away from the others."""
+
+AWAY_SPEED = 0.1
+"""Highest speed away from a pressed bumper, m/s."""
+
+KEPT = ("call", "wall", "stall", "stall in step")
+"""Events that a plan keeps whose bumpers stop the robot."""
+
+SILENT_NS, EXCUSE_NS = NS // 2, NS // 10
+"""An input that is not reported for the first time counts as pressed. Behind a stall of the host
+the daemon waits for the second time, because the lines of that time come with it."""
+
+STOPPED = {"stopped", "fault", "shutdown"}
+"""Modes of a robot that is stopped: a fault and the end of the daemon come before a stop."""
+
+LONGEST = 4096
+"""Bytes of a line that are kept. A status line is much shorter."""
+
+FIELD = (
+    rb"(?:estop=(?:ok|pressed)|bumpers=[.X]{1,4}|driver=(?:ok|fault)|volts=\d{1,2}\.\d\d"
+    rb"|amps=-?\d{1,3}\.\d\d|charge=(?:100|\d{1,2})%|temp=-?\d{1,3}\.\d)"
+)
+STATUS = re.compile(rb"(!status(?: " + FIELD + rb")+)(?:\*([0-9A-F]{4}))?\r?")
+
+CLEAR = {
+    "do": "call", "verb": "clear", "late": 0.01, "lost": False, "twice": False, "by": "op9",
+    "via": "native",
+}  # fmt: skip
+
+
+# plans
+
+
+def add(plan: Plan) -> None:
+    """Give some plans inputs, and operators who clear the stops."""
+    dice = random.Random(f"board inputs {plan['seed']}")
+    # A line without a checksum does not count once the link has the check.
+    if dice.random() <= SHARE and "link_check" not in plan["config"]["mcu"]:
+        _bumpers(plan, dice)
+    kinds = (("emergency stop", _emergency_stop), ("away", _away), ("battery", _battery))
+    for name, give in kinds:
+        dice = random.Random(f"{name} {plan['seed']}")
+        if dice.random() < OTHERS:
+            give(plan, dice)
+    plan["events"].sort(key=lambda one: one["at"])
+
+
+def _bumpers(plan: Plan, dice: random.Random) -> None:
+    """Add bumpers that stop the robot, and leave out the other trouble of the board."""
+    places = [dice.choice(PLACES) for _ in range(dice.randint(1, 4))]
+    plan["config"]["safety"] = {"bumpers": places}
+    plan["board"].append(["bumpers"])
+    events = [event for event in plan["events"] if event["do"] in KEPT]
+    for _ in range(1 + int(plan["seconds"] / 15)):
+        at, lasts = dice.uniform(2.0, plan["seconds"]), dice.choice((0.03, 0.3, 2.0, 6.0))
+        fault = ["bumper_pressed", dice.randint(1, len(places)), 0.0, 0.0]
+        events.append({"at": round(at, 3), "do": "board", "for": lasts, "fault": fault})
+        _clears(dice, events, at, lasts)
+    plan["events"] = events
+
+
+def _clears(dice: random.Random, events: list[Any], at: float, lasts: float) -> None:
+    """Add operators who clear during an event of the board, and one who does so behind it."""
+    for _ in range(dice.randrange(4)):
+        early = round(at + dice.uniform(0.0, lasts + 1.0), 3)
+        events.append({"at": early, **CLEAR, "named": dice.random() < 0.7})
+    late = round(at + lasts + dice.uniform(0.1, 2.0), 3)
+    events.append({"at": late, **CLEAR, "named": True})
+
+
+def _moment(plan: Plan, dice: random.Random) -> float:
+    """Return a time, mostly one at which a sender drives."""
+    drives = [p[0] for s in plan["senders"] for p in s["phases"] if p[1]]
+    if drives and dice.random() < 0.7:
+        return float(min(dice.choice(drives) + dice.uniform(0.2, 3.0), plan["seconds"]))
+    return dice.uniform(1.0, plan["seconds"])
+
+
+def _pressed(
+    plan: Plan, dice: random.Random, press: str, silent: str, number: int = 0, longest: float = 6.0
+) -> tuple[float, float]:
+    """Press an input, or let it fall silent, often beside other trouble; return when and how long.
+
+    The times of the fault are its own, so that it also changes while the host stalls.
+    """
+    events, at = plan["events"], _moment(plan, dice)
+    name, lasts = press, dice.choice((0.005, 0.03, 0.3, 2.0, longest))
+    if dice.random() < 0.25:
+        name, lasts = silent, dice.choice((0.3, 0.48, 0.6, 2.0))
+    after = dice.choice((0.0, 0.0, 0.0, dice.uniform(0.0, 0.5)))
+    numbers = [number] if number and name == press else []
+    fault = [name, *numbers, round(after, 3), lasts]
+    whole = round(after + lasts + 0.3, 3)
+    events.append({"at": round(at, 3), "do": "board", "for": whole, "fault": fault})
+    beside = round(max(1.0, at + dice.choice((-0.3, 0.001, 0.05)) * dice.random()), 3)
+    length = dice.choice((0.05, 0.4, 1.2))
+    match dice.randrange(10):
+        case 0 | 1:
+            how = dice.choice(("stall", "stall in step"))
+            events.append({"at": beside, "do": how, "for": length})
+        case 2:
+            wire = dice.choice((["mute"], ["noise"], ["partial_line"], ["bit_errors", 3]))
+            events.append({"at": beside, "do": "board", "for": 2 * length, "fault": wire})
+        case 3:
+            events.append({"at": beside, "do": "unplug", "for": length, "new": False})
+    _clears(dice, events, at, after + lasts)
+    return at, after + lasts
+
+
+def _emergency_stop(plan: Plan, dice: random.Random) -> None:
+    plan["board"].append(["estop"])
+    if dice.random() < 0.3:
+        plan["config"].setdefault("safety", {})["estop"] = "required"
+    for _ in range(1 + int(plan["seconds"] / 12)):
+        _pressed(plan, dice, "estop_pressed", "estop_silent")
+    # One more begins and ends while the host stalls.
+    at, length = round(_moment(plan, dice), 3), dice.choice((0.1, 0.4, 1.2))
+    fault = ["estop_pressed", length / 4, length / 4]
+    plan["events"] += [
+        {"at": at, "do": "board", "for": 2 * length, "fault": fault},
+        {"at": round(at + 0.001, 3), "do": "stall", "for": length},
+    ]
+    _clears(dice, plan["events"], at, length)
+
+
+def _away(plan: Plan, dice: random.Random) -> None:
+    """Add bumpers that let the robot drive away, and often a sender that pushes on."""
+    safety = plan["config"].setdefault("safety", {})
+    if "bumpers" in safety:
+        return
+    places = [dice.choice((*PLACES, "front", "rear")) for _ in range(dice.randint(1, 4))]
+    safety.update(bumpers=places, bumper="away")
+    plan["board"].append(["bumpers"])
+    alone = dice.random() < 0.6
+    if alone:
+        best = max(plan["config"]["commands"]["sources"], key=lambda s: s["priority"])["name"]
+        usual = {"way": "plain", "source": best, "junk": 0.0, "churn": False, "bad_stamps": 0.0}
+        plan["senders"] = [plan["senders"][0] | usual]
+    for _ in range(1 + int(plan["seconds"] / 15)):
+        number = dice.randint(1, len(places))
+        at, lasts = _pressed(plan, dice, "bumper_pressed", "bumpers_silent", number, 9.0)
+        if alone and lasts > 6.0:
+            # Behind a zero that counts the sender pushes, and does so through the release.
+            (sender,) = plan["senders"]
+            speed = round(dice.choice((-1, 1)) * dice.uniform(0.1, 1.0), 3)
+            push = [round(at + 3.0, 3), speed, speed * (number % 2)]
+            others = [p for p in sender["phases"] if not at <= p[0] < at + lasts + 2.0]
+            sender["phases"] = sorted([*others, [round(at + 0.5, 3), 0.0, 0.0], push])
+
+
+def _battery(plan: Plan, dice: random.Random) -> None:
+    """Add a battery that is nearly full, and becomes nearly empty for some time."""
+    battery: dict[str, Any] = {"measure": "percent", "hysteresis": 5.0}
+    bounds: tuple[float, ...] = (60.0, 45.0, 30.0)
+    if dice.random() < 0.7:
+        battery, bounds = {"measure": "volts", "hysteresis": 0.5}, (23.4, 23.0, 22.6)
+    for name, below in zip(("warning", "return", "stop"), bounds, strict=True):
+        battery[f"{name}_below"] = below
+    plan["config"]["battery"] = battery
+    plan["board"].append(["battery", 90, 600])
+    for _ in range(1 + int(plan["seconds"] / 30)):
+        at, lasts = _moment(plan, dice), dice.choice((0.4, 5.0, 15.0, 30.0))
+        fault = ["battery", dice.choice((0, 0, 5, 45)), 600]
+        plan["events"].append({"at": round(at, 3), "do": "board", "for": lasts, "fault": fault})
+        _clears(dice, plan["events"], at, lasts + 10.0)
+
+
+def kinds(plan: Plan) -> set[str]:
+    """Return the inputs of a plan: `estop`, bumpers that `stop` or let drive `away`, `battery`."""
+    safety, names = plan["config"].get("safety", {}), {name for name, *_ in plan["board"]}
+    found = names & {"estop", "battery"}
+    return found | ({safety.get("bumper", "stop")} if "bumpers" in safety else set())
+
+
+def removed(plan: Plan) -> Plan:
+    """Return the plan without inputs, for a product that does not know them."""
+    tables = plan["config"].items()
+    return plan | {
+        "config": {name: table for name, table in tables if name not in ("safety", "battery")},
+        "board": [fault for fault in plan["board"] if fault[0] not in INPUTS],
+        "events": [event for event in plan["events"] if event.get("fault", [""])[0] not in INPUTS],
+    }
+
+
+# judges
+
+
+class _Input:
+    """The emergency stop, or all bumpers, as the daemon has read them."""
+
+    def __init__(self) -> None:
+        self.marks = b""
+        """`X` for each pressed one in the last line, empty before the first line."""
+        self.reported_ns: int | None = None
+        """Arrival of the last line that may count, by the robot's clock."""
+        self.pressed_ns: int | None = None
+        """True time since when one certainly counts as pressed."""
+        self.sure = True
+        """The last line certainly counted."""
+        self.silent = ""
+        """`maybe` or `surely` if the board is silent about it."""
+
+    @property
+    def known(self) -> bool:
+        """Whether the daemon certainly knows the marks."""
+        return self.sure and not self.silent and self.reported_ns is not None
+
+
+class _Mean:
+    """The mean of the battery's measure, and the levels that it must and may have reached."""
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        names = [name for name in ("warning", "return", "stop") if config.get(f"{name}_below")]
+        self.bounds = {name: config[f"{name}_below"] for name in names}
+        self._room = 0.05 if config.get("measure", "volts") == "volts" else 0.5
+        self._rise = config.get("hysteresis", 0.5)
+        self.must = dict.fromkeys(self.bounds, False)
+        self.may = dict.fromkeys(self.bounds, False)
+        self.mean = self.stood_s = 0.0
+        self.at_ns: int | None = None
+        self.sure = True
+
+    @property
+    def level(self) -> set[str]:
+        """The levels that `state` may have, if the mean counts."""
+        names = ["ok", *self.bounds]
+        least = max([names.index(name) for name in self.bounds if self.must[name]], default=0)
+        most = max([names.index(name) for name in self.bounds if self.may[name]], default=0)
+        return set(names[least : most + 1])
+
+    def take(self, at_ns: int, value: float) -> None:
+        """Take a report. Each stands for 0.3 s at most, and a silence of 5 s begins anew."""
+        gap_s = 0.0 if self.at_ns is None else (at_ns - self.at_ns) / NS
+        if self.at_ns is None or gap_s > 5.0:
+            self.mean, self.stood_s = value, 0.0
+        self.sure &= not 4.8 < gap_s < 5.3
+        stood_s = min(gap_s, 0.3) if gap_s <= 5.0 else 0.0
+        self.stood_s += stood_s
+        self.mean += (value - self.mean) * stood_s / max(1e-9, min(10.0, self.stood_s))
+        self.at_ns = at_ns
+        if self.stood_s < 2.9:
+            return
+        for name, below in self.bounds.items():
+            below_s = self.stood_s > 3.1
+            self.must[name] |= below_s and self.mean < below - self._room
+            self.must[name] &= self.mean < below + self._rise - self._room
+            self.may[name] |= self.mean < below + self._room
+            self.may[name] &= self.mean < below + self._rise + self._room
+
+
+class Inputs:
+    """Judges what the robot does while an input counts as pressed or the battery is empty."""
+
+    def __init__(self, witness: Witness, board: list[list[Any]]) -> None:
+        """`board` are the lasting faults of the board, which name the inputs that it reports."""
+        self._witness = witness
+        self._reports = any(name in INPUTS for name, *_ in board)
+        config = witness.config
+        safety = config.get("safety", {})
+        self._places: list[str] = safety.get("bumpers", [])
+        self._away = safety.get("bumper") == "away"
+        self._needed = ["bumpers"] * bool(self._places)
+        self._needed += ["estop"] * (safety.get("estop") == "required")
+        self._checked = "link_check" in config["mcu"]
+        self._field = b"volts" if config.get("battery", {}).get("measure") == "volts" else b"charge"
+        self.new_life()
+
+    def new_life(self) -> None:
+        """Note that a daemon starts: it knows no input."""
+        self.estop, self.bumpers = _Input(), _Input()
+        self.battery = _Mean(self._witness.config.get("battery", {}))
+        self._mode = ""
+        self._looked_ns = self._stepped_ns = 0
+        self._due_ns: int | None = None
+        """A line must leave until then, because an input was pressed."""
+        self._fresh = self._latches = self._doubtful = False
+        self._before: tuple[tuple[float, ...], int] = ZERO, 0
+        """Wheel speeds and time of the last line before the present step."""
+        self._empty_ns: int | None = None
+        """True time since when the battery certainly is empty."""
+        self._came: deque[tuple[int, bytes]] = deque()
+        self._held = b""
+
+    def fed(self, at_ns: int, data: bytes) -> None:
+        """Take bytes that reached the port, by the robot's clock."""
+        if self._reports:
+            self._came.append((at_ns, data))
+
+    def lost(self) -> None:
+        """Note that the port was closed, or the daemon ended, before it has read all bytes."""
+        if self._came:
+            self._doubt()
+        self._came.clear()
+        self._held = b""
+
+    @property
+    def limiting(self) -> bool:
+        """Whether a bumper may be pressed that allows only some motion."""
+        free = self.bumpers.known and b"X" not in self.bumpers.marks
+        return self._away and (self._fresh or not free)
+
+    def take(self, decided_ns: int, offset: int, calm_ns: int) -> None:
+        """Take the bytes that the step at `decided_ns` has read, by the robot's clock.
+
+        True time is later by `offset`. At `calm_ns` the last stall of the host was over.
+        """
+        self._fresh = self._latches = False
+        while self._came and self._came[0][0] <= decided_ns:
+            at_ns, data = self._came.popleft()
+            *lines, self._held = (self._held + data).split(b"\n")
+            self._held = self._held[:LONGEST]
+            for line in lines:
+                self._line(line, at_ns, at_ns + offset)
+        for known in (self.estop, self.bumpers):
+            if known.reported_ns is not None and decided_ns - known.reported_ns > SILENT_NS:
+                self._silence(known, decided_ns, offset, calm_ns)
+        if self._fresh:
+            self._due_ns = decided_ns + self._witness.period_ns + MARGIN_NS // 6
+
+    def _line(self, line: bytes, at_ns: int, true_ns: int) -> None:
+        match = STATUS.fullmatch(line)
+        if match is None:
+            return
+        pairs = [field.split(b"=") for field in match[1].split()[1:]]
+        fields = dict(pairs)
+        wrong = match[2] is not None and int(match[2], 16) != binascii.crc_hqx(match[1], 0)
+        if wrong or len(fields) < len(pairs):
+            return
+        # Whether the link already has the check decides whether a line without one counts.
+        certain = match[2] is not None or not self._checked
+        if b"estop" in fields:
+            mark = b"X" if fields[b"estop"] == b"pressed" else b"."
+            self._report(self.estop, mark, certain, at_ns, true_ns)
+        if b"bumpers" in fields and len(fields[b"bumpers"]) == len(self._places):
+            self._report(self.bumpers, fields[b"bumpers"], certain, at_ns, true_ns)
+        if self._field in fields:
+            self.battery.sure &= certain
+            self.battery.take(at_ns, float(fields[self._field].rstrip(b"%")))
+
+    def _report(self, known: _Input, marks: bytes, certain: bool, at_ns: int, true_ns: int) -> None:
+        """Take the marks of a line. One that is pressed now is a stop, or asks for zeros."""
+        known.reported_ns = at_ns
+        before, was_sure, was_silent = known.marks, known.sure, known.silent
+        known.marks, known.sure, known.silent = marks, certain, ""
+        if not certain:
+            known.pressed_ns = None
+            self._doubt()
+            return
+        if was_silent == "surely" or not before:
+            before = b"." * len(marks)
+        if b"X" not in marks:
+            known.pressed_ns = None
+        elif known.pressed_ns is None:
+            known.pressed_ns = true_ns
+        if not was_sure:
+            self._doubt()
+        elif any(now > then for now, then in zip(marks, before, strict=True)):
+            self._press(known, true_ns, self._away and known is self.bumpers)
+
+    def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
+        """Take a silence: it counts as a press, at the latest when the host has had time."""
+        reported_ns, witness = known.reported_ns or 0, self._witness
+        latest_ns = max(reported_ns + SILENT_NS, calm_ns + EXCUSE_NS)
+        if decided_ns < latest_ns + 2 * witness.period_ns + MARGIN_NS:
+            known.silent = "maybe"
+            self._doubt()
+        elif known.silent != "surely":
+            known.silent = "surely"
+            # A pressed emergency stop that falls silent is no new press.
+            if known is self.bumpers or b"X" not in known.marks:
+                self._press(known, reported_ns + SILENT_NS + offset, False)
+            known.pressed_ns = known.pressed_ns or reported_ns + SILENT_NS + offset
+
+    def _press(self, known: _Input, true_ns: int, away: bool) -> None:
+        witness = self._witness
+        witness.counts["emergency stop" if known is self.estop else "bumper pressed"] += 1
+        # The robot does not ramp down: its motors have no voltage, or it touches an obstacle.
+        witness.cut = self._fresh = True
+        if away:
+            witness.arming(true_ns)
+        else:
+            self._latches = True
+            insort(witness.stops, true_ns)
+
+    def _doubt(self) -> None:
+        """Note that the robot may have been stopped, or not."""
+        self._doubtful = self._witness.cut = True
+        self._witness.perhaps_latched.add("clear")
+
+    # promises
+
+    def step(
+        self,
+        true_ns: int,
+        seen: Seen,
+        offset: int,
+        calm: bool,
+        state: Callable[[], dict[str, Any]],
+    ) -> None:
+        """Judge a step behind its lines. `calm` if the host has not just stalled."""
+        if not self._reports:
+            return
+        witness, moving = self._witness, self._moving(seen.lines)
+        if self._away and self.bumpers.known and b"X" in self.bumpers.marks:
+            self._drives_away(true_ns, moving)
+            self._pushes(seen.decided_ns + offset)
+        for name, pressed_ns in self._stopping():
+            since = f"pressed since {pressed_ns / NS:.3f} s"
+            if moving:
+                text = f"{moving}, {since}"
+                raise BrokenError(f"nothing moves while {name} is pressed", true_ns, text)
+            if seen.mode not in STOPPED:
+                text = f"{seen.mode}: {seen.reason}, {since}"
+                raise BrokenError(f"{name} that is pressed stops the robot", true_ns, text)
+        if self._latches and seen.mode not in STOPPED:
+            text = f"{seen.mode}: {seen.reason}"
+            raise BrokenError("a press stops the robot, however short", true_ns, text)
+        if self._fresh and moving:
+            raise BrokenError("a press is a zero at once", true_ns, str(moving))
+        self._answers(true_ns, seen, calm)
+        for name in self._needed:
+            known = self.estop if name == "estop" else self.bumpers
+            if known.reported_ns is None and (moving or seen.mode in ("ready", "driving")):
+                text = f"{seen.mode}, and the board has not reported {name}"
+                raise BrokenError("a robot waits for its inputs", true_ns, text)
+        self._empty(true_ns, seen)
+        causes = witness.stops or witness.perhaps_latched or witness.pending
+        if seen.mode == "stopped" and self._mode not in (*STOPPED, "") and not causes:
+            raise BrokenError("no stop without a cause", true_ns, seen.reason)
+        maybe = "maybe" in (self.estop.silent, self.bumpers.silent)
+        if self._doubtful and not maybe and seen.mode in ("ready", "driving"):
+            self._doubtful = False
+            witness.perhaps_latched.discard("clear")
+        self._mode, self._stepped_ns = seen.mode, true_ns
+        self._before = witness.last, witness.last_ns
+        self._looked_ns = self._looked_ns or seen.decided_ns
+        if seen.decided_ns - self._looked_ns > NS:
+            self._looked_ns = seen.decided_ns
+            self._state(true_ns, state(), seen.decided_ns)
+
+    def _stopping(self) -> Iterator[tuple[str, int]]:
+        """Yield each input that certainly stops the robot, and the true time since when."""
+        if self.estop.pressed_ns is not None:
+            yield "an emergency stop", self.estop.pressed_ns
+        latches = not self._away or self.bumpers.silent == "surely"
+        if latches and self.bumpers.pressed_ns is not None:
+            yield "a bumper", self.bumpers.pressed_ns
+
+    def _moving(self, lines: list[tuple[int, bytes]]) -> list[tuple[float, ...]]:
+        """Return the wheel speeds of each line that moves a wheel."""
+        found = []
+        for match in filter(None, (LINE.match(line) for _, line in lines)):
+            motors = [float(g[1:]) * (1 if g[:1] == b"p" else -1) for g in match.groups()]
+            found.append(tuple(motors[place] * sign for place, sign in self._witness.motors))
+        return [wheels for wheels in found if any(wheels)]
+
+    def _answers(self, true_ns: int, seen: Seen, calm: bool) -> None:
+        """Judge that a line leaves within a period behind a press."""
+        if self._due_ns is None:
+            return
+        if seen.lines or not calm or seen.link != "up":
+            self._due_ns = None
+        elif seen.decided_ns > self._due_ns:
+            text = f"no line until {self._due_ns / NS:.3f} s of its clock"
+            raise BrokenError("a press is a zero within a period", true_ns, text)
+
+    def _sign(self) -> int:
+        """Return the sign of the speeds that lead away from all pressed bumpers, 0 for none."""
+        marks = zip(self._places, self.bumpers.marks, strict=True)
+        signs = {AWAY.get(place, 0) for place, mark in marks if mark == ord("X")}
+        return signs.pop() if len(signs) == 1 else 0
+
+    def _drives_away(self, true_ns: int, moving: list[tuple[float, ...]]) -> None:
+        witness, sign = self._witness, self._sign()
+        room = 0.011 * witness.radius
+        for wheels in moving:
+            v, w = witness.twist(wheels)
+            straight = abs(w) <= room / witness.half
+            if not (sign and straight and -room <= v * sign <= AWAY_SPEED + room):
+                text = f"{v:.3f} m/s, {w:.3f} rad/s, {self._places} are {self.bumpers.marks!r}"
+                raise BrokenError("nothing drives towards a pressed bumper", true_ns, text)
+
+    def _pushes(self, now_ns: int) -> None:
+        """Disarm a sender whose command certainly led elsewhere, so that it must send a zero."""
+        witness, sign = self._witness, self._sign()
+        latest: set[tuple[str, str]] = set()
+        for source, wish in reversed(witness.wishes):
+            if wish.arrived_ns <= self._stepped_ns:
+                return
+            who, mine = (source, wish.identity), witness.priority[source]
+            rivals = [one for one in witness.senders if witness.priority[one[0]] >= mine]
+            live = now_ns - wish.arrived_ns < witness.timeout[source] - MARGIN_NS
+            elsewhere = (wish.v or wish.w) and (not sign or wish.v * sign < -0.01)
+            if who not in latest and rivals == [who] and wish.certain and live and elsewhere:
+                known = witness.senders[who]
+                known.armed_ns = wish.armed_ns = -1
+                known.zeros.clear()
+                witness.counts["pushes against a bumper"] += 1
+            latest.add(who)
+
+    def _empty(self, true_ns: int, seen: Seen) -> None:
+        """Judge the stop of an empty battery. The robot stops between two bounds of the mean."""
+        battery, witness = self.battery, self._witness
+        if not battery.bounds:
+            return
+        if not battery.sure:
+            self._doubtful = True
+            witness.perhaps_latched.add("clear")
+            return
+        if battery.may["stop"] and seen.mode == "stopped" != self._mode and not witness.stops:
+            witness.counts["battery empty"] += 1
+            witness.stops.append(true_ns)
+            self._ramps(true_ns)
+        self._empty_ns = (self._empty_ns or true_ns) if battery.must["stop"] else None
+        if battery.must["stop"] and seen.mode not in STOPPED:
+            text = f"{seen.mode}: {seen.reason}, the mean is {battery.mean:.2f}"
+            raise BrokenError("an empty battery stops the robot", true_ns, text)
+
+    def _ramps(self, true_ns: int) -> None:
+        """Judge the first line of an empty battery's stop: the robot does not stand at once."""
+        witness, (before, before_ns) = self._witness, self._before
+        even = witness.last_ns - before_ns < 3 * witness.period_ns
+        if witness.last != ZERO or witness.cut or not even:
+            return
+        if witness.ramp_ns(True, before) > 5 * witness.period_ns + NS // 20:
+            raise BrokenError("an empty battery stops the robot with a ramp", true_ns, str(before))
+
+    def cleared(self, asked_ns: int) -> None:
+        """Judge a clear that worked, at the step that has answered it."""
+        for name, pressed_ns in self._stopping():
+            if asked_ns > pressed_ns:
+                text = f"pressed since {pressed_ns / NS:.3f} s"
+                raise BrokenError(f"no clear works while {name} is pressed", asked_ns, text)
+        if self.battery.sure and self._empty_ns is not None and asked_ns > self._empty_ns:
+            text = f"the mean is {self.battery.mean:.2f}"
+            raise BrokenError("no clear works while the battery is empty", asked_ns, text)
+
+    def _state(self, true_ns: int, state: dict[str, Any], decided_ns: int) -> None:
+        """Hold the inputs in `state` against the lines."""
+        if self.estop.known:
+            expected = "pressed" if self.estop.marks == b"X" else "released"
+            self._same(true_ns, "the emergency stop", state["emergency_stop"], {expected})
+        if self.bumpers.known:
+            pressed = str([mark == ord("X") for mark in self.bumpers.marks])
+            self._same(true_ns, "the bumpers", str(state["bumpers"]), {pressed})
+        battery = self.battery
+        late_ns = decided_ns - (battery.at_ns or 0)
+        if battery.sure and battery.bounds and battery.stood_s > 3.2 and late_ns < 4 * NS:
+            name = f"the level of the battery of mean {battery.mean:.2f}"
+            self._same(true_ns, name, state["battery"]["level"], battery.level)
+
+    def _same(self, true_ns: int, name: str, said: str, expected: set[str]) -> None:
+        self._witness.counts["input looks"] += 1
+        if said not in expected:
+            text = f"{name} is {said}, allowed is {sorted(expected)}"
+            raise BrokenError("state has the inputs of the board", true_ns, text)
