@@ -421,9 +421,9 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     if here:
         mend = (
             "if the files above are new, give the services their copies: `sudo systemctl "
-            "try-reload-or-restart acsard-gateway acsard-web`, and `sudo systemctl reload acsard` on "
-            "a robot that connects to a router. It uses them for its next connection; a restart of "
-            "its daemon, which stops the robot, ends this warning at once"
+            "try-reload-or-restart acsard-gateway acsard-web`, and `sudo systemctl reload acsard` "
+            "on a robot that connects to a router. It uses them for its next connection; a restart "
+            "of its daemon, which stops the robot, ends this warning at once"
         )
     text = f"the daemon's certificate that ends first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
