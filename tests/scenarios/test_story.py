@@ -1,8 +1,8 @@
 """A reader of one output of a recording learns what happened, when, why and by which client.
 
 The story has thirteen incidents in three runs of the daemon. `acsard recording show`, the report
-and the exported `log` must tell all of them alike. Two of them are about the battery: it runs empty,
-and an undervoltage restarts the board.
+and the exported `log` must tell all of them alike. Two incidents are about the battery: it runs
+empty, and an undervoltage restarts the board.
 """
 
 from __future__ import annotations
