@@ -388,8 +388,8 @@ COMMANDS: dict[str, How] = {
     "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
     "--revoke phone": BY_THE_SERVICE,
     'sudo sh -c "/opt/acsard/venv/bin/acsard tls renew && '
-    'systemctl try-restart acsard-web acsard-gateway"': Elsewhere(
-        OPEN, "test_a_renewed_certificate_is_shown_after_the_restart_and_tokens_still_count"
+    'systemctl try-reload-or-restart acsard-web acsard-gateway"': Elsewhere(
+        OPEN, "test_a_renewed_certificate_is_shown_after_the_reload_and_tokens_still_count"
     ),
     # deploy/ros2
     "source /opt/ros/jazzy/setup.bash": NO_ROS,

@@ -427,7 +427,7 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
         return _search(args)
     recording = _recording(args)
     if args.file is None and times:
-        _note(recording, "the newest recording: a number of seconds counts from its beginning")
+        _note(recording, "a number of seconds counts from its beginning")
     return [(recording, span(recording, args.begin, args.end))]
 
 
@@ -493,7 +493,10 @@ def _recording(args: argparse.Namespace) -> Recording:
     if not files:
         which = "recording" if name is None else f"recording {name}"
         raise MendableError(f"no {which} in {where}; `acsard recording` lists them")
-    return Recording(files[-1])
+    recording = Recording(files[-1])
+    if name is None and len(files) > 1:
+        _note(recording, f"the newest of {len(files)} recordings; `acsard recording` lists them")
+    return recording
 
 
 def _when(text: str) -> When:

@@ -254,10 +254,10 @@ of those clients drives ramps to zero. `acsard gateway` that you started by hand
 start it again. A robot that connects to a router uses it for its next connection. Until then
 `acsard doctor` warns of the old one; a restart of `acsard run` ends the warning at once.
 
-A service of systemd has copies of the files from its start. Type for it, where it runs:
+A service of systemd has copies of the files. Type for it, where it runs; the robot drives on:
 
-  sudo systemctl try-restart acsard-gateway acsard-web   the robot drives on
-  sudo systemctl restart acsard                          if it connects to a router: it stops
+  sudo systemctl try-reload-or-restart acsard-gateway acsard-web
+  sudo systemctl reload acsard     if the robot connects to a router
 """
 
 _LINES = """\

@@ -52,7 +52,8 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
             words, input=task, capture_output=True, env=environment(), timeout=EDIT_S
         )
     except subprocess.TimeoutExpired:
-        raise ValueError(f"this computer is too busy: it took more than {EDIT_S:g} s") from None
+        text = f"this computer was too busy for {EDIT_S:g} s: type the command again"
+        raise ValueError(text) from None
     try:
         result = msgspec.json.decode(done.stdout, type=Result)
     except msgspec.DecodeError:

@@ -420,10 +420,10 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     mend = "run `acsard doctor` on that machine, which examines its files"
     if here:
         mend = (
-            "if the files above are new, a robot that connects to a router uses them for its next "
-            "connection: restart its daemon, which stops it (`sudo systemctl restart acsard`, or "
-            "`acsard run` again); for a robot without a router run `sudo systemctl try-restart "
-            "acsard-gateway acsard-web`"
+            "if the files above are new, give the services their copies: `sudo systemctl "
+            "try-reload-or-restart acsard-gateway acsard-web`, and `sudo systemctl reload acsard` "
+            "on a robot that connects to a router. It uses them for its next connection; a restart "
+            "of its daemon, which stops the robot, ends this warning at once"
         )
     text = f"the daemon's certificate that ends first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)

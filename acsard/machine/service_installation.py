@@ -298,8 +298,8 @@ def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
     """
     place = str(directory).encode()
     text = re.sub(
-        rb"(?m)^(LoadCredential=[\w.-]+:).*/",
-        lambda match: match[1] + place + b"/",
+        rb'(?m)^(LoadCredential=[\w.-]+:|ExecReload=.*cd ")[^"\n]*(/[^/"\n]+|" && .*)$',
+        lambda match: match[1] + place + match[2],
         file.content if found is None else found,
     )
     if text == found:

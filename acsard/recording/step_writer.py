@@ -92,6 +92,8 @@ class StepWriter:
         """Number of beginnings and ends of a sync of the current file; odd during a sync."""
         self._lost_before = 0
         """Number of steps that were lost before the present trouble began."""
+        self._safe_ns: int | None = None
+        """Monotonic time of the last step that a sync has brought to the disk, ns."""
         self._config, self._report, self._request_state = config, report, request_state
         self._ring: Ring | None = None
         self._writing: Writing | None = None
@@ -275,10 +277,16 @@ class StepWriter:
         ring.tend(self._last)
         if self.trouble or not self._reported:
             missing = many(self.lost - self._lost_before, "step is", "steps are")
+            if self.lost > self._lost_before and self._safe_ns is not None:
+                # The file may have steps that no sync has brought to the disk.
+                at_most = f", at most {(self._began_ns - self._safe_ns) / NS_PER_S:.1f} s"
+            else:
+                at_most = ""
             # The disk refused the event with the reason too, so no recording has it.
-            since = f" again; {missing} missing ({self.trouble})" if self.trouble else ""
+            since = f" again; {missing} missing{at_most} ({self.trouble})" if self.trouble else ""
             self.trouble, self._reported = "", True
             self._report(Event("recording", f"to {self.where}{since}"))
+        self._safe_ns = self._last.mono_ns
         if self._is_long_enough(ring) or self._last.mono_ns - self._state_ns > CHECKPOINT_NS:
             self._request_state()
 

@@ -448,7 +448,9 @@ def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
     losses = LinkLosses()
     for event in events:
         word = INCIDENTS.get(event.name)
-        if losses.repeated(event.name) or not word:
+        # A wheel that counts again is the end of a wheel fault, and no warning.
+        ended = event.name == "wheel_fault" and event.level == "info"
+        if losses.repeated(event.name) or not word or ended:
             continue
         if event.name == "stop" and event.by and event.by not in stopped:
             stopped.append(event.by)

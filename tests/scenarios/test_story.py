@@ -1,8 +1,8 @@
 """A reader of one output of a recording learns what happened, when, why and by which client.
 
-The story has twelve incidents in three runs of the daemon. `acsard recording show`, the report and
-the exported `log` must tell all of them alike. The product has no battery yet, so a board that
-restarts, as after an undervoltage, stands for the empty battery.
+The story has thirteen incidents in three runs of the daemon. `acsard recording show`, the report
+and the exported `log` must tell all of them alike. Two incidents are about the battery: it runs
+empty, and an undervoltage restarts the board.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 
 from acsard.cli import main
-from acsard.core.config.settings import Config, McuConfig, RecordConfig
+from acsard.core.config.settings import BatteryConfig, Config, McuConfig, RecordConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from acsard.core.simulator import protocol
-from acsard.core.values import NS_PER_S, Latch, Latches
+from acsard.core.values import NS_PER_S, BatteryLevel, Latch, Latches
 from acsard.host.errors import Exit
 from acsard.recording import recorder as module
 from acsard.recording.directory import listed
@@ -76,6 +76,7 @@ class Host:
         self.config = replace(
             Config(mcu=McuConfig(port="/dev/ttyACM0", link_check="auto", encoder_counts=3200)),
             record=RecordConfig(str(where), 100.0),
+            battery=BatteryConfig("percent", return_below=30.0, stop_below=10.0, hysteresis=5.0),
         )
         self.incidents: list[Incident] = []
 
@@ -116,6 +117,15 @@ class Host:
         self.hold(NAV, "nav", 0.0, 1.0)
         self.hold(NAV, "nav", 0.5, seconds)
         assert self.world.state.mode == "driving", self.world.state.reason
+
+    def drive_until(self, level: BatteryLevel) -> None:
+        """Let the navigation drive until the battery has this level."""
+        for _ in range(600):
+            self.hold(NAV, "nav", 0.5, 0.1)
+            battery = self.world.state.battery
+            if battery is not None and battery.level == level:
+                return
+        raise AssertionError(self.world.state.battery)
 
     def call(self, service: str, name: str) -> None:
         world, key = self.world, f"srv/{service}"
@@ -301,6 +311,22 @@ def first_run(host: Host) -> None:
     host.call("clear", ANNA)
 
     host.drive()
+    with host.world.mcu.battery(50.0, 0.6):
+        host.drive_until("return")
+        host.note("low battery", "^battery: return: .*the mean is below battery.return_below = 30")
+        host.drive_until("stop")
+    host.note(
+        "empty battery",
+        "^battery stop: .*the mean is below battery.stop_below = 10 %",
+        r"^mode: driving -> stopped: battery below battery\.stop_below = 10 %",
+        r"^drive: drove \d+\.\d\d m in \d+\.\d s \(by nav\)",
+    )
+    with host.world.mcu.battery(90.0, 600.0):
+        host.run(8.0)
+        host.note("anna clears the stop after a charge", f"^clear: cleared; .* {by(ANNA)}")
+        host.call("clear", ANNA)
+
+    host.drive()
     host.note(
         "full disk",
         "^cut: the disk accepted no more data",
@@ -312,7 +338,8 @@ def first_run(host: Host) -> None:
     host.hold(NAV, "nav", 0.5, 4.0)
     host.note(
         "the disk has room again",
-        r"^recording: to .* again; \d+ steps are missing \(.*No space left on device\)",
+        r"^recording: to .* again; \d+ steps are missing, at most \d\.0 s "
+        r"\(.*No space left on device\)",
         r"^continues: an earlier recording goes on here: driving, link up, .* \(by nav\)",
     )
     host.hold(NAV, "nav", 0.5, 4.0)

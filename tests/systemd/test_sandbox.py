@@ -79,6 +79,27 @@ def test_with_lan_conf_the_gateway_reads_root_s_keys_and_listens_beyond_this_com
     )
 
 
+def test_a_reload_gives_the_services_a_new_certificate_while_the_robot_drives(
+    container: Container, board: Board
+) -> None:
+    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text())  # as for a router
+    opened(container)
+    daemon = container.main_pid()
+    user = str(Path(f"/proc/{daemon}").stat().st_uid)
+    assert container.run(ACSARD, "tls", "renew", "--days", "9").code == 0
+    container.types("systemctl reload acsard && systemctl try-reload-or-restart acsard-gateway")
+    viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", f"{TLS}/clients/viewer")
+    words = (ACSARD, "get", "state", *viewer)
+    until(
+        lambda: "ends in 9 days" in container.run(*words).out, 20.0, "the gateway uses the new one"
+    )
+    for name in ("ca.pem", "certificate.pem", "key.pem"):
+        assert container.run("cmp", f"{TLS}/{name}", f"/run/acsard/{name}").code == 0
+        about = container.run("stat", "-Lc", "%u %a", f"/run/acsard/{name}", "/run/acsard/.")
+        assert about.out.split() == [user, "400", user, "700"]
+    assert container.main_pid() == daemon
+
+
 def test_a_gateway_that_is_killed_is_open_again_and_the_daemon_does_not_notice(
     container: Container, board: Board
 ) -> None:

@@ -202,7 +202,7 @@ def test_the_unit_lets_in_the_networks_of_lan_conf_and_these_to_the_page_alone(
     assert phone.reaches(8443, STRANGE)
 
 
-def test_a_renewed_certificate_is_shown_after_the_restart_and_tokens_still_count(
+def test_a_renewed_certificate_is_shown_after_the_reload_and_tokens_still_count(
     robot: Container, phone: Phone
 ) -> None:
     token = invited(robot, "--name guest")

@@ -278,6 +278,7 @@ def test_seconds_need_one_recording(ring: Ring) -> None:
     assert code == 0
     assert names[-1] in err
     assert "a number of seconds counts from its beginning" in err
+    assert "the newest of 30 recordings; `acsard recording` lists them" in err
     code, _, err = recording(where, "show", "all", "--from", "0.1")
     assert (code, "name that recording, or write a time" in err) == (2, True)
 

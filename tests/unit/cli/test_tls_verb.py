@@ -503,7 +503,7 @@ def test_renew_by_name_replaces_that_certificate_alone_and_keeps_its_addresses(
     assert names_of(place) == {*names, "10.0.0.5"} >= {"robot4.local", "10.0.0.4"}
     said = capsys.readouterr().out
     assert f"{place} has a new certificate. Copy ca.pem, certificate.pem, key.pem" in said
-    assert "sudo systemctl try-restart acsard-gateway acsard-web" in said
+    assert "sudo systemctl try-reload-or-restart acsard-gateway acsard-web" in said
 
 
 def test_a_name_without_a_certificate_is_not_renewed(

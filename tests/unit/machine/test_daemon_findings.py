@@ -219,8 +219,8 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
 @pytest.mark.parametrize(
     ("here", "mend"),
     [
-        (True, "try-restart acsard-gateway acsard-web"),
-        (True, "uses them for its next connection: restart its daemon, which stops it"),
+        (True, "try-reload-or-restart acsard-gateway acsard-web"),
+        (True, "`sudo systemctl reload acsard` on a robot that connects to a router"),
         (False, "`acsard doctor` on that machine"),
     ],
 )

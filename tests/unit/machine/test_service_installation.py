@@ -214,7 +214,9 @@ def test_what_else_lies_in_its_directories_is_seen(tmp_path: Path) -> None:
 
 
 DROP_IN = File(
-    ETC / "lan.conf", b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
+    ETC / "lan.conf",
+    b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
+    b"ExecReload=+/bin/sh -c 'cd \"/a/b\" && install key.pem %t/%N'\n",
 )
 
 
@@ -222,6 +224,7 @@ def test_a_drop_in_comes_with_the_place_of_the_certificates() -> None:
     step = admitted(DROP_IN, None, Path("/srv/tls"))
     assert isinstance(step, Write)
     assert b"LoadCredential=key.pem:/srv/tls/key.pem\n" in step.file.content
+    assert b"'cd \"/srv/tls\" && install key.pem %t/%N'\n" in step.file.content
 
 
 def test_networks_that_somebody_has_narrowed_stay() -> None:

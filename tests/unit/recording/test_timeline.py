@@ -352,6 +352,11 @@ def test_a_stop_of_the_battery_is_a_serious_incident_and_another_level_is_none()
     assert is_serious(summary(events))
 
 
+def test_a_summary_counts_no_wheel_that_is_sound_again() -> None:
+    left_out = TimelineEntry(1.0, "wheel_fault", "left out: ...", "warning")
+    assert summary([left_out, TimelineEntry(5.0, "wheel_fault", "again: ...")]) == "1 wheel fault"
+
+
 def test_a_summary_names_who_stopped_the_robot_and_counts_the_incidents() -> None:
     events = [
         TimelineEntry(1.0, "stop", "stopped", by="joe"),
