@@ -316,16 +316,16 @@ class Robot:
         events += battery.look(statuses, now.mono_ns)
         if battery.stopped_now:
             self._life.press(battery.why, now)
+        held = "", ""
         if estop.why:
-            self._life.hold(estop.why, estop.mend)
+            held = estop.why, estop.mend
         elif bumpers.held:
-            self._life.hold(bumpers.held, bumpers.mend)
+            held = bumpers.held, bumpers.mend
         elif self.session.status.driver_fault:
-            self._life.hold(DRIVER_FAULT, DRIVER_MEND)
+            held = DRIVER_FAULT, DRIVER_MEND
         elif battery.held:
-            self._life.hold(battery.why, battery.mend)
-        else:
-            self._life.hold()
+            held = battery.why, battery.mend
+        self._life.hold(*held, now.mono_ns)
 
     def _keep_away(self, now_ns: int) -> None:
         """Follow the choice only away from the pressed bumpers.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import random
 
 import pytest
 
 from acsard.core.config.settings import Config, ControlConfig, McuConfig, SafetyConfig, SimConfig
+from acsard.core.incoming.queries import Query
 from acsard.core.values import NS_PER_S, Latches, Outputs, Received
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import SIGNED, World
@@ -216,6 +218,25 @@ def test_a_press_survives_a_restart_of_the_daemon_and_of_the_board() -> None:
         assert again.call("clear").success
         again.drive(0.5, seconds=0.5)
         assert again.state.mode == "driving"
+
+
+def test_a_clear_that_came_before_the_release_is_refused_also_if_one_step_takes_both() -> None:
+    world = World()
+    with world.mcu.estop():
+        world.run(0.3)
+        with world.mcu.estop_pressed(0.0, 1.0):
+            world.run(0.5)
+            latch, begin_ns = world.state.latch, world.now_ns
+            world.stall(1.5)
+            asked = json.dumps({"latch": latch}).encode()
+            call = "srv/clear", "srv/clear", "", asked, "", begin_ns + NS_PER_S // 5
+            world.bus.queries.append(Query(99, *call))
+            world.run(0.05)
+        answer = json.loads(world.bus.replies[99][0].payload)
+        assert (answer["success"], world.state.emergency_stop) == (False, "released")
+        assert "before the release" in answer["message"]
+        assert world.state.mode == "stopped"
+        assert world.call("clear").success
 
 
 def test_a_recording_replays_a_press_and_its_release() -> None:

@@ -62,6 +62,8 @@ class Lifecycle:
         self._held = self._mend = ""
         """Why the board lets nothing release a latch, in words, and what to do about it; "" while
         it lets a clear release one."""
+        self._freed_ns = LONG_AGO_NS
+        """Monotonic time of the step in which the board last began to let a clear release one."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, None before it."""
         self._derive()
@@ -90,8 +92,13 @@ class Lifecycle:
         self._stopped_ns = self._stop_asked_ns = now.mono_ns
         self._latch(stop=self._made(now, "", why))
 
-    def hold(self, why: str = "", mend: str = "") -> None:
-        """Note why the board lets nothing release a latch, and what to do about it."""
+    def hold(self, why: str, mend: str, now_ns: int) -> None:
+        """Note why the board lets nothing release a latch, "" if it lets, and what to do then.
+
+        `now_ns` is the monotonic time of this step.
+        """
+        if self._held and not why:
+            self._freed_ns = now_ns
         self._held, self._mend = why, mend
 
     def leave(self) -> None:
@@ -135,6 +142,9 @@ class Lifecycle:
         latches, latch = self.latches, self.latches.next
         if latch is None:
             return ""
+        if asked_ns <= self._freed_ns:
+            # The step may have taken longer than a press, and the call may have come during it.
+            raise RefusedError("this call came before the release: call srv/clear again")
         if number is None:
             self._require_seen_stop(asked_ns)
             set_ns = max(self._stopped_ns, self._faulted_ns)

@@ -51,7 +51,7 @@ def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool
 
 def press(life: Lifecycle, seconds: float, why: str = PRESSED) -> None:
     life.press(why, at(seconds))
-    life.hold(why, CHECK if why == SILENT else RELEASE)
+    life.hold(why, CHECK if why == SILENT else RELEASE, ns(seconds))
 
 
 def number(life: Lifecycle) -> int:
@@ -390,7 +390,9 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, number(life))
     assert str(caught.value) == f"{PRESSED}: release it there, then call srv/clear again"
-    life.hold("", "")
+    life.hold("", "", ns(9.2))
+    with pytest.raises(RefusedError, match="came before the release: call srv/clear again"):
+        life.clear(number(life), ns(9.2), at(9.3))
     assert (mode(life), life.why) == (Mode.STOPPED, f"{latched}; call srv/clear")
     assert clear(life, 9.5, number(life)).startswith("cleared; ")
     assert mode(life) is Mode.READY
@@ -415,7 +417,7 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
         f"a wheel is dead, latched at {AT}:03 UTC; also {PRESSED}; also {stopped}; release it "
         "there, then call srv/clear twice"
     )
-    life.hold("", "")
+    life.hold("", "", ns(8.0))
     assert clear(life, 9.0).startswith("fault cleared; still stopped by joe: ")
     assert life.why == f"{stopped}; call srv/clear"
 
@@ -423,7 +425,7 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
 def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
     life = ready()
     life.fault("a motor driver is hot", at(1.0))
-    life.hold("a motor driver is hot", "let it cool")
+    life.hold("a motor driver is hot", "let it cool", ns(1.0))
     fault = f"a motor driver is hot, latched at {AT}:01 UTC"
     assert life.why == f"{fault}; let it cool, then call srv/clear"
     with pytest.raises(RefusedError) as caught:
@@ -438,7 +440,7 @@ def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
 def test_a_fault_beside_one_that_the_board_reports_names_both() -> None:
     life = ready()
     life.fault("a wheel is dead", at(1.0))
-    life.hold("a motor driver is hot", "let it cool")
+    life.hold("a motor driver is hot", "let it cool", ns(1.0))
     assert life.why == (
         f"a wheel is dead, latched at {AT}:01 UTC; also a motor driver is hot; let it cool, then "
         "call srv/clear"
@@ -449,9 +451,9 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     life = ready()
     press(life, 1.0)
     seen = number(life)
-    life.hold("", "")
+    life.hold("", "", ns(8.0))
     press(life, 5.0)
-    life.hold("", "")
+    life.hold("", "", ns(8.0))
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
@@ -463,7 +465,7 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
 def test_a_plain_clear_is_refused_right_after_a_press() -> None:
     life = ready()
     press(life, 1.0)
-    life.hold("", "")
+    life.hold("", "", ns(1.2))
     with pytest.raises(RefusedError) as caught:
         clear(life, 1.5)
     assert str(caught.value).startswith(f"the robot was stopped ({PRESSED}) 0.5 s ago: look at")
@@ -560,7 +562,7 @@ FACTS: dict[str, Do] = {
     "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
     "leave": lambda life, _: life.leave(),
     "press": lambda life, now: press(life, now),
-    "release": lambda life, _: life.hold("", ""),
+    "release": lambda life, _: life.hold("", "", ns(8.0)),
 }
 
 REQUESTS: dict[str, Do] = {
