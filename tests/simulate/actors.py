@@ -117,6 +117,8 @@ class Run:
         """The last byte of the board that reached the daemon."""
         self._plain = "link_check" not in plan["config"]["mcu"]
         """The serial lines have no check, so that a whole line always counts."""
+        self._boards = 1
+        """Number of boards that were plugged in."""
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
@@ -362,7 +364,8 @@ class Run:
                 deaf_ns = int(event["deaf"] * NS)
                 self.liveness.event(deaf_ns + TROUBLE_NS)
                 if deaf_ns > 12 * NS // 10:
-                    self.at(self.true_ns + deaf_ns, self._hears_again)
+                    boards = self._boards
+                    self.at(self.true_ns + deaf_ns, lambda: self._hears_again(boards))
             case "unplug":
                 self.inputs.lost()
                 product.unplug()
@@ -453,6 +456,7 @@ class Run:
         self.liveness.event(TROUBLE_NS if new else 0)
         if not self.product.plugged:
             self.product.plug(new)
+            self._boards += new
             if self.witness.blocked_ns is not None:
                 self.witness.blocked_ns = self.true_ns  # The new port has taken no line either.
             self.damage.forget()
@@ -549,9 +553,9 @@ class Run:
                 self._disarmed(true_ns)
         self._fed_ns = true_ns
 
-    def _hears_again(self) -> None:
-        # A daemon that hears itself cannot know that the board was deaf.
-        if not self.echo.on:
+    def _hears_again(self, boards: int) -> None:
+        # A daemon that hears itself cannot know that the board was deaf. Another board was not.
+        if not self.echo.on and boards == self._boards:
             self._disarmed(self.true_ns)
 
     def _disarmed(self, true_ns: int) -> None:
