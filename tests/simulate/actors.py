@@ -115,6 +115,8 @@ class Run:
         self._fed_ns = 0
         self._ended = b""
         """The last byte of the board that reached the daemon."""
+        self._rest = b""
+        """What the board has sent of a line that has no end yet."""
         self._plain = "link_check" not in plan["config"]["mcu"]
         """The serial lines have no check, so that a whole line always counts."""
         self._boards = 1
@@ -536,10 +538,10 @@ class Run:
         if self._plain:
             self.damage.fed(data)
         self.inputs.fed(at_ns, data)
-        if b"ap" not in data and b"an" not in data:
-            return  # The board greets, or the line is noisy while it boots.
-        if "endless" in self._names and b"\n" not in data and not self.echo.on:
-            return  # A line from just before may still arrive.
+        lines, end, rest = (self._rest + data).rpartition(b"\n")
+        self._rest = rest[-99:]
+        if not end or (b"ap" not in lines and b"an" not in lines):
+            return  # The line has no end, or the board greets, or it makes noise while it boots.
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
         if not self._plain and gap_ns > 6 * NS // 10:

@@ -723,7 +723,7 @@ def test_a_robot_with_a_damaged_latch_file_starts_stopped(damage: str) -> None:
     assert result.counts["mode stopped"] == 1
 
 
-@pytest.mark.parametrize("fault", [["endless"], ["wrong_baud", 9600]])
+@pytest.mark.parametrize("fault", [["endless"], ["wrong_baud", 9600], ["partial_line"]])
 def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[Any]) -> None:
     links = Counter[str]()
     run = Run(quiet_with({"at": 2.0, "for": 2.0, "do": "board", "fault": fault}))
@@ -736,6 +736,7 @@ def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[A
     run.product._see = look
     assert run.play()["lawful drives"] == 1
     assert links["up"] < 30 < sum(links.values())
+    assert run.witness.armed_since_ns >= 4 * NS  # when the board could be read again
 
 
 def test_a_request_of_ros_has_the_settings_that_the_operator_sets() -> None:
