@@ -600,7 +600,8 @@ class Run:
             self._full_ns = true_ns
         if witness.blocked_ns is not None:
             self._blocked_ns = true_ns
-        self.inputs.take(seen.decided_ns, offset, self._stalled_ns - offset)
+        calm_ns = max(self._stalled_ns - offset, self.resumed_ns)
+        self.inputs.take(seen.decided_ns, offset, calm_ns)
         if self._calls:
             self._take_answers()
             self._late_answers(true_ns)

@@ -294,6 +294,19 @@ def test_a_robot_drives_only_away_from_its_pressed_bumpers(
         bench.step(1.2, b"", "driving", (0, b",".join(words) + b"\r\n"))
 
 
+def test_a_clear_is_obeyed_until_the_silence_behind_a_stall_surely_counts() -> None:
+    bench = Bench()
+    bench.step(1.0, OK)
+    woke_ns = 3 * NS
+    bench.inputs.take(woke_ns, 0, woke_ns)
+    assert bench.inputs.estop.silent == "maybe"
+    surely_ns = woke_ns + NS // 5
+    bench.inputs.take(surely_ns, 0, woke_ns)
+    bench.inputs.cleared(woke_ns + NS // 100)
+    with pytest.raises(BrokenError, match="no clear works while an emergency stop is pressed"):
+        bench.inputs.cleared(surely_ns + 1)
+
+
 def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> None:
     bench = Bench()
     config = {"measure": "volts", "stop_below": 22.0, "hysteresis": 0.5}
