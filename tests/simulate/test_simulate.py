@@ -255,11 +255,21 @@ def test_a_press_without_a_line_in_the_next_period_is_a_finding() -> None:
     for line in (RESTS, None):
         bench = Bench()
         bench.step(1.0, OK, "driving", MOVES)
+        bench.witness.last = (1.0,) * 4
         bench.step(1.01, PRESSED)
         if line:
             bench.step(1.02, b"", "stopped", line)
         with nullcontext() if line else pytest.raises(BrokenError, match="within a period"):
             bench.step(1.03)
+
+
+def test_a_press_beside_a_robot_that_stands_has_its_line_within_two_periods() -> None:
+    bench = Bench()
+    bench.step(1.0, OK, "ready", RESTS)
+    bench.step(1.01, PRESSED)
+    bench.step(1.03)
+    with pytest.raises(BrokenError, match="within a period"):
+        bench.step(1.04)
 
 
 @pytest.mark.parametrize(
