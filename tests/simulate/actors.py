@@ -543,6 +543,7 @@ class Run:
         if not end or (b"ap" not in lines and b"an" not in lines):
             return  # The line has no end, or the board greets, or it makes noise while it boots.
         true_ns = at_ns - START_NS + self.slept_ns
+        self.witness.reported(true_ns, lines)
         gap_ns = true_ns - self._fed_ns
         if not self._plain and gap_ns > 6 * NS // 10:
             # The next good line is the first one with the check, for which the daemon asks again.

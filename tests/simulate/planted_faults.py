@@ -45,6 +45,7 @@ FRESHNESS, LIMITS, LIFECYCLE = (
 )
 MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/session.py"
 WITNESS, ODOMETRY = "core/motion/wheel_witness.py", "core/motion/odometry.py"
+WHEEL_FAULTS = "core/motion/wheel_faults.py"
 PATH = "core/motion/path.py"
 LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
 COMMANDS, KINEMATICS, CODEC = (
@@ -620,6 +621,13 @@ FAULTS = (
         WITNESS,
         "moving and least > SLACK and abs(seen) < 0.1 * least",
         "moving and least > SLACK and abs(seen) < 0.97 * least",
+    ),
+    fault(
+        "sanity blind",
+        "a wheel that contradicts its command is never a fault",
+        WHEEL_FAULTS,
+        "if not (limit and (bad_left or bad_right)):",
+        "if True:",
     ),
     # bus
     fault(

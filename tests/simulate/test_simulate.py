@@ -479,6 +479,32 @@ def test_a_wheel_that_clearly_does_not_obey_must_become_a_fault(speed: float, ra
         drive()
 
 
+@pytest.mark.parametrize(
+    ("fault", "reported", "found_s"),
+    [
+        ("dead_motor", b"cp01.23", 4.5),
+        ("dead_motor", b"cn1.23", 4.5),
+        ("dead_motor", b"cp00.00", 3.55),
+        ("reversed_motor", b"cp01.23", 3.55),
+    ],
+)
+def test_a_wheel_whose_motor_is_dead_may_come_to_rest_before_it_must_be_a_fault(
+    fault: str, reported: bytes, found_s: float
+) -> None:
+    witness = witnessed()
+    witness.lies = [(fault, (witness.motors[2][0],))]
+
+    def drive(begin_s: float, end_s: float) -> None:
+        for n in range(round(begin_s * 100), round(end_s * 100)):
+            witness.obeyed(n * NS // 100, (0.0, 0.0, -5.0, 0.0))
+
+    drive(1.0, 3.0)
+    witness.reported(3 * NS, b"ap05.00,bp05.00," + reported + b",dp05.00")
+    drive(3.0, found_s)
+    with pytest.raises(BrokenError, match="does not obey"):
+        drive(found_s, found_s + 0.03)
+
+
 def test_a_hand_that_turns_wheels_at_rest_causes_no_fault() -> None:
     witness = witnessed()
     witness.line(NS, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", NS, NS)
