@@ -352,7 +352,7 @@ class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
     number: int
-    """Identifies the latch: milliseconds since 1970, or one more than the latch before.
+    """Identifies the latch: milliseconds since 1970, or more if the latch before has this number.
 
     It stays unique across restarts, and JavaScript represents it exactly.
     """

@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
+from acsard.core.motion.lifecycle import number_after_restart
 from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latch, Latches
 
 FORMAT = 1
@@ -111,7 +112,7 @@ def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int 
     if latches.stop is not None:
         return latches
     numbers = [latch.number for latch in (latches.fault, latches.inactive) if latch is not None]
-    number = max(now.wall_ns // 1_000_000, *[n + 1 for n in numbers], before + 1)
+    number = number_after_restart(max([*numbers, before]), now)
     return replace(latches, stop=Latch(number, now.wall_ns, by, why))
 
 
@@ -120,8 +121,7 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
 
     The previous process may have set latches that the file lacks. So the robot starts stopped, and
     each latch of the file takes a new number: a `clear` or `activate` that names its old number may
-    have been sent before the latches that are lost. If the wall clock went back, the time since the
-    computer started makes the numbers of two such starts differ.
+    have been sent before the latches that are lost.
 
     Args:
         latches: the latches in the file.
@@ -129,10 +129,8 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
         now: time of the start.
     """
     found = latches.fault, latches.inactive, latches.stop
-    least = max((latch.number + 1 for latch in found if latch), default=0)
-    number = now.wall_ns // 1_000_000
-    if number < least:
-        number = least + now.mono_ns // 1_000_000
+    kept = max((latch.number for latch in found if latch), default=-1)
+    number = number_after_restart(kept, now)
     fault, inactive, stop = (
         latch and replace(latch, number=number + place) for place, latch in enumerate(found)
     )

@@ -51,6 +51,8 @@ class Lifecycle:
         """True until the first `activate`, with `control.auto_activate = false`."""
         found = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in found if latch is not None], default=0)
+        self._numbered = False
+        """True from the first latch of this run on, which has a number that no earlier run used."""
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
         """Monotonic times at which the last stop and the last fault were latched."""
         self._cleared_ns = LONG_AGO_NS
@@ -231,7 +233,10 @@ class Lifecycle:
         return self._dormant or self.latches.inactive is not None
 
     def _made(self, now: Instant, by: str, why: str) -> Latch:
-        self._number = max(self._number + 1, now.wall_ns // 1_000_000)
+        if self._numbered:
+            self._number = max(self._number + 1, now.wall_ns // 1_000_000)
+        else:
+            self._numbered, self._number = True, number_after_restart(self._number, now)
         return Latch(self._number, now.wall_ns, by, why)
 
     def _latch(self, **changes: Latch | None) -> None:
@@ -279,6 +284,21 @@ class Lifecycle:
             f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, "
             "or with the number of the latch that you have seen"
         )
+
+
+def number_after_restart(kept: int, now: Instant) -> int:
+    """Return a number for a latch that no earlier run of the daemon has given to another latch.
+
+    A latch that was released is not in the latch file. If the wall clock went back, the number that
+    follows the kept ones may be the number of such a latch, and a late `clear` of that one would
+    release the new one. The time since the computer started makes the two numbers differ.
+
+    Args:
+        kept: The largest number of the latches that were kept, or less than 1 without any.
+        now: Both clocks at this step.
+    """
+    number = now.wall_ns // 1_000_000
+    return number if number > kept else kept + 1 + now.mono_ns // 1_000_000
 
 
 def _not_in_force(number: int, still: str, call: str) -> str:

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
 from acsard.daemon.latch_rules import (
     ANSWER_NS,
@@ -133,7 +134,8 @@ def test_a_stop_by_the_daemon_is_newer_than_the_latches_beside_it() -> None:
     late = replace(FAULT, number=1_900_000_000_000)
     made = stopped(Latches(fault=late), "the file cannot be read", NOW)
     assert made.fault == late
-    assert made.stop == Latch(late.number + 1, NOW.wall_ns, "acsard", "the file cannot be read")
+    number = late.number + 1 + NOW.mono_ns // 1_000_000
+    assert made.stop == Latch(number, NOW.wall_ns, "acsard", "the file cannot be read")
 
 
 def test_the_number_of_a_stop_by_the_daemon_is_the_wall_time_in_ms() -> None:
@@ -242,6 +244,20 @@ def test_a_stop_that_no_step_served_is_newer_than_the_stop_before_it(ahead: int)
     assert latches.stop
     assert latches.stop.number > earlier.number
     assert latches.stop.by == "joe"
+
+
+def test_a_stop_that_no_step_served_is_newer_than_a_stop_that_was_released() -> None:
+    """The wall clock went back, and the released stop had the number behind `INACTIVE`."""
+    keeper, now = Keeper(), Instant(NOW.mono_ns, NOW.wall_ns - 9 * NS_PER_S)
+    life = Lifecycle(active=True, latches=Latches(inactive=INACTIVE))
+    life.stop("joe", 1, Instant(1, now.wall_ns))
+    assert life.latches.stop
+    seen = life.latches.stop.number
+    life.clear(seen, 2, Instant(2, now.wall_ns))
+    Handover(life.latches, keeper).take_stops(life.latches, ["ann"], now)
+    (latches,) = keeper.given
+    assert latches.stop
+    assert latches.stop.number > seen
 
 
 def test_without_such_a_stop_the_latches_are_handed_over_as_they_are() -> None:

@@ -150,10 +150,10 @@ def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_that_does_not() -> No
     assert number(life) == first + 1
     early = ready()
     early.stop("ann", ns(1.0), Instant(ns(1.0), 0))
-    assert number(early) == 1  # 0 means that there is no stop
+    assert number(early) == 1001  # 0 means that there is no stop
     kept = Lifecycle(active=True, latches=Latches(stop=STOP, inactive=OFF))
     kept.stop("ann", ns(1.0), Instant(ns(1.0), 0))
-    assert number(kept) == OFF.number + 1
+    assert number(kept) == OFF.number + 1001
 
 
 def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
@@ -163,6 +163,21 @@ def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
     clear(life, 1.5, first)
     life.stop("ann", ns(2.0), Instant(ns(2.0), 0))
     assert number(life) == first + 1
+
+
+def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_back() -> None:
+    """The latch file has only the latch that is still in force."""
+    first = Lifecycle(active=True, latches=Latches(inactive=OFF))
+    numbers = []
+    for seconds in (1.0, 1.5):
+        first.stop("ann", ns(seconds), Instant(ns(seconds), 0))
+        numbers.append(number(first))
+        first.clear(numbers[-1], ns(seconds + 0.1), Instant(ns(seconds + 0.1), 0))
+    second = Lifecycle(active=True, latches=first.latches.after_restart())
+    second.stop("joe", ns(3.0), Instant(ns(3.0), 0))
+    assert number(second) > max(numbers)
+    with pytest.raises(RefusedError, match=f"latch {numbers[0]} is not in force"):
+        second.clear(numbers[0], ns(3.1), Instant(ns(3.1), 0))
 
 
 def test_the_same_stop_arriving_twice_has_one_number() -> None:
