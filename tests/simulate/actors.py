@@ -132,6 +132,7 @@ class Run:
         self.moved_ns = -1
         self.product = Product(plan["config"], self._see)
         self.product.fed = self._fed
+        self.product.drops = self.witness.dropped
 
     # time
 
@@ -597,6 +598,7 @@ class Run:
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
+        witness.read()
         if self.product.disk.full:
             self._full_ns = true_ns
         if witness.blocked_ns is not None:

@@ -172,6 +172,8 @@ class Product:
         self.fed: Callable[[int, bytes], None] = lambda at_ns, data: None
         self.dropped = 0
         """Samples that the inbox had no room for, of this daemon."""
+        self.drops: Callable[[str], None] = lambda key: None
+        """Called with the key of each sample that the inbox drops: the oldest unread one of it."""
         self.echo = False
         self.unplugged_ns = self.plugged_ns = START_NS
         """When the board was last unplugged, and plugged in: a daemon that starts finds it so."""
@@ -273,6 +275,7 @@ class Product:
                     arrivals.remove(same[0])
                     world.bus.overrun_sources.add(key.split("/")[1])
                     self.dropped += 1
+                    self.drops(key)
         if at_ns == world.now_ns and (world._listens or key == "stop"):
             world._step()
 

@@ -208,6 +208,9 @@ class Witness:
         self.ages = Ages(at_ns)
         self.senders: dict[tuple[str, str], Sender] = {}
         self.wishes: deque[tuple[str, Wish]] = deque()
+        self._unread: list[tuple[str, Wish | None, tuple[Any, ...]]] = []
+        """Messages that no step has read yet: the key, the command if it can be read, and the
+        arguments for its age."""
         self.last: tuple[float, ...] = ZERO
         self.last_ns = at_ns
         self.wished_ns = at_ns
@@ -226,6 +229,7 @@ class Witness:
     ) -> Wish | None:
         """Take note of a command that reached the daemon; return None if it cannot be read."""
         self.delivered += 1
+        self._unread.append((sample.key, None, ()))
         source = sender["source"]
         if message.junk not in ("", "cancels"):
             if sample.shared and message.junk in MAYBE_SPEEDS:
@@ -241,8 +245,8 @@ class Witness:
         wish = Wish(arrived_ns, v, w)
         wish.identity, wish.shared = sample.identity, sample.shared
         loose = sample.clock in self.shared_clocks
-        timeout_ns = self.timeout[source]
-        wish.fresh = self.ages.fresh(sender, message, sample, arrived_ns, timeout_ns, loose)
+        seen = sender, message, sample, arrived_ns, self.timeout[source], loose
+        self._unread[-1] = sample.key, wish, seen
         wish.certain = (
             not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
         )
@@ -259,6 +263,25 @@ class Witness:
         self.wishes.append((source, wish))
         return wish
 
+    def dropped(self, key: str) -> None:
+        """Note that the inbox dropped its oldest message of this key, which no step will read.
+
+        The robot does not follow it, and does not learn its delay.
+        """
+        place = next(n for n, (other, *_) in enumerate(self._unread) if other == key)
+        del self._unread[place]
+
+    def read(self) -> None:
+        """Judge the ages of all commands that a step has read."""
+        self._judge_ages()
+        self._unread.clear()
+
+    def _judge_ages(self) -> None:
+        for place, (key, wish, seen) in enumerate(self._unread):
+            if wish is not None:
+                wish.fresh = self.ages.fresh(*seen)
+                self._unread[place] = key, None, ()
+
     def _arm(self, known: Sender, now_ns: int) -> None:
         """Arm a shared identity by the latest zero that the pause has passed behind."""
         place = bisect_right(known.zeros, now_ns - self.pause_ns)
@@ -271,6 +294,8 @@ class Witness:
 
     def suspended(self, at_ns: int) -> None:
         """Note that the robot's clock stood, so that it cannot know the delays it knew before."""
+        # The delays of the commands that wait for a step are of the time before.
+        self._judge_ages()
         self.ages.forget_least(at_ns)
 
     def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:

@@ -587,6 +587,30 @@ def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
     assert later[-1] is obeyed
 
 
+@pytest.mark.parametrize("dropped", [True, False])
+def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
+    dropped: bool,
+) -> None:
+    witness = witnessed()
+    sender = made(1)["senders"][0] | {
+        "way": "client", "source": "app", "id": "ann", "churn": False, "delay": 0.001, "clock": []
+    }  # fmt: skip
+
+    def arrives(at_ns: int, delay_ns: int) -> None:
+        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        witness.command(sender, one, sample(sender, one, PLAIN["config"], 0), at_ns)
+
+    arrives(5 * NS, NS)
+    if dropped:
+        witness.dropped("cmd/app")
+    witness.read()
+    for number in range(20):
+        arrives(6 * NS + number * NS // 20, 3 * NS)
+        witness.read()
+    assert not witness.wishes[0][1].fresh
+    assert witness.wishes[-1][1].fresh is dropped
+
+
 def test_a_set_that_had_no_answer_may_be_in_force_after_a_restart_or_not() -> None:
     witness = witnessed()
     limit = witness.file["wheel_speed"]
