@@ -541,8 +541,8 @@ class Run:
         self.inputs.fed(at_ns, data)
         lines, end, rest = (self._rest + data).rpartition(b"\n")
         self._rest = rest[-99:]
-        if not end or (b"ap" not in lines and b"an" not in lines):
-            return  # The line has no end, or the board greets, or it makes noise while it boots.
+        if not end or not any(line[:2] in (b"ap", b"an") for line in lines.split(b"\n")):
+            return  # The line has no end, or begins with noise, or the board greets.
         true_ns = at_ns - START_NS + self.slept_ns
         self.witness.reported(true_ns, lines)
         gap_ns = true_ns - self._fed_ns

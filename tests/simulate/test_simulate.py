@@ -796,7 +796,7 @@ def test_a_robot_with_a_damaged_latch_file_starts_stopped(damage: str) -> None:
     assert result.counts["mode stopped"] == 1
 
 
-@pytest.mark.parametrize("fault", [["endless"], ["wrong_baud", 9600], ["partial_line"]])
+@pytest.mark.parametrize("fault", [["endless"], ["wrong_baud", 9600], ["partial_line"], ["noise"]])
 def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[Any]) -> None:
     links = Counter[str]()
     run = Run(quiet_with({"at": 2.0, "for": 2.0, "do": "board", "fault": fault}))
