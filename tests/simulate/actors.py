@@ -459,6 +459,7 @@ class Run:
         self.liveness.event(TROUBLE_NS if new else 0)
         if not self.product.plugged:
             self.product.plug(new)
+            self.witness.first = True
             self._boards += new
             if self.witness.blocked_ns is not None:
                 self.witness.blocked_ns = self.true_ns  # The new port has taken no line either.

@@ -347,8 +347,8 @@ class Inputs:
             if known.reported_ns is not None and decided_ns - known.reported_ns > SILENT_NS:
                 self._silence(known, decided_ns, offset, calm_ns)
         if self._fresh:
-            # A line that a command made early leaves in the place of the next period's line. A robot
-            # that has got a zero already may then get the next one a period later.
+            # A line that a command made early leaves in the place of the next period's line. A
+            # robot that has got a zero already may then get the next one a period later.
             periods = 1 if any(self._witness.last) else 2
             self._due_ns = decided_ns + periods * self._witness.period_ns + MARGIN_NS // 6
 

@@ -213,6 +213,8 @@ class Witness:
         arguments for its age."""
         self.last: tuple[float, ...] = ZERO
         self.last_ns = at_ns
+        self.first = True
+        """The next line is the first one since the port was opened: always a plain stop."""
         self.wished_ns = at_ns
         self.coasting: tuple[int, tuple[float, ...]] | None = None
         """Since when no wish explains the motion, and the wheel speeds then."""
@@ -487,7 +489,11 @@ class Witness:
             return
         if self._jerks:
             self._jerk(at_ns, wheels, made_ns - self.last_ns)
+        first, self.first = self.first, False
         if wheels == ZERO:
+            if first and self.linked:
+                # This stop has taken the place of a line, whose speed may have grown for longer.
+                made_ns = self.last_ns
             self.last, self.last_ns, self.coasting, self.braking = ZERO, made_ns, None, None
             self._driven = [(at_ns, 0.0)] * 4
             self.softest = dict(self.limits)

@@ -465,6 +465,22 @@ def test_a_robot_goes_on_at_full_speed_only_if_its_board_cannot_have_stopped(
         witness.line(at_ns, b"ap08.00,bp08.00,cp08.00,dp08.00\r\n", at_ns, at_ns)
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_the_stop_that_opens_a_port_takes_the_place_of_a_line_whose_speed_may_have_grown(
+    first: bool,
+) -> None:
+    witness = witnessed()
+    witness.linked, witness.first = True, first
+    witness.limits["linear_acceleration"] = 1.0
+    zero, grown = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", b"ap00.40,bp00.40,cp00.40,dp00.40\r\n"
+    at_ns = NS
+    witness.line(at_ns, zero, at_ns, at_ns)
+    # The bench has no sender, which is the next promise to be judged.
+    promise = "motion needs a fresh wish" if first else "no acceleration is over its limit"
+    with pytest.raises(BrokenError, match=promise):
+        witness.line(at_ns + NS // 100, grown, at_ns, at_ns + NS // 100)
+
+
 @pytest.mark.parametrize(("speed", "raises"), [(5.0, True), (3.0, False)])
 def test_a_wheel_that_clearly_does_not_obey_must_become_a_fault(speed: float, raises: bool) -> None:
     witness = witnessed()
