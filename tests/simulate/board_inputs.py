@@ -52,7 +52,8 @@ FIELD = (
     rb"(?:estop=(?:ok|pressed)|bumpers=[.X]{1,4}|driver=(?:ok|fault)|volts=\d{1,2}\.\d\d"
     rb"|amps=-?\d{1,3}\.\d\d|charge=(?:100|\d{1,2})%|temp=-?\d{1,3}\.\d)"
 )
-STATUS = re.compile(rb"(!status(?: " + FIELD + rb")+)(?:\*([0-9A-F]{4}))?\r?")
+STATUS = re.compile(rb"(!status(?: " + FIELD + rb")+)(?:\*([0-9A-F]{4}))?\s*")
+"""White space at the end does not count, also if it is a line end that was damaged."""
 
 CLEAR = {
     "do": "call", "verb": "clear", "late": 0.01, "lost": False, "twice": False, "by": "op9",
