@@ -24,6 +24,8 @@ from tests.each import each
 from tests.scenarios.taped import chunks, recorded_world
 from tests.scenarios.world import World
 
+pytestmark = pytest.mark.slow
+
 MINUTES = 10
 
 SHARE = 0.95

@@ -167,6 +167,7 @@ def reversed_encoder(seed: int) -> tuple[float, float, str]:
     return off(made)[1], abs(by_plain), reason
 
 
+@pytest.mark.slow
 def test_forty_robots_of_96_counts_with_a_reversed_encoder_are_all_found() -> None:
     found = [reversed_encoder(seed) for seed in range(40)]
     kept, phantom = sum(one[0] for one in found), sum(one[1] for one in found)

@@ -495,7 +495,7 @@ def test_the_first_goal_of_nav2_after_a_start_does_not_move_the_robot_and_the_se
     nav2.idle(0.0 if road == "rmw" else 1.0)
     drives(world, lambda: nav2.goal(FAST, 0.5))
     nav2.cancel()
-    nav2.idle(300.0)
+    nav2.idle(60.0)
     drives(world, lambda: nav2.goal(FAST, 1.0))
 
 

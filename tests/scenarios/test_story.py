@@ -38,6 +38,8 @@ from tests.scenarios.speakers import Speaker, over
 from tests.scenarios.taped import chunks
 from tests.scenarios.world import World
 
+pytestmark = pytest.mark.slow
+
 TOLERANCE_S = 1.0
 """Largest difference between the time of an incident and the time of a line about it."""
 

@@ -9,6 +9,8 @@ import pytest
 from tests.simulate.actors import played
 from tests.simulate.shrink import load
 
+pytestmark = pytest.mark.slow
+
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
 
 
