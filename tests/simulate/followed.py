@@ -75,6 +75,11 @@ class Followed:
         """The lowest delay of each clock, and when the daemon last forgot all delays."""
         self._fell_ns: dict[str, int] = {}
         """When the lowest delay of each clock last fell clearly."""
+        self._learned: dict[str, tuple[int, int]] = {}
+        """The lowest delay of each clock that the daemon certainly believes, and when the daemon
+        last forgot all delays. A lower delay that did not last for a proof is not believed."""
+        self._below_ns: dict[str, int] = {}
+        """When a command of each clock last took clearly less time than the delay in `_learned`."""
         self._newest: dict[str, int] = {}
         """The highest number that arrived, by clock."""
         self._waiting: dict[Who, Command] = {}
@@ -153,9 +158,23 @@ class Followed:
             run = self._runs[sample.clock] = Run(at_ns, age)
         run.low, run.high, run.last_ns = min(run.low, age), max(run.high, age), at_ns
         proof_ns = 3 * NS + 2 * min(witness.timeout[found.who[0]], 2 * NS)
+        if age < self._lowest_learned(sample.clock, age) - FALL_NS:
+            self._below_ns[sample.clock] = at_ns
         proven = run.followed or (not sender.get("jitter") and at_ns - run.begun_ns > proof_ns)
+        if proven:
+            self._learn(sample.clock, age)
         proven &= at_ns - self._fell_ns.get(sample.clock, -NS) >= NS
         return proven and age <= least + EVEN_NS and message.number > newest
+
+    def _lowest_learned(self, clock: str, default: int) -> int:
+        """Return the lowest delay of this clock that the daemon certainly believes."""
+        learned_ns, lowest = self._learned.get(clock, (0, default))
+        return lowest if learned_ns == self._witness.ages.learned_ns else default
+
+    def _learn(self, clock: str, age: int) -> None:
+        """Note that the daemon has accepted a command with this delay."""
+        lowest = min(age, self._lowest_learned(clock, age))
+        self._learned[clock] = self._witness.ages.learned_ns, lowest
 
     @property
     def wish(self) -> tuple[float, float] | None:
@@ -198,6 +217,8 @@ class Followed:
             if found.clock in self._runs:
                 run = self._runs[found.clock]
                 run.followed |= found.true_ns >= run.begun_ns
+                if found.true_ns >= witness.ages.learned_ns:
+                    self._learn(found.clock, found.true_ns - found.message.sent_ns)
         self._holder = found
 
     def _first_keeps(self, true_ns: int, decided_ns: int, found: Command) -> None:
@@ -208,8 +229,9 @@ class Followed:
         priority = witness.priority
         left_ns = witness.timeout[holder.who[0]] - (decided_ns - holder.arrived_ns)
         if priority[found.who[0]] <= priority[holder.who[0]] and left_ns > witness.period_ns:
+            fell_ns = max(times.get(holder.clock, -1) for times in (self._fell_ns, self._below_ns))
             if holder.sender["way"] in FOREIGN and (
-                not stable(holder.sender) or self._fell_ns.get(holder.clock, -1) >= holder.true_ns
+                not stable(holder.sender) or fell_ns >= holder.true_ns
             ):
                 return  # it was set, or looks so behind a congestion: it must send a zero again
             raise BrokenError(

@@ -7,7 +7,7 @@ import random
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import nullcontext
 from copy import deepcopy
 from pathlib import Path
@@ -943,29 +943,54 @@ def test_whole_lines_that_are_not_heard_behind_a_damaged_one_are_a_finding(
             damage.look(n * NS, lambda n=n: max(0, n - lost))  # type: ignore[misc]
 
 
-def followed_in_turn(*sent: tuple[float, str, float, float]) -> None:
-    """Have the robot follow each command of two `signed` senders: time, sender, speed, by."""
-    witness = witnessed()
+SIGNED = made(1)["senders"][0] | {
+    "way": "signed", "source": "app", "wheels": False, "delay": 0.0, "churn": False,
+    "jitter": 0.0, "congestion": [], "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0,
+    "ahead": 0.0, "drift": 0.0, "loss": 0.0, "twice": 0.0, "swap": 0.0,
+}  # fmt: skip
+
+
+def followed_in_turn(
+    *sent: tuple[float, str, float, float],
+    late: Collection[float] = (),
+    refused: Collection[float] = (),
+) -> None:
+    """Have the robot follow each command of two `signed` senders: time, sender, speed, by.
+
+    The commands that arrive at the times in `late` took 1 s. The robot does not follow those that
+    arrive at the times in `refused`.
+    """
+    witness, followed_ns = witnessed(), None
     followed = Followed(witness)
-    base = made(1)["senders"][0] | {
-        "way": "signed", "source": "app", "wheels": False, "delay": 0.0, "churn": False,
-        "jitter": 0.0, "congestion": [], "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0,
-        "ahead": 0.0, "drift": 0.0, "loss": 0.0, "twice": 0.0, "swap": 0.0,
-    }  # fmt: skip
     for number, (at_s, name, v, by_s) in enumerate(sent):
-        sender = base | {"id": name, "clock": [["step", 5.0, by_s]] if by_s else []}
+        sender = SIGNED | {"id": name, "clock": [["step", 5.0, by_s]] if by_s else []}
         at_ns = int(at_s * NS)
-        one = Message(at_ns, at_ns, v, 0.0, at_ns, number, "")
+        sent_ns = at_ns - NS * (at_s in late)
+        one = Message(sent_ns, at_ns, v, 0.0, sent_ns, number, "")
         found = sample(sender, one, PLAIN["config"], 0)
         wish = witness.command(sender, one, found, at_ns)
         followed.command(sender, one, found, at_ns, wish)
-        followed.step(at_ns + 1, at_ns + 1, at_ns, "driving", "up")
+        followed_ns = followed_ns if at_s in refused else at_ns
+        followed.step(at_ns + 1, at_ns + 1, followed_ns, "driving", "up")
 
 
 def test_a_second_sender_that_is_followed_before_the_first_is_silent_is_a_finding() -> None:
     followed_in_turn((4.0, "a", 0.3, 0.0), (6.0, "b", 0.3, 0.0))
     with pytest.raises(BrokenError, match="the first of equal priority keeps the robot"):
         followed_in_turn((4.0, "a", 0.3, 0.0), (4.05, "b", 0.3, 0.0))
+
+
+def test_a_delay_that_falls_below_all_accepted_ones_looks_like_a_clock_that_was_set() -> None:
+    sent = [
+        (3.9, "a", 0.3, 0.0),
+        (4.0, "a", 0.3, 0.0),
+        (4.01, "a", 0.3, 0.0),
+        (4.02, "b", 0.3, 0.0),
+    ]
+    # The daemon has refused the only short delay before, so it does not know it.
+    followed_in_turn(*sent, late=[4.0], refused=[3.9, 4.01])
+    with pytest.raises(BrokenError, match="the first of equal priority keeps the robot"):
+        followed_in_turn(*sent, late=[4.0], refused=[4.01])
 
 
 def test_a_clock_that_was_set_and_drives_without_a_zero_is_a_finding() -> None:
