@@ -66,6 +66,8 @@ class _Clock:
         """Its proof was certainly over once."""
         self.unsure = False
         """Its proof may have been over before a silence, or not."""
+        self.believed = False
+        """Its proof may have been over when one of its commands arrived."""
         self.odd = False
         """It is adjusted or shared, or its messages overtake each other."""
 
@@ -104,6 +106,10 @@ class Reasons:
     def __init__(self, run: Run) -> None:
         self.run = run
         self._ready_ns = self._looked_ns = self._calm_ns = -1
+        self._clocks: dict[str, _Clock] = {}
+        self._known_before: set[str] = set()
+        """Clocks whose proof may have been over before the robot's clock stood. The daemon compares
+        their next commands with the delays from before, and does not take them for new."""
         self.restart()
 
     def restart(self, stood: bool = False) -> None:
@@ -112,7 +118,12 @@ class Reasons:
         A daemon whose clock stood still knows the delays from before, so they look changed to it.
         """
         self._stood = stood
-        self._clocks: dict[str, _Clock] = {}
+        if stood:
+            believed = (name for name, clock in self._clocks.items() if clock.believed)
+            self._known_before.update(believed)
+        else:
+            self._known_before.clear()
+        self._clocks.clear()
         self._heard: dict[str, dict[str, _Heard]] = {}
         self._junk: set[str] = set()
         """Sources with refused messages, any of which may undo the zero of a shared identity."""
@@ -141,6 +152,7 @@ class Reasons:
         clock.odd |= any(wild)
         clock.odd |= one.clock in self.run.witness.shared_clocks
         clock.proved |= clock.known(at_ns, self.run.witness.timeout[source])
+        clock.believed |= clock.may_be_known(at_ns, self.run.witness.timeout[source])
         heard.clock = clock
 
     def _clock(self, name: str, at_ns: int, delay_ns: int) -> _Clock:
@@ -148,6 +160,7 @@ class Reasons:
         clock = self._clocks.get(name)
         if clock is None:
             clock = self._clocks[name] = _Clock(at_ns, delay_ns)
+            clock.unsure = name in self._known_before
         silent_ns = at_ns - clock.last_ns
         if silent_ns > FORGOTTEN_NS or (silent_ns > PAUSE_NS and not clock.proved):
             # Its proof may begin again, unless it was over.
@@ -199,17 +212,17 @@ class Reasons:
         words = {one["name"]: one["waits_for"] for one in state["sources"]}
         for source in wishing:
             kind, _ = kind_of(words[source])
-            allowed = self._allowed(source, now_ns)
+            allowed = self.allowed(source, now_ns)
             if kind not in allowed:
                 text = f"{source} waits for {words[source]!r}, allowed is {sorted(allowed)}"
                 raise BrokenError(name, now_ns, text)
         kind, named = kind_of(state["reason"])
-        allowed = self._allowed(named, now_ns) - {"priority"} if named in words else set()
+        allowed = self.allowed(named, now_ns) - {"priority"} if named in words else set()
         if kind not in allowed:
             text = f"{state['reason']!r}, allowed is {sorted(allowed)}, {wishing} wish a speed"
             raise BrokenError(name, now_ns, text)
 
-    def _allowed(self, source: str, now_ns: int) -> set[str]:
+    def allowed(self, source: str, now_ns: int) -> set[str]:
         """Return the kinds of causes that this source may wait for now, if it has live senders."""
         witness, found = self.run.witness, set[str]()
         timeout_ns = witness.timeout[source]

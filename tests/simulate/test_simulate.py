@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection
 from contextlib import nullcontext
 from copy import deepcopy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -38,7 +39,7 @@ from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, Product, Seen, problems
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.reasons import kind_of
+from tests.simulate.reasons import Reasons, kind_of
 from tests.simulate.reports import Reports, judge_pose
 from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
 from tests.simulate.spread import Spread
@@ -756,6 +757,26 @@ def test_the_words_of_a_reason_are_sorted_into_a_kind_and_a_source(
     words: str, kind: tuple[str, str]
 ) -> None:
     assert kind_of(words) == kind
+
+
+@pytest.mark.parametrize(
+    ("lasted_s", "stood", "late"), [(3, True, True), (0.1, True, False), (3, False, False)]
+)
+def test_behind_a_suspend_only_a_sender_that_was_proved_before_may_be_called_late(
+    lasted_s: float, stood: bool, late: bool
+) -> None:
+    witness = witnessed()
+    run: Any = SimpleNamespace(witness=witness)
+    reasons = Reasons(run)
+    end_ns = 4 * NS
+    for at_ns in (*range(end_ns - int(lasted_s * NS), end_ns, NS // 20), end_ns):
+        if at_ns == end_ns:
+            reasons.restart(stood)
+        one = Message(at_ns, at_ns, 0.1, 0.0, at_ns, at_ns, "")
+        found = sample(SIGNED, one, PLAIN["config"], 0)
+        witness.command(SIGNED, one, found, at_ns)
+        reasons.command(SIGNED, one, found)
+    assert ("late" in reasons.allowed("app", end_ns)) is late
 
 
 def state_of(counters: dict[str, int]) -> dict[str, Any]:
