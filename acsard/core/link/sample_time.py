@@ -63,6 +63,11 @@ LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 """Largest lateness of a line in slots when a clock is found: for lines read one by one, for
 batches."""
 
+EARLY_ALONE = 0.5
+"""Slots by which one line may be earlier than all others when a clock is found. A line that is
+earlier came out of turn: it answers a command that left between two periods. With it as the
+earliest line, all others would be a slot late."""
+
 JUMP = 1.4
 """Slots since the last line. Below this a lone line cannot have another one missing before it."""
 
@@ -217,7 +222,7 @@ class FreeRunningTimes:
         gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
         for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
-            if max(late) <= most:
+            if max(late) <= most and sorted(late)[1] <= EARLY_ALONE:
                 break
         else:
             del reads[: len(reads) // 4]

@@ -203,6 +203,24 @@ def test_a_first_line_out_of_turn_makes_no_other_period_of_batches() -> None:
     assert slots.usual == 10 * MS
 
 
+@pytest.mark.parametrize("period_ms", [10, 100])
+@pytest.mark.parametrize("early", [0.7, 0.84, 0.95])
+@pytest.mark.parametrize("turn", [4, 11])
+def test_a_reply_to_a_command_between_two_periods_makes_no_clock_that_is_a_slot_early(
+    period_ms: int, early: float, turn: int
+) -> None:
+    slots, period_ns = FreeRunningTimes((period_ms / 1000,)), period_ms * MS
+    for slot in range(120):
+        # The command leaves at once instead of with the next period, so its reply is early.
+        late = 0.04 * (slot % 4) - (early if slot == turn else 0.0)
+        at_ns = 10**12 + int((slot + late) * period_ns)
+        slots.read(at_ns, 1, True)
+        placed = slots.place(0)
+        if placed is not None:
+            assert at_ns - placed.due_ns < period_ns / 2
+    assert slots.period == period_ms / 1000
+
+
 @pytest.mark.parametrize("lost", [1, 2, 7, 50])
 def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
     bench = Bench().found()
