@@ -10,6 +10,14 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from acsard.core.config.settings import Config
+from acsard.core.messages.keys_and_roles import (
+    PUBLISHED,
+    TOPICS,
+    Topic,
+    full_key,
+    json_key,
+    source_keys,
+)
 from acsard.core.messages.permissions import (
     COMMAND_ROLE,
     SERVICE_ROLES,
@@ -18,7 +26,6 @@ from acsard.core.messages.permissions import (
     has,
     keys_for,
 )
-from acsard.core.messages.topics import PUBLISHED, TOPICS, Topic, full_key, json_key, source_keys
 from acsard.core.values import ROLES, Role
 from acsard.daemon.gateway.fleet_router import EXAMPLE
 

@@ -32,8 +32,8 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.encodings import Decoder, encode, encoding_name
+from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Odometry, RobotState, Twist, Vector3
-from acsard.core.messages.topics import full_key
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 from acsard.daemon.bus.outlets import direct

@@ -40,7 +40,7 @@ from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus, require_one
 from acsard.client import connect
 from acsard.core.config.settings import Config
-from acsard.core.messages.topics import IMU, full_key
+from acsard.core.messages.keys_and_roles import IMU, full_key
 from acsard.daemon.bus.address import address_of
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.config_file import change, writable

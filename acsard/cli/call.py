@@ -10,8 +10,8 @@ from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
+from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, SERVICES
 from acsard.core.messages.schema import MESSAGES
-from acsard.core.messages.topics import PLAIN_SERVICES, SERVICES
 from acsard.core.values import Verb
 from acsard.daemon.bus import robot_discovery
 from acsard.daemon.bus.robot_discovery import named

@@ -15,7 +15,7 @@ from acsard.core.config.named_faults import ARGUMENTS, FAULTS
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, LogConfig
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.topics import PUBLISHED, TOPICS, json_key, source_keys
+from acsard.core.messages.keys_and_roles import PUBLISHED, TOPICS, json_key, source_keys
 from acsard.host.extras import missing
 
 SHELLS = {

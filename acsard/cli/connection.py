@@ -15,7 +15,7 @@ from acsard.client import Client, connect
 from acsard.client.follower import FIRST_S
 from acsard.core.config.settings import TLS
 from acsard.core.formatting import printable
-from acsard.core.messages.topics import key_hint, row_of, unknown
+from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
 from acsard.daemon.bus.address import Address, address_of
 from acsard.daemon.bus.robot_discovery import Presence, explain_silence, named, presence
 from acsard.daemon.bus.tls import trouble

@@ -30,9 +30,9 @@ from acsard.client import Client
 from acsard.client.synchronous import decoder
 from acsard.core import formatting
 from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.keys_and_roles import TOPICS, by_key
 from acsard.core.messages.one_line import SHORT, short
 from acsard.core.messages.schema import MESSAGES
-from acsard.core.messages.topics import TOPICS, by_key
 from acsard.daemon.bus.robot_discovery import ALL, follow, named, present, robot_of
 from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock

@@ -8,8 +8,8 @@ from acsard.cli.common import add_config, load
 from acsard.core.config.settings import Config
 from acsard.core.incoming.queries import topic_table
 from acsard.core.messages.encodings import encode
+from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import TopicInfo, Topics
-from acsard.core.messages.topics import by_key
 from acsard.core.ros.names import full_name
 from acsard.core.ros.parameters import SETTING
 from acsard.core.ros.transports import left_out, ros_names

@@ -18,8 +18,8 @@ from msgspec import Struct
 from acsard.client.follower import FLEET_ASK_S, Follower
 from acsard.client.synchronous import Client
 from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Info, RobotState
-from acsard.core.messages.topics import full_key
 from acsard.daemon.bus.robot_discovery import ALL, robot_of
 from acsard.daemon.bus.subscription import encoded
 from acsard.host.mailbox import Mailbox

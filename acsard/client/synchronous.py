@@ -19,9 +19,7 @@ from acsard.client.driving import UnheardError, drive
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import Decoder, encode, encoding_name
-from acsard.core.messages.permissions import COMMAND_ROLE, has
-from acsard.core.messages.signature import Signature, public_name
-from acsard.core.messages.topics import (
+from acsard.core.messages.keys_and_roles import (
     VERBS,
     by_key,
     command_key,
@@ -30,6 +28,8 @@ from acsard.core.messages.topics import (
     service_key,
     unknown,
 )
+from acsard.core.messages.permissions import COMMAND_ROLE, has
+from acsard.core.messages.signature import Signature, public_name
 from acsard.core.values import Plain, Pose
 from acsard.daemon.bus.address import Address, address_by_environment
 from acsard.daemon.bus.identity import Identity, identity

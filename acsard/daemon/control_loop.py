@@ -29,9 +29,9 @@ from acsard.core.incoming.queries import Queries, Query, refused
 from acsard.core.incoming.speed_limit import SpeedLimiter
 from acsard.core.link.serial_output import Port
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import Info, Message
-from acsard.core.messages.topics import IMU, SPEED_LIMIT
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.robot import Robot
 from acsard.core.values import (

@@ -19,8 +19,8 @@ from typing import Any, Self
 
 from acsard.core.config.settings import TLS, Config
 from acsard.core.link.codec import Codec
+from acsard.core.messages.keys_and_roles import DESCRIPTION
 from acsard.core.messages.schema import Info
-from acsard.core.messages.topics import DESCRIPTION
 from acsard.core.values import NS_PER_S, Event, Latches
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.certificate_watch import watch_certificates

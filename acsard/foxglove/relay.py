@@ -20,8 +20,8 @@ from acsard.client.synchronous import decoder
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, Via
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.keys_and_roles import by_key, source_keys
 from acsard.core.messages.schema import Events, LogEvent, Time, TwistStamped
-from acsard.core.messages.topics import by_key, source_keys
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.channels import CMD_VEL_IN, ENCODING, LOG, SCHEMA_ENCODING, Channel
 from acsard.core.ros.shapes import Log, asked, log

@@ -23,8 +23,8 @@ from acsard.core.config.live import flat, live
 from acsard.core.config.settings import RosConfig
 from acsard.core.messages.encodings import DecodeError, Decoder, encode
 from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, SERVICES
 from acsard.core.messages.schema import MESSAGES, ServiceReply
-from acsard.core.messages.topics import PLAIN_SERVICES, SERVICES
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError, Verb
 from acsard.foxglove.drives import Drives

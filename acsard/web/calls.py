@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, TypeVar
 from acsard.client import Client
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.schema import ServiceReply
-from acsard.core.messages.topics import SERVICES
 from acsard.daemon.bus import robot_discovery
 from acsard.daemon.bus.address import require_id
 from acsard.host import clock

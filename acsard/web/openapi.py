@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.topics import FOLLOWED
+from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.terminal import json_prompt
 from acsard.web import socket_messages
 from acsard.web.routes import Body, Problem, Route

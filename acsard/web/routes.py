@@ -14,8 +14,8 @@ from typing import Any, Literal
 from msgspec import Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, VERBS, Topic
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
-from acsard.core.messages.topics import SERVICES, TOPICS, VERBS, Topic
 from acsard.core.values import ROLES, Role
 from acsard.host.rate_limits import Rate
 from acsard.web.limits import REQUESTS, STOPS

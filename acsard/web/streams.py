@@ -17,7 +17,7 @@ import zenoh
 
 from acsard.client import Client
 from acsard.core.messages.encodings import DecodeError, detect
-from acsard.core.messages.topics import FOLLOWED
+from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.daemon.bus.subscription import encoded, on
 from acsard.host import clock
 from acsard.host.errors import UsageError

@@ -23,8 +23,8 @@ import pytest
 from acsard.bench.rig import Rig, processor_ns
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.messages import encodings
+from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Message
-from acsard.core.messages.topics import full_key
 from acsard.daemon.bus import outlets
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.outlets import direct

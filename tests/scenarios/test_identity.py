@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from acsard.core.messages.encodings import encode
-from acsard.core.messages.topics import TOPICS
+from acsard.core.messages.keys_and_roles import TOPICS
 from acsard.core.values import NS_PER_S
 from acsard.recording.state import freeze
 from tests.scenarios.speakers import Speaker

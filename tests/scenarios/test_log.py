@@ -10,8 +10,8 @@ import pytest
 
 from acsard.core.incoming.commands import Arrival, Via
 from acsard.core.incoming.queries import Query
+from acsard.core.messages.keys_and_roles import SERVICES, VERBS
 from acsard.core.messages.signature import public_name
-from acsard.core.messages.topics import SERVICES, VERBS
 from acsard.core.values import NS_PER_S, Event, EventName
 from tests.scenarios.instant_watch import InstantWatch
 from tests.scenarios.world import World

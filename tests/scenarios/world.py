@@ -19,9 +19,9 @@ from acsard.core.incoming.queries import Query, Reply
 from acsard.core.link.codec import Codec
 from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.messages.encodings import encode
+from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.core.messages.signature import Signature
-from acsard.core.messages.topics import PUBLISHED
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
 from acsard.core.simulator.true_messages import turn_rate

@@ -34,7 +34,7 @@ import msgspec
 import zenoh
 
 from acsard.core.incoming.queries import BUSY
-from acsard.core.messages.topics import command_key
+from acsard.core.messages.keys_and_roles import command_key
 
 T = TypeVar("T")
 

@@ -26,7 +26,14 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
+from acsard.core.messages.keys_and_roles import (
+    PUBLISHED,
+    SERVICES,
+    TOPICS,
+    WHOAMI,
+    source_keys,
+    whoami_key,
+)
 from acsard.core.values import ROLES
 from acsard.host.errors import Exit
 from tests.system.browser import Page, hands

@@ -27,8 +27,8 @@ from acsard.client.follower import FIRST_S, Watch
 from acsard.client.synchronous import Client
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time, TwistStamped
-from acsard.core.messages.topics import by_key
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.terminal.prompt import Prompt

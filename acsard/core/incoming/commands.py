@@ -23,6 +23,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages import signature
 from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.core.messages.keys_and_roles import COMMANDS, SERVICES
 from acsard.core.messages.schema import (
     MESSAGES,
     Header,
@@ -36,7 +37,6 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.signature import public_name
-from acsard.core.messages.topics import COMMANDS, SERVICES
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import GID_BYTES, unpack
 from acsard.core.ros.transports import Transport

@@ -24,6 +24,16 @@ from acsard.core.messages.encodings import (
     encoding_name,
 )
 from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.keys_and_roles import (
+    JSON_TREE,
+    PUBLISHED,
+    SERVICES,
+    VERBS,
+    WHOAMI,
+    full_key,
+    offered,
+    whoami_key,
+)
 from acsard.core.messages.schema import (
     MESSAGES,
     HardwareInterface,
@@ -34,16 +44,6 @@ from acsard.core.messages.schema import (
     TopicInfo,
     Topics,
     WhoAmI,
-)
-from acsard.core.messages.topics import (
-    JSON_TREE,
-    PUBLISHED,
-    SERVICES,
-    VERBS,
-    WHOAMI,
-    full_key,
-    offered,
-    whoami_key,
 )
 from acsard.core.ros.attachments import Attachment, unpack
 from acsard.core.ros.parameters import (

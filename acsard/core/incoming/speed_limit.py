@@ -24,8 +24,8 @@ from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, caller_name
 from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.core.messages.keys_and_roles import SPEED_LIMIT
 from acsard.core.messages.schema import Header, SpeedLimit
-from acsard.core.messages.topics import SPEED_LIMIT
 from acsard.core.values import NS_PER_S, Answer, Event, Refusal, Request
 
 SETTING = "limits.linear_speed"

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 
 from acsard.core.config.settings import Config
+from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.schema import (
     MESSAGES,
     Imu,
@@ -20,7 +21,6 @@ from acsard.core.messages.schema import (
     SpeedLimit,
     TwistStamped,
 )
-from acsard.core.messages.topics import SERVICES
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from typing import Literal, get_args
 
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.topics import JSON_TREE, VERBS, Topic, json_key, row_of
+from acsard.core.messages.keys_and_roles import JSON_TREE, VERBS, Topic, json_key, row_of
 from acsard.core.values import ROLES, Role, Verb
 
 Use = Literal["publish", "subscribe", "query"]

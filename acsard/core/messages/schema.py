@@ -13,7 +13,7 @@ from typing import Annotated, get_args
 from msgspec import Meta, Struct
 
 from acsard.core.link.link_state import State
-from acsard.core.messages.topics import Direction
+from acsard.core.messages.keys_and_roles import Direction
 from acsard.core.motion.modes import Mode
 from acsard.core.values import (
     NS_PER_S,

@@ -18,8 +18,8 @@ from typing import Any
 from msgspec import Struct
 
 from acsard.core.messages.encodings import encode
+from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import MESSAGES, RobotState, TwistStamped
-from acsard.core.messages.topics import by_key
 from acsard.core.ros.names import Qos, full_name
 from acsard.core.ros.shapes import Log, State, state
 from acsard.core.ros.transports import PUBLISHED

@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.encodings import encoding_name
-from acsard.core.messages.topics import (
+from acsard.core.messages.keys_and_roles import (
     DESCRIPTION,
     IMU,
     PLAIN_SERVICES,

@@ -21,8 +21,7 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict
 
 from acsard.core.config.settings import Config
-from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
-from acsard.core.messages.topics import (
+from acsard.core.messages.keys_and_roles import (
     COMMANDS,
     DESCRIPTION,
     IMU,
@@ -33,6 +32,7 @@ from acsard.core.messages.topics import (
     published,
     source_keys,
 )
+from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
 from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, left_out
 from acsard.core.values import ROLES, ROOT, Role
 

@@ -17,9 +17,9 @@ from acsard.core.incoming.bus_interface import BusInput, Waker
 from acsard.core.incoming.imu import OWN
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.encodings import encoding_name
+from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.messages.schema import Message
 from acsard.core.messages.signature import Signature
-from acsard.core.messages.topics import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.ros.names import gid
 from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
 from acsard.core.values import NS_PER_S

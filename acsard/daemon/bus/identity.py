@@ -16,8 +16,8 @@ from typing import Literal
 import zenoh
 from msgspec import Struct
 
+from acsard.core.messages.keys_and_roles import full_key, whoami_key
 from acsard.core.messages.permissions import MAY, has, least_role
-from acsard.core.messages.topics import full_key, whoami_key
 from acsard.core.values import NS_PER_S, ROLES, Role
 from acsard.daemon.bus.tls import common_name
 from acsard.host import clock

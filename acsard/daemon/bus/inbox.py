@@ -20,7 +20,7 @@ import zenoh
 from acsard.core.incoming.bus_interface import NOTHING, BusInput, Waker
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
 from acsard.core.incoming.queries import BUSY, Query, Reply, most_bytes, refused
-from acsard.core.messages.topics import (
+from acsard.core.messages.keys_and_roles import (
     IMU,
     JSON_TREE,
     SPEED_LIMIT,

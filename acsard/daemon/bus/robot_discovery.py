@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from acsard.core.config.settings import TLS
 from acsard.core.formatting import many
-from acsard.core.messages.topics import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
+from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
 from acsard.core.values import ROOT
 from acsard.daemon.bus.address import require_id
 from acsard.daemon.bus.subscription import Subscription, queue_on

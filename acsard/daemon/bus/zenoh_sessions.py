@@ -15,7 +15,7 @@ from pathlib import Path
 import zenoh
 
 from acsard.core.config.settings import TLS, Config
-from acsard.core.messages.topics import IMU, SPEED_LIMIT, full_key, source_keys
+from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
 from acsard.core.ros.transports import command_keys
 from acsard.daemon.bus.access import access_control, gateway_access
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, require_usable, trouble

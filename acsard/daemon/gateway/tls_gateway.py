@@ -16,8 +16,8 @@ from zenoh.handlers import Callback
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
+from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import GatewayState
-from acsard.core.messages.topics import full_key
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.tls import ends, files_in, require_usable

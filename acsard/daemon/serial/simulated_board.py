@@ -18,8 +18,8 @@ from typing import Self, get_args
 
 from acsard.core.config.settings import Baud, Config
 from acsard.core.incoming.bus_interface import Bus
+from acsard.core.messages.keys_and_roles import IMU
 from acsard.core.messages.schema import Message
-from acsard.core.messages.topics import IMU
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import Sight, WatchedMcu

@@ -20,6 +20,7 @@ from acsard.calibration.log_table import (
     read,
     row,
 )
+from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import (
     Header,
     Imu,
@@ -32,7 +33,6 @@ from acsard.core.messages.schema import (
     Time,
     Vector3,
 )
-from acsard.core.messages.topics import by_key
 from tests.each import each
 from tests.unit.calibration import cut
 

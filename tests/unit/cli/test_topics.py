@@ -13,7 +13,7 @@ import pytest
 from acsard.cli import VERBS
 from acsard.cli.topics import ros_table
 from acsard.core.config.settings import Config, RosConfig
-from acsard.core.messages.topics import PUBLISHED
+from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.ros.transports import PARAMETERS, left_out, ros_names
 
 

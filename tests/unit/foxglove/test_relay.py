@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
+from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import (
     Events,
     Header,
@@ -20,7 +21,6 @@ from acsard.core.messages.schema import (
     TwistStamped,
     Vector3,
 )
-from acsard.core.messages.topics import full_key
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.transports import SOURCES, command_keys
 from acsard.foxglove.relay import News, Reader, Way, ways

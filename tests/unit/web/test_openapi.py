@@ -11,8 +11,8 @@ from typing import Any
 from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
+from acsard.core.messages.keys_and_roles import SERVICES, TOPICS
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
-from acsard.core.messages.topics import SERVICES, TOPICS
 from acsard.web.app import ROUTES
 from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
 from acsard.web.routes import PARAMETERS, asked

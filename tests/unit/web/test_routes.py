@@ -6,8 +6,8 @@ import re
 from collections import Counter
 from pathlib import Path
 
+from acsard.core.messages.keys_and_roles import SERVICES, row_of
 from acsard.core.messages.permissions import SERVICE_ROLES
-from acsard.core.messages.topics import SERVICES, row_of
 from acsard.web.app import ROUTES
 from acsard.web.limits import REQUESTS
 

@@ -15,10 +15,10 @@ from acsard.core.incoming.queries import BUSY, Queries, Query, Reply, most_bytes
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.keys_and_roles import PUBLISHED, SERVICES, TOPICS, offered
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceReply, Topics
 from acsard.core.messages.signature import public_name
-from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, offered
 from acsard.core.ros import parameters as rcl
 from acsard.core.ros.attachments import Attachment, unpack
 from acsard.core.ros.transports import PARAMETER_SERVICES, TRIGGERS

@@ -17,9 +17,9 @@ from acsard.core.incoming.queries import interfaces, topic_table
 from acsard.core.link.link_state import TABLE as LINKS
 from acsard.core.messages.encodings import DecodeError, encode
 from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.keys_and_roles import PUBLISHED, TOPICS
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import MESSAGES, Info, Message, ServiceReply
-from acsard.core.messages.topics import PUBLISHED, TOPICS
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.modes import Mode
 from acsard.core.values import GyroDoes, Role

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.core.messages.keys_and_roles import FOLLOWED, PUBLISHED, TOPICS
 from acsard.core.messages.permissions import (
     USES,
     has,
     keys_for,
     least_role,
 )
-from acsard.core.messages.topics import FOLLOWED, PUBLISHED, TOPICS
 from acsard.core.values import ROLES, Role
 from tests.each import each
 

@@ -23,6 +23,7 @@ from acsard.core.config.settings import (
     RatesConfig,
     RobotConfig,
 )
+from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.messages.report import Report, from_rpy, from_yaw
 from acsard.core.messages.schema import (
     Battery,
@@ -46,7 +47,6 @@ from acsard.core.messages.schema import (
     TwistStamped,
     Vector3,
 )
-from acsard.core.messages.topics import PUBLISHED
 from acsard.core.motion.arbiter_text import missed
 from acsard.core.motion.gyro import WORDS
 from acsard.core.values import (

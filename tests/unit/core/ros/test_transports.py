@@ -13,7 +13,7 @@ from acsard.core.config.settings import (
     OdometryConfig,
     RosConfig,
 )
-from acsard.core.messages.topics import TOPICS
+from acsard.core.messages.keys_and_roles import TOPICS
 from acsard.core.ros.names import TYPE_HASHES
 from acsard.core.ros.transports import (
     PARAMETERS,

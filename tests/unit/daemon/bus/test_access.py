@@ -26,8 +26,15 @@ from acsard.core.config.settings import (
     RosConfig,
     Source,
 )
+from acsard.core.messages.keys_and_roles import (
+    PUBLISHED,
+    SERVICES,
+    TOPICS,
+    WHOAMI,
+    full_key,
+    whoami_key,
+)
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
-from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, full_key, whoami_key
 from acsard.core.ros.transports import PARAMETERS, claims, endpoints
 from acsard.core.values import Role
 from acsard.daemon.bus.access import GRANTS, access_control, gateway_access

@@ -9,7 +9,7 @@ from typing import Any
 import zenoh
 
 from acsard.core.incoming.queries import Reply
-from acsard.core.messages.topics import IMU
+from acsard.core.messages.keys_and_roles import IMU
 from acsard.daemon.bus.inbox import ARRIVALS, TICKETS, Inbox, Replies
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.messages.topics import PUBLISHED
+from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.daemon.bus.robot_discovery import (
     MAX_NAMED,
     Presence,

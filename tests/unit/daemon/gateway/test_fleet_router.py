@@ -21,7 +21,7 @@ from acsard.core.config.settings import (
     RobotConfig,
     RosConfig,
 )
-from acsard.core.messages.topics import JSON_TREE, TOPICS, source_keys
+from acsard.core.messages.keys_and_roles import JSON_TREE, TOPICS, source_keys
 from acsard.core.values import ROLES, Role
 from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.gateway.fleet_router import Router, router_file

@@ -6,8 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig, RosConfig
-from acsard.core.messages.schema import MESSAGES
-from acsard.core.messages.topics import (
+from acsard.core.messages.keys_and_roles import (
     PUBLISHED,
     SERVICES,
     TOPICS,
@@ -21,6 +20,7 @@ from acsard.core.messages.topics import (
     row_of,
     source_keys,
 )
+from acsard.core.messages.schema import MESSAGES
 from tests.each import each
 
 PROMISED = [
