@@ -405,8 +405,11 @@ class Inputs:
             # A pressed emergency stop that falls silent is no new press.
             if known is self.bumpers or b"X" not in known.marks:
                 self._press(known, reported_ns + SILENT_NS + offset, False)
-            # A clear is obeyed until the silence surely counts, for example behind a stall.
-            known.pressed_ns = known.pressed_ns or decided_ns + offset
+            # A clear is obeyed until the silence surely counts, for example behind a stall, and
+            # while a bumper is pressed that lets the robot drive away.
+            limits = self._away and known is self.bumpers
+            if limits or known.pressed_ns is None:
+                known.pressed_ns = decided_ns + offset
 
     def _press(self, known: _Input, true_ns: int, away: bool) -> None:
         witness = self._witness

@@ -318,6 +318,17 @@ def test_a_clear_is_obeyed_until_the_silence_behind_a_stall_surely_counts() -> N
         bench.inputs.cleared(surely_ns + 1)
 
 
+def test_a_clear_is_obeyed_while_a_bumper_is_pressed_that_lets_the_robot_drive_away() -> None:
+    bench = Bench(bumpers=["front", "rear"], bumper="away")
+    bench.step(1.0, HIT, "ready", RESTS)
+    bench.inputs.cleared(3 * NS // 2)
+    bench.inputs.take(2 * NS, 0, -NS)
+    assert bench.inputs.bumpers.silent == "surely"
+    bench.inputs.cleared(3 * NS // 2)
+    with pytest.raises(BrokenError, match="no clear works while a bumper is pressed"):
+        bench.inputs.cleared(2 * NS + 1)
+
+
 def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> None:
     bench = Bench()
     config = {"measure": "volts", "stop_below": 22.0, "hysteresis": 0.5}
