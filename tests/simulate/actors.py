@@ -132,7 +132,7 @@ class Run:
         self.moved_ns = -1
         self.product = Product(plan["config"], self._see)
         self.product.fed = self._fed
-        self.product.drops = self.witness.dropped
+        self.product.drops = self._dropped
 
     # time
 
@@ -232,6 +232,11 @@ class Run:
         shared = one.clock in self.witness.shared_clocks
         self.reports.command(sender, message, one, at_ns, shared)
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
+
+    def _dropped(self, key: str) -> None:
+        """Note that the inbox dropped its oldest message of this key unread."""
+        self.witness.dropped(key)
+        self.reasons.dropped(key, self.true_ns)
 
     # operators
 
@@ -599,6 +604,9 @@ class Run:
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
+        if seen.at_ns - seen.decided_ns > NS // 1000:
+            # A stall in a step waits for a step that makes a line.
+            self._stalled_ns = max(self._stalled_ns, true_ns)
         witness.read()
         if self.product.disk.full:
             self._full_ns = true_ns

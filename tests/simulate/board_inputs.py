@@ -382,7 +382,8 @@ class Inputs:
             known.pressed_ns = None
             self._doubt()
             return
-        if was_silent == "surely" or not before:
+        if (was_silent == "surely" and known is self.bumpers) or not before:
+            # A pressed emergency stop that was silent still is the same press.
             before = b"." * len(marks)
         if b"X" not in marks:
             known.pressed_ns = None

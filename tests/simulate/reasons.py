@@ -125,6 +125,9 @@ class Reasons:
             self._known_before.clear()
         self._clocks.clear()
         self._heard: dict[str, dict[str, _Heard]] = {}
+        self._dropped_ns: dict[str, int] = {}
+        """When a message of a source was last dropped unread. It may have been a speed, so a shared
+        identity must send a zero again."""
         self._junk: set[str] = set()
         """Sources with refused messages, any of which may undo the zero of a shared identity."""
 
@@ -154,6 +157,10 @@ class Reasons:
         clock.proved |= clock.known(at_ns, self.run.witness.timeout[source])
         clock.believed |= clock.may_be_known(at_ns, self.run.witness.timeout[source])
         heard.clock = clock
+
+    def dropped(self, key: str, at_ns: int) -> None:
+        """Note that the inbox dropped a message of this key unread."""
+        self._dropped_ns[key.split("/")[1]] = at_ns
 
     def _clock(self, name: str, at_ns: int, delay_ns: int) -> _Clock:
         """Return the clock of this name with one more delay."""
@@ -238,7 +245,8 @@ class Reasons:
                 # A foreign clock that was known is not new again, however late it becomes.
                 if not (clock.known(now_ns, timeout_ns) or (heard.foreign and clock.proved)):
                     found.add("proof")
-            armed = heard.armed_ns > self._calm_ns and certain
+            since_ns = max(self._calm_ns, self._dropped_ns.get(source, -1) if heard.shared else -1)
+            armed = heard.armed_ns > since_ns and certain
             if witness.neutral_first and not armed:
                 found.add("neutral")
         mine = witness.priority[source]

@@ -252,6 +252,18 @@ def test_an_input_that_is_silent_for_half_a_second_counts_as_pressed(
         bench.step(at, b"", mode)
 
 
+def test_a_pressed_emergency_stop_that_was_silent_is_no_new_press() -> None:
+    bench = Bench()
+    bench.step(1.0, OK, "driving", MOVES)
+    for at in (1.1, 2.0, 2.1):
+        bench.step(at, PRESSED if at != 2.0 else b"", "stopped", RESTS)
+    assert bench.inputs.estop.silent == ""
+    assert bench.witness.stops == [11 * NS // 10]
+    bench.step(3.0, b"", "stopped", RESTS)
+    bench.step(3.1, OK + PRESSED, "stopped", RESTS)
+    assert bench.witness.stops == [11 * NS // 10, 31 * NS // 10]
+
+
 def test_a_press_without_a_line_in_the_next_period_is_a_finding() -> None:
     for line in (RESTS, None):
         bench = Bench()
@@ -788,6 +800,28 @@ def test_behind_a_suspend_only_a_sender_that_was_proved_before_may_be_called_lat
         witness.command(SIGNED, one, found, at_ns)
         reasons.command(SIGNED, one, found)
     assert ("late" in reasons.allowed("app", end_ns)) is late
+
+
+def test_a_shared_identity_may_wait_for_a_zero_behind_messages_that_were_dropped() -> None:
+    witness = witnessed()
+    run: Any = SimpleNamespace(witness=witness)
+    reasons, plain = Reasons(run), SIGNED | {"way": "plain"}
+    for at_ns in range(0, 3 * NS, NS // 20):
+        one = Message(at_ns, at_ns, 0.1 * (at_ns > 2 * NS), 0.0, 0, at_ns, "")
+        found = sample(plain, one, PLAIN["config"], 0)
+        witness.command(plain, one, found, at_ns)
+        reasons.command(plain, one, found)
+    assert reasons.allowed("app", 3 * NS) == set()
+    reasons.dropped("cmd/app", 3 * NS)
+    assert reasons.allowed("app", 3 * NS) == {"neutral"}
+
+
+def test_a_stall_in_a_step_counts_from_the_step_that_it_delays() -> None:
+    stall = {"at": 2.0, "do": "stall in step", "for": 0.2}
+    run = Run(quiet_with(stall))
+    run.play()
+    # The next line of the robot is made up to a period later.
+    assert 22 * NS // 10 < run._stalled_ns < 222 * NS // 100
 
 
 def state_of(counters: dict[str, int]) -> dict[str, Any]:

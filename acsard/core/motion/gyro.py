@@ -213,7 +213,8 @@ class Gyro:
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
         late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
-        if late > LATEST_NS:
+        # Samples come in order, so a stamp before the last one means that the clock was set back.
+        if late > LATEST_NS or sample.stamp_ns < last.stamp_ns:
             self._promptest = MinimumDelay()
             return sample.at_ns
         return sample.at_ns - max(0, int(late))
