@@ -464,7 +464,7 @@ class Run:
         self.liveness.event(TROUBLE_NS if new else 0)
         if not self.product.plugged:
             self.product.plug(new)
-            self.witness.first = True
+            self.witness.first, self._rest = True, b""
             self._boards += new
             if self.witness.blocked_ns is not None:
                 self.witness.blocked_ns = self.true_ns  # The new port has taken no line either.
@@ -511,7 +511,7 @@ class Run:
             witness.file_is_behind()
 
         def start() -> None:
-            self.resumed_ns = product.now_ns
+            self.resumed_ns, self._rest = product.now_ns, b""
             if product.disk.full:
                 # The daemon starts stopped, because it cannot write the latch file. A clear
                 # releases this stop only if its sender has read `state` after the start.

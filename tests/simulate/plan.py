@@ -87,20 +87,23 @@ def made(seed: int, seconds: float | None = None) -> Plan:
             if dice.random() < 0.5:
                 first = plan["senders"][0]
                 sender.update(id=first["id"], way=first["way"], source=first["source"])
-    _draw_lawful_driver(random.Random(f"lawful driver {seed}"), plan)
+    driven = _draw_lawful_driver(random.Random(f"lawful driver {seed}"), plan)
     events = _events(dice, kinds, length, config, plan["senders"])
+    if driven:
+        events += _rare_events(random.Random(f"rare events {seed}"), plan)
     plan["events"] = sorted(events, key=lambda one: one["at"])
     board_inputs.add(plan)
     return plan
 
 
-def _draw_lawful_driver(dice: random.Random, plan: Plan) -> None:
+def _draw_lawful_driver(dice: random.Random, plan: Plan) -> bool:
     """In a quarter of the plans make the first sender keep all rules, and nobody outrank it.
 
     `liveness.py` judges inside a plan that such a sender drives. Few plans have one by chance.
+    Return whether this plan has one.
     """
     if dice.random() >= 0.25:
-        return
+        return False
     seconds: float = plan["seconds"]
     first: dict[str, Any] = plan["senders"][0]
     source = max(plan["config"]["commands"]["sources"], key=lambda one: one["priority"])
@@ -122,6 +125,34 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> None:
         for one in plan["senders"][1:]
         if one["source"] in below and not (one["junk"] or one["churn"]) and one["id"] != first["id"]
     ]
+    return True
+
+
+def _rare_events(dice: random.Random, plan: Plan) -> list[dict[str, Any]]:
+    """Return trouble at the right time for it, in a fifth of the plans with a lawful driver.
+
+    By chance few echoes last through changes of speed, and few drives meet an output that is
+    blocked while the board goes on to report.
+    """
+    mcu, phases = plan["config"]["mcu"], plan["senders"][0]["phases"]
+    times = [phase[0] for phase in phases if 1.0 < phase[0] < plan["seconds"] - 4.0]
+    special = "link_check" in mcu or "reply_period" in mcu or plan["board"]
+    if dice.random() >= 0.2 or special or not times:
+        return []
+    echo = dice.random() < 0.5
+    if not echo:
+        mcu["reply_period"] = 0.1
+        plan["board"] = [["free_running", 0.1]]
+    events: list[dict[str, Any]] = []
+    for time in dice.sample(times, min(3, len(times))):
+        if echo:
+            at, lasts = max(1.0, time - dice.random()), round(dice.uniform(2.0, 6.0), 3)
+            event = {"do": "board", "fault": ["echo"]}
+        else:
+            at, lasts = time + dice.uniform(0.5, 3.0), dice.choice((1.0, 3.0))
+            event = {"do": "block"}
+        events.append({"at": round(at, 3), "for": lasts, **event})
+    return events
 
 
 def _drives(dice: random.Random, seconds: float) -> list[list[Any]]:

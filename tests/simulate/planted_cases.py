@@ -89,8 +89,8 @@ CASES = (
         "case 9",
         "healthy motors that lag latch the fault `runaway`",
         WITNESS,
-        "self._nearest = math.inf",
-        "self._nearest = 0.0",
+        "nearing = off < self._nearest - NEARER",
+        "nearing = off < self._nearest - NEARER and not fast",
     ),
     fault(
         "case 10",

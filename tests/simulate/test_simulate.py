@@ -34,7 +34,7 @@ from tests.simulate.followed import Followed
 from tests.simulate.jerk import Slope
 from tests.simulate.log_lines import LogLines
 from tests.simulate.pairs import OURS, Pair, Trace
-from tests.simulate.plan import KINDS, Plan, made
+from tests.simulate.plan import KINDS, Plan, _rare_events, made
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, Product, Seen, problems
@@ -814,6 +814,33 @@ def test_a_shared_identity_may_wait_for_a_zero_behind_messages_that_were_dropped
     assert reasons.allowed("app", 3 * NS) == set()
     reasons.dropped("cmd/app", 3 * NS)
     assert reasons.allowed("app", 3 * NS) == {"neutral"}
+
+
+def test_a_port_that_is_opened_again_has_no_rest_of_a_line() -> None:
+    run, line = Run(quiet_with()), b"ap0.00,bp0.00,cp0.00,dp0.00\r\n"
+    began = START.mono_ns
+    run._fed(began + NS, line + b"noise")
+    run._fed(began + NS + 1, line)
+    assert run._fed_ns == NS
+    run._fed(began + 2 * NS, b"noise")
+    run.product.unplug()
+    run.plug(False)
+    run._fed(began + 3 * NS, line)
+    assert run._fed_ns == 3 * NS
+
+
+def test_rare_events_come_at_the_time_of_a_drive() -> None:
+    found = {"echo": 0, "block": 0}
+    for seed in range(200, 400):
+        plan = made(seed)
+        before = {key: plan[key] for key in ("board", "config")} | {"seconds": plan["seconds"]}
+        drives = [[1.0, 0.0, 0.0], [5.0, 0.5, 0.0], [9.0, -0.5, 0.0]]
+        sender = {"phases": drives}
+        for event in _rare_events(random.Random(seed), before | {"senders": [sender]}):
+            assert 1.0 <= event["at"] <= plan["seconds"]
+            assert any(abs(event["at"] - time) <= 3.0 for time, *_ in drives)
+            found["block" if event["do"] == "block" else event["fault"][0]] += 1
+    assert min(found.values()) > 5
 
 
 def test_a_stall_in_a_step_counts_from_the_step_that_it_delays() -> None:
