@@ -56,6 +56,8 @@ class Clock:
         self.least_ns: int | None = None
         self.recent: deque[tuple[int, int]] = deque()
         self.stamp_ns = 0
+        self.constant = False
+        """Its delays once looked constant for the time of a proof, so the daemon may know them."""
         self.followed = False
         """The robot has followed one of its commands, so the daemon knows its delays."""
         self.names = 0
@@ -76,7 +78,7 @@ class Ages:
         """Note that the robot's own clock stood until now."""
         self.learned_ns = at_ns
         for clock in self.clocks.values():
-            clock.least_ns = None
+            clock.least_ns, clock.constant = None, False
 
     def fresh(
         self,
@@ -94,7 +96,7 @@ class Ages:
         clock = self.clocks.setdefault(sample.clock, Clock())
         clock.loose |= loose
         if len(self.clocks) - clock.names > REMEMBERED:
-            clock.least_ns, clock.recent = None, deque()
+            clock.least_ns, clock.recent, clock.constant = None, deque(), False
         clock.names = len(self.clocks)
         foreign = sender["way"] in FOREIGN
         if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
@@ -105,7 +107,8 @@ class Ages:
         recent = clock.recent
         silent = bool(recent) and arrived_ns - recent[-1][0] > 19 * NS // 10
         if silent and foreign and not clock.followed:
-            clock.least_ns = None  # the proof begins again, and the pages promise no more
+            # The proof begins again, and the pages promise no more.
+            clock.least_ns, clock.constant = None, False
         least = clock.least_ns
         clock.least_ns = age if least is None else min(least, age)
         while recent and recent[0][0] < arrived_ns - 3 * NS:
@@ -117,10 +120,13 @@ class Ages:
             allowed += int((1.0 + minutes) * NS)
         if clock.loose or age <= prompt + allowed:
             fresh = True
-        elif least is None or self._falls(clock, age, arrived_ns, min(timeout_ns, 2 * NS)):
+        elif least is None:
             fresh = False
         else:
-            fresh = age <= least + allowed
+            falls = self._falls(clock, age, arrived_ns, min(timeout_ns, 2 * NS))
+            # A delay that the daemon knows is no backlog, also if there were longer ones since.
+            fresh = age <= least + allowed and (not falls or (clock.constant and age >= least))
+            clock.constant |= not falls
         if recent and arrived_ns - recent[-1][0] < BURST_NS:
             at_ns, before = recent.pop()
             recent.append((at_ns, min(before, age)))

@@ -628,6 +628,24 @@ def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
     assert later[-1] is obeyed
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_delay_that_falls_is_a_backlog_unless_the_robot_knew_it_before(known: bool) -> None:
+    ages, sender = Ages(0), {"way": "client", "delay": 0.001, "clock": []}
+
+    def fresh(at_ms: int, delay_ms: int) -> bool:
+        at_ns, delay_ns = at_ms * NS // 1000, delay_ms * NS // 1000
+        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        by = Sample("cmd/app", b"", {}, "ann", False, "ann")
+        return ages.fresh(sender, one, by, at_ns, NS // 4, loose=False)
+
+    if known:
+        for at_ms in range(5000, 6000, 50):
+            fresh(at_ms, 620)
+    assert not any([fresh(at_ms, 1000 + at_ms // 100) for at_ms in range(6000, 10_000, 50)])
+    assert fresh(10_000, 700) is known
+    assert not fresh(10_001, 550)
+
+
 @pytest.mark.parametrize("dropped", [True, False])
 def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
     dropped: bool,
