@@ -94,6 +94,9 @@ class Followed:
         """When the newest zero of each sender was sent, of those that arrived."""
         self._before: dict[str, Command] = {}
         """The newest command of each adjusted clock that was followed."""
+        self._adjusted: set[Who] = set()
+        """Identities under which a sender with an adjusted clock has sent. Several programs may
+        share one of them, and each must send a zero when the clock of one was set."""
         self._armed_since_ns = witness.armed_since_ns
         self._mode = ""
         self._decided_ns = 0
@@ -118,6 +121,8 @@ class Followed:
         found = Command(at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w)
         if not (wish.v or wish.w or message.junk):
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
+        if found.clock and sender["way"] in FOREIGN and not stable(sender):
+            self._adjusted.add(who)
         self._arrived[at_ns] = None if at_ns in self._arrived else found
         if len(self._arrived) > KEPT:
             del self._arrived[next(iter(self._arrived))]
@@ -219,7 +224,8 @@ class Followed:
                 run.followed |= found.true_ns >= run.begun_ns
                 if found.true_ns >= witness.ages.learned_ns:
                     self._learn(found.clock, found.true_ns - found.message.sent_ns)
-        self._holder = found
+        # A step may follow a command and forget it: a call that releases the robot comes later.
+        self._holder = None if disarmed else found
 
     def _first_keeps(self, true_ns: int, decided_ns: int, found: Command) -> None:
         """The robot leaves a sender that is not silent only for a source of higher priority."""
@@ -230,9 +236,8 @@ class Followed:
         left_ns = witness.timeout[holder.who[0]] - (decided_ns - holder.arrived_ns)
         if priority[found.who[0]] <= priority[holder.who[0]] and left_ns > witness.period_ns:
             fell_ns = max(times.get(holder.clock, -1) for times in (self._fell_ns, self._below_ns))
-            if holder.sender["way"] in FOREIGN and (
-                not stable(holder.sender) or fell_ns >= holder.true_ns
-            ):
+            foreign = holder.sender["way"] in FOREIGN
+            if holder.who in self._adjusted or (foreign and fell_ns >= holder.true_ns):
                 return  # it was set, or looks so behind a congestion: it must send a zero again
             raise BrokenError(
                 "the first of equal priority keeps the robot", true_ns,

@@ -641,7 +641,9 @@ def test_a_delay_that_falls_is_a_backlog_unless_the_robot_knew_it_before(known: 
     if known:
         for at_ms in range(5000, 6000, 50):
             fresh(at_ms, 620)
-    assert not any([fresh(at_ms, 1000 + at_ms // 100) for at_ms in range(6000, 10_000, 50)])
+        assert not any(fresh(at_ms, 1000) for at_ms in range(6000, 9800, 50))
+    for number in range(20):
+        assert not fresh(9800 + 10 * number, 1000 - (0 if known else 5 * number))
     assert fresh(10_000, 700) is known
     assert not fresh(10_001, 550)
 
@@ -1089,6 +1091,45 @@ def test_a_second_sender_that_is_followed_before_the_first_is_silent_is_a_findin
     followed_in_turn((4.0, "a", 0.3, 0.0), (6.0, "b", 0.3, 0.0))
     with pytest.raises(BrokenError, match="the first of equal priority keeps the robot"):
         followed_in_turn((4.0, "a", 0.3, 0.0), (4.05, "b", 0.3, 0.0))
+
+
+@pytest.mark.parametrize("adjusted", [True, False])
+def test_all_programs_of_an_identity_lose_the_robot_if_the_clock_of_one_was_set(
+    adjusted: bool,
+) -> None:
+    witness = witnessed()
+    followed = Followed(witness)
+    stamped = {"way": "header", "clock": [["step", 5.0, 2.0]] if adjusted else []}
+    ways = ({"way": "plain"}, stamped, {"way": "signed", "id": "b"})
+    expected = nullcontext() if adjusted else pytest.raises(BrokenError, match="first of equal")
+    with expected:
+        for number, way in enumerate(ways):
+            at_ns, sender = 4 * NS + number * NS // 100, SIGNED | way
+            one = Message(at_ns, at_ns, 0.3, 0.0, at_ns, number, "")
+            found = sample(sender, one, PLAIN["config"], 0)
+            wish = witness.command(sender, one, found, at_ns)
+            followed.command(sender, one, found, at_ns, wish)
+            follows = 4 * NS if number == 1 else at_ns
+            followed.step(at_ns + 1, at_ns + 1, follows, "driving", "up")
+
+
+@pytest.mark.parametrize("released", [True, False])
+def test_a_robot_that_is_released_forgets_the_command_that_it_followed_in_that_step(
+    released: bool,
+) -> None:
+    witness = witnessed()
+    followed = Followed(witness)
+    expected = nullcontext() if released else pytest.raises(BrokenError, match="first of equal")
+    with expected:
+        for number, name in enumerate("ab"):
+            at_ns, sender = 4 * NS + number * NS // 20, SIGNED | {"id": name}
+            one = Message(at_ns, at_ns, 0.3, 0.0, at_ns, number, "")
+            found = sample(sender, one, PLAIN["config"], 0)
+            wish = witness.command(sender, one, found, at_ns)
+            followed.command(sender, one, found, at_ns, wish)
+            if released and not number:
+                witness.arming(at_ns + 1)
+            followed.step(at_ns + 2, at_ns + 2, at_ns, "driving", "up")
 
 
 def test_a_delay_that_falls_below_all_accepted_ones_looks_like_a_clock_that_was_set() -> None:
