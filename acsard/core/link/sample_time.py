@@ -1,11 +1,11 @@
-"""Estimates when the board took its samples, by one clock for each of two kinds of boards.
+"""Estimates when the board took its samples, with one clock for each of two kinds of boards.
 
 The time at which the host reads a line is not the time of its sample: an adapter, the scheduler or
 a stall of the host may have held the line back. `FreeRunningTimes` finds the period of a board that
-reports by its own clock. `PromptedTimes` takes the lines that left as the clock of a board that
-answers each of them. Both take each read by `read` and return the time of each of its lines by
-`place`, as a `Placed`. `forget` starts a new session. `feedback.py` chooses the better clock for
-each line.
+reports by its own clock. For a board that answers each command line, `PromptedTimes` uses the times
+at which the command lines were written. For each read of the port, call `read` on both classes.
+Then `place` returns the time of each line of the read as a `Placed`. `forget` starts a new session.
+`feedback.py` chooses the better clock for each line.
 """
 
 from __future__ import annotations
@@ -25,121 +25,143 @@ Read = tuple[int, int]
 """The time at which the last line of a read was complete, ns, and the number of its lines."""
 
 BRIDGED_S = 1.0
-"""Longest gap that is filled, s. After a longer one the board may have been reset."""
+"""Longest gap between two lines that is filled, s. After a longer one the board may have been
+reset."""
 
 
 class Placed(Struct, frozen=True, gc=False):
-    """The time of a line by one of the clocks; `due_ns` is when it was due to be complete here."""
+    """The time of a line by one of the clocks.
+
+    `clock` is "slots" for `FreeRunningTimes`, "prompts" for `PromptedTimes`, and "reads" for the
+    times of the reads. `due_ns` is the monotonic time at which the host should have received the
+    whole line, ns.
+    """
 
     clock: Literal["slots", "prompts", "reads"]
     due_ns: int
     dt: float | None = None
-    """Seconds since the last line by the same clock, None for the first line."""
+    """Time since the previous line that this clock placed, s. None for the first such line, and for
+    the clock "reads"."""
     bridged: float = 0.0
-    """Seconds of `dt` that no line reported."""
+    """The part of `dt` that no line reported, s."""
     early: bool = False
-    """Whether the line came before it was due. Then `due_ns` is its arrival, and the time to the
-    next line is the difference of their `due_ns`."""
+    """Whether the line came before it was due. Then `due_ns` is the time of its arrival, and the
+    time to the next line is the difference of the two `due_ns`."""
 
 
 # A free-running board.
 
 WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
-"""Least duration and number of reads of a window from which a clock is found or corrected."""
+"""Least duration of a window, ns, and its least number of reads. A clock is found or corrected from
+the reads of one window."""
 
 LOOP_GAIN = 0.2
-"""Gain g of the settled loop. A window determines x to a few hundredths."""
+"""Gain g of the loop in `FreeRunningTimes` after it has settled. One window determines the error x
+of the clock to a few hundredths of a slot."""
 
 DRIFT = 0.01
-"""Relative error that a board's clock may have. A ceramic resonator has half of it."""
+"""Largest relative error of a board's clock. A ceramic resonator has half of it."""
 
 EXACT = 0.001
-"""As DRIFT for periods that nobody has configured: a quartz's error and that of the fit."""
+"""Largest relative error of a measured period that is not configured. Within it, the period is
+rounded to whole ms. It covers the error of a quartz and the error of the fit."""
 
 LONE = 0.7
-"""Share of the reads with one line at which lines count as read one by one."""
+"""Share of the reads. If at least this share has a single line, lines are treated as read one by
+one."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""Largest lateness of a line in slots when a clock is found: for lines read one by one, for
-batches."""
+"""Largest lateness of a line, in slots, in the window from which a clock is found. `LATE_ALONE` is
+for lines that are read one by one, `LATE_BATCHED` for batches."""
 
-EARLY_ALONE = 0.5
-"""Slots by which one line may be earlier than all others when a clock is found. A line that is
-earlier came out of turn: it answers a command that left between two periods. With it as the
-earliest line, all others would be a slot late."""
+EARLY_ALONE, ALONE = 0.55, 12
+"""At most one line, and one more for each `ALONE` lines, may be earlier than all others by more
+than `EARLY_ALONE` slots in the window from which a clock is found. These came out of turn: each
+answers a command that was sent between two periods. If there are more, the clock is not accepted,
+because it would make all others a slot late."""
 
 JUMP = 1.4
-"""Slots since the last line. Below this a lone line cannot have another one missing before it."""
+"""Time between two reads, in slots. If two reads with a single line each are closer together, no
+line is missing between them."""
 
 SURE = 0.15
-"""Slots beyond the greatest possible lateness at which a line is certainly missing."""
+"""Margin in slots. A read that is later than the greatest possible lateness of its last line by one
+slot and this margin proves that a line is missing."""
 
 EARLY = 0.25
-"""Slots by which no line of a window may be early if the clock is right."""
+"""If a line of a window is earlier than its slot by more than this number of slots, the clock is
+wrong."""
 
 LOSSY_READS = 0.45
-"""Share of the reads of two windows before which lines are missing. Above it the period is
+"""Share of the reads that have missing lines before them, over two windows. Above it, the period is
 wrong."""
 
 
 class FreeRunningTimes:
     """The sample times of a free-running board, from the times at which its lines were read.
 
-    The board makes one line every T. The time of a read alone does not show to which of these slots
-    a line belongs: an adapter holds lines back, and during a host stall they wait in the kernel.
-    Let a be the time of a read, k the slot of its last line and c the time of slot 0. Then
+    The board makes one line in each slot of length T. The time of a read alone does not show to
+    which slot a line belongs: an adapter holds lines back, and during a host stall they wait in the
+    kernel. Let a be the time of a read, k the slot of its last line and c the time of slot 0. Then
 
-        (1)  x = (a - c) / T - k        slots that the clock is ahead of the lines
+        (1)  x = (a - c) / T - k
 
-    is how late the read's last line is, and each missing line adds 1 to it.
+    is the lateness of the read's last line in slots. Each missing line adds 1 to x.
 
-    If lines are read one by one, x is about 0, and a lone line shows at once how many are missing
-    before it. If an adapter batches lines, x lies between 0 and 1; then only a read counts that
-    came no later after the one before it than usual. Lines that a backlog certainly lacks are
-    spread over its lines. A line that comes before its slot takes back a slot that was counted in
-    excess. Twice a second the least x corrects c and T in a second-order loop:
+    If lines are read one by one, x is about 0, and a line that is read alone shows at once how many
+    lines are missing before it. If an adapter batches lines, x lies between 0 and 1. Then a read
+    shows single missing lines only if it came no later after the previous read than usual. Any
+    other read shows a missing line only if x exceeds the greatest possible lateness. The missing
+    slots are spread over the lines of the read. A line that comes before its slot shows that too
+    many slots were counted as missing, so one is taken back. Twice a second the least x corrects c
+    and T in a second-order loop with the gain g:
 
         (2)  c += g x T                 (3)  T += g^2 / 2 x T / slots
 
-    Lines without a period are refused, and a clock that the lines contradict is given up.
+    No clock is found for lines without a period. A clock that the lines contradict is given up.
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        """Start; `known` are the configured periods, s."""
+        """Start. `known` has the periods that the configuration suggests, s."""
         self._known = known
         self.usual = 0.0
-        """T in ns as last found, 0 before the first time."""
+        """The last measured T, ns. 0 until a clock has been found."""
         self._stretch = 1.0
         """Slots per line of the last read, including its share of the missing lines."""
         self._before = 0
         self._first, self._slot = 0.0, 0
-        """c in ns, and k of the last line."""
+        """The time c of slot 0, ns, and the slot k of the last line."""
         self._given = 0
-        """Slots counted lately without a line. One of them may be taken back."""
+        """Number of slots that were recently counted as missing lines. They may be taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
-        """Usual x of a read, usual distance of two reads in slots, gain g, share of reads with
-        missing lines."""
+        """Usual x of a read, usual time between two reads in slots, gain g, and share of the reads
+        with missing lines."""
         self._batched: bool = False
+        """Whether an adapter batches lines."""
         self._alone: bool = False
-        """Whether an adapter batches lines, and whether the last line came alone."""
+        """Whether the last read had a single line."""
         self._least: float
         self._begin(0)
         self.forget()
 
     def forget(self) -> None:
-        """Give up the clock, because the board has changed or keeps another period."""
+        """Give up the clock, because the board has changed or has another period."""
         self.period: float | None = None
-        """T in s as the firmware means it, None while unknown. The firmware divides its counts by
-        this nominal period, whatever its clock does."""
+        """Nominal period of the firmware, s. None while no clock is known. The firmware divides its
+        counts by this period even if its clock is fast or slow."""
         self._reads: list[Read] = []
         self._last: float | None = None
-        """Slot of the last placed line, None before the first one by the present clock."""
+        """Slot of the last line that the present clock has placed. None before the first one."""
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Return the number of lines that were lost before the last line of this read.
+        """Process a read, and return the number of lines that were lost before its last line.
 
-        The result is -1 if there was one line too many. `at_ns` is the time at which the last line
-        was complete. `drained` means that the kernel held no more data.
+        The result is -1 if there was one line too many.
+
+        Args:
+            at_ns: The monotonic time at which the last line was complete.
+            lines: The number of lines in the read.
+            drained: Whether the read took all data that the kernel held.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -150,10 +172,10 @@ class FreeRunningTimes:
         ahead = (at_ns - self._first) / self.usual - self._slot
         lost = self._missing(ahead, since / self.usual, lines, drained)
         if lost < 0 and (self._given <= 0 or ahead > 0):
-            self.forget()  # the lines come too early or ever later, so they follow another clock
+            self.forget()  # the lines are too early or ever later, so the board has another clock
             return 0
         self._slot += lost
-        # What is missing for too long to be filled lies before the whole read.
+        # If the missing lines cover more time than may be filled, all of them lie before the read.
         self._stretch = 1.0 + lost / lines if lost * self.usual < BRIDGED_S * NS_PER_S else 1.0
         self._given += lost
         self._passed += lines + lost
@@ -172,7 +194,7 @@ class FreeRunningTimes:
 
     @property
     def late_ns(self) -> float:
-        """Mean delay from the time at which a line is complete to its read, ns."""
+        """Mean time from the slot of a line to its read, ns."""
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
@@ -192,9 +214,15 @@ class FreeRunningTimes:
         return Placed("slots", due_ns, passed * period, missing * period)
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        """Return how many slots this read proves missing, `since` slots after the last read.
+        """Return the number of missing lines that this read proves.
 
         Return -1 if the read contradicts the clock.
+
+        Args:
+            ahead: x of the read, slots.
+            since: The time since the last read, slots.
+            lines: The number of lines in the read.
+            drained: Whether the read took all data that the kernel held.
         """
         lag = min(self._lag, 0.5)
         if ahead < -0.5 + 0.6 * lag:
@@ -204,7 +232,7 @@ class FreeRunningTimes:
         alone, self._alone = self._alone, lines == 1
         if self._batched:
             prompt = since < 1.1 * self._batch and lines - 1 < since
-            held = self._batch + 1.0  # an adapter holds the last line of a backlog back too
+            held = self._batch + 1.0  # an adapter also holds back the last line of a backlog
         else:
             held, prompt = 0.0, lines == 1
             if prompt and alone and since < JUMP:
@@ -222,7 +250,7 @@ class FreeRunningTimes:
         gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
         for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
-            if max(late) <= most and sorted(late)[1] <= EARLY_ALONE:
+            if max(late) <= most and sorted(late)[1 + len(late) // ALONE] <= EARLY_ALONE:
                 break
         else:
             del reads[: len(reads) // 4]
@@ -240,13 +268,14 @@ class FreeRunningTimes:
     ) -> Iterator[tuple[list[int], float, float]]:
         """Yield candidate clocks, the likelier ones first.
 
-        A candidate is the slot of each read's last line, the largest allowed lateness in slots, and
-        the period in ns. The order has three reasons:
+        A candidate has the slot of each read's last line, the largest allowed lateness in slots,
+        and the period in ns. `gaps` are the times between the reads, ns. The order has three
+        reasons:
 
         - For jittery lines a configured period is more reliable than half a second of data.
-        - An adapter hands lines over one by one too if they fill its packets. So the configured
-          periods are tried without missing lines before any other period is tried with missing
-          lines.
+        - An adapter that holds lines back also passes them on one by one if they fill its packets.
+          So the configured periods are tried without missing lines before any other period is tried
+          with missing lines.
         - Half a second of batches cannot distinguish two periods that hardly differ.
         """
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
@@ -267,7 +296,7 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a window: its least x, its reads, their slots and the reads with missing lines."""
+        """Start a window: reset its least x and the numbers of reads, slots and lossy reads."""
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -287,7 +316,7 @@ class FreeRunningTimes:
         self._gain = max(LOOP_GAIN, self._gain / (1 + self._gain))
         self._first += self._gain * least * self.usual
         usual = self.usual * (1 + self._gain**2 / 2 * least / slots)
-        # The time of the present line stays unchanged.
+        # Keep the time of the present line unchanged.
         self._first -= (usual - self.usual) * self._slot
         self.usual = usual
         self.period = self._nominal()
@@ -308,9 +337,9 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot of each read's last line.
+    """Return the slot of each read's last line, from 0 for the first read.
 
-    A gap between reads adds missing lines if lines are `period` ns apart.
+    With a finite `period`, ns, a longer gap between two reads is counted as missing lines.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -319,7 +348,7 @@ def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
 
 
 def _slope(reads: list[Read], slots: list[int]) -> float:
-    """Return the period by least squares, ns."""
+    """Return the period in ns that fits the reads and their slots by least squares."""
     origin = reads[0][0]
     times = [at - origin for at, _ in reads]
     middle, centre = fmean(slots), fmean(times)
@@ -329,9 +358,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return the latest time of slot 0, ns, and each line's lateness in slots.
+    """Return the latest time of slot 0 for which no line is early, ns.
 
-    The time is such that no line is early.
+    Also return the lateness of each read's last line, in slots. `period` is in ns.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -341,107 +370,119 @@ def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, 
 # A prompted board.
 
 MEMORY = 64
-"""Lines that are remembered because their replies may still come."""
+"""Largest number of written lines that are remembered because their replies may still come."""
 
 FAST = 0.05
 """Gain per reply or read of the filters for the usual delay, its spread and the batches."""
 
 SLOW = 0.0125
-"""Gain per read of the slower filter that decides whether the spread is the board's."""
+"""Gain per read of the slower filter that decides whether the board itself varies the delay."""
 
 LEAST = 0.002
-"""Gain per reply with which the least delay is forgotten: a time constant of 500 replies."""
+"""Gain per reply with which the least delay rises towards the usual delay: a time constant of 500
+replies. So an outdated least delay is forgotten."""
 
 CREEP = 0.05
-"""Rise of the soonest delay per reply, in distances of two lines, by which it is forgotten."""
+"""Rise per reply of the least delay of the last replies, as a fraction of the usual time between
+two lines. So the delays of older replies are forgotten."""
 
 LATE = 1.25
-"""Distances of two lines by which the soonest delay of the last replies may lie above the least
-one. Above it, replies were lost. One distance is too little: a delay may rise by almost as much for
-good."""
+"""Largest difference between the least delay of the last replies and the long-term least delay, in
+usual times between two lines. Above it, replies were lost. A limit of 1 is too low, because the
+delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""Share of lost replies. Below it, a line that another one follows closely does not count as
-lost."""
+"""Share of lost replies. Below it, the reply to a line that another line follows closely is not
+taken for lost."""
 
 JITTER_NS = 350_000
-"""Mean deviation that USB and the scheduler add to a constant delay, ns."""
+"""Mean deviation of the delay that USB and the scheduler add to a constant delay, ns."""
 
 THOUGHT_NS = 800_000
-"""Mean deviation that USB and the scheduler rarely cause, ns. Above it, the board's delay
-varies."""
+"""Mean deviation of the delay above which the board itself varies it, ns. USB and the scheduler
+rarely cause as much."""
 
 RISE_NS = 20_000
-"""Rise of a batched link's least delay per read, by which the link forgets it, ns."""
+"""Rise per read of the least delay on a batched link, ns. So an outdated least delay is
+forgotten."""
 
 LOSING = 0.005
-"""Gain per read of the share of lost replies. It is slow, because over 20 reads two lost replies
-would already make it 3 %."""
+"""Gain of the filter for the share of lost replies. It is small, because a filter over 20 reads
+would already show 3 % after two lost replies."""
 
 LOSSY = 0.03
 """Share of lost replies on a batched link. Above it, any line may lack its reply."""
 
 SEVERAL = 0.15
-"""Share of the reads that hold several lines. Above it, an adapter batches lines; host stalls alone
-cause fewer."""
+"""Share of the reads that have several lines. Above it, an adapter batches lines. Host stalls alone
+cause fewer such reads."""
 
 THINKS = 0.6
-"""Filtered share of the reads with a varying delay. Above it, the variation is the board's own. An
-adapter that is filled line by line causes it too, but only for a quarter of a second."""
+"""Filtered share of the reads with a varying delay. Above it, the board itself varies the delay. An
+adapter that is filled line by line causes a varying delay too, but only for a quarter of a
+second."""
 
 BATCH_NS = 2_000_000
-"""Mean deviation that no board causes, ns: an adapter holds the lines back."""
+"""Mean deviation of the delay above which an adapter holds the lines back, ns. No board causes as
+much."""
 
 
 class PromptedTimes:
     """The sample times of a prompted board, from the command lines that its replies answer.
 
-    A plain reply does not name its line. But a board that answers each line samples at that moment,
-    so the times at which the lines left are the sample times. Two replies are as far apart as their
-    lines, whenever the host reads them, and where no line left no reply is missing.
+    A plain reply does not say which line it answers. However, a board that answers each line takes
+    its sample when the line arrives. So the times at which the lines were written are the sample
+    times, up to a usual delay. The time between two samples is the time between their lines, even
+    if the host reads the replies late. If no line was written, no reply is missing.
 
-    Replies come in the order of the lines. If a reply is later than usual by more than half the
-    distance from its line to the next one, it answers that next line and the reply before it was
-    lost.
+    Replies come in the order of the lines. Suppose that a reply is later than usual by more than
+    half the time from its line to the next line. Then it answers the next line, and the reply to
+    the earlier line was lost.
     """
 
     def __init__(self, soonest_ns: int) -> None:
-        """Start; `soonest_ns` is the wire time of a line and its reply."""
+        """Start. `soonest_ns` is the least possible delay of a reply, ns.
+
+        It is the wire time of a line and its reply.
+        """
         self._soonest = soonest_ns
         self._left: deque[int] = deque(maxlen=MEMORY)
         self.forget()
 
     def forget(self) -> None:
-        """Forget all lines: they are answered or will never be."""
+        """Forget all lines, because they are answered or will never be answered."""
         self._left.clear()
         self.restart()
 
     def restart(self) -> None:
-        """Forget which line was answered last: the next reply answers the newest one that it can.
+        """Forget which line was answered last, and the usual delay.
 
-        The lines stay, because replies to the last ones are still on the way.
+        The next reply is then assigned to the newest line that it can answer. The lines are kept,
+        because replies to the last ones may still come.
         """
         self._delay: float | None = None
         self._spread = self._least = 0.0
-        """Mean deviation of the usual delay, and the least delay; both ns."""
+        """Mean deviation from the usual delay, and the long-term least delay, both ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
         self._sent: int | None = None
         self._apart = self._missing = 0.0
-        """Time at which the last line left, usual distance of two lines, share of lost replies."""
+        """`_sent` is the time at which the last line was written, and `_apart` the usual time
+        between two lines, both ns. `_missing` is the share of lost replies."""
         self._last: int | None = None
-        """Time of the line that was answered last, plus the excess of its reply over the usual
-        delay, ns."""
+        """Time of the last answered line, plus the delay of its reply beyond the usual delay,
+        ns."""
         self._passed = self._line = 0
-        """Times of the last line that is answered or given up, and of the last that is answered."""
+        """Time of the last line that was answered or given up, and time of the last line that was
+        answered, ns."""
         self._lost = False
-        """Whether the last lone reply made the code give up the line before its own."""
+        """Whether a line was given up because of the last reply that was read alone."""
         self._at, self._alone = 0, False
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """For a batched link: least delay and usual distance of two reads, both ns, and share of
+        """For a batched link: least delay and usual time between two reads, both ns, and share of
         lost replies."""
         self._several = 0.0
-        """Share of the reads that hold several lines."""
+        """Filtered share of the reads that have several lines."""
         self._thinking = 0.0
         """Filtered share of the reads in which the delay varied more than a scheduler or an adapter
         causes."""
@@ -453,7 +494,7 @@ class PromptedTimes:
 
     @property
     def lossy(self) -> bool:
-        """Whether replies get lost on a batched link. There no clock of slots can be found."""
+        """Whether replies get lost on a batched link, where `FreeRunningTimes` finds no clock."""
         return self._batched and self._losses > LOSSY
 
     @property
@@ -462,7 +503,7 @@ class PromptedTimes:
         return self._several > SEVERAL
 
     def left(self, at_ns: int) -> None:
-        """Note that a line left at `at_ns`."""
+        """Record that a command line was written at `at_ns` on the monotonic clock."""
         if self._sent is not None:
             apart, usual = at_ns - self._sent, self._apart
             self._apart = usual + FAST * (min(apart, 2 * usual) - usual) if usual else apart
@@ -470,10 +511,10 @@ class PromptedTimes:
         self._left.append(at_ns)
 
     def read(self, at_ns: int, lines: int) -> None:
-        """Take a read of `lines` lines, of which the last was complete at `at_ns`.
+        """Process a read of `lines` lines. The last was complete at the monotonic time `at_ns`.
 
-        The delay of a lone reply shows which line it answers. So does the delay of a batch if it is
-        longer than the adapter ever holds a reply back.
+        The delay of a reply that is read alone shows which line it answers. The delay of a batch
+        shows it only if it is longer than the adapter ever holds a reply back.
         """
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone = at_ns, alone
@@ -489,7 +530,8 @@ class PromptedTimes:
     def place(self, asked_ns: int | None = None) -> Placed | None:
         """Return the time of the next reply, or None if no line waits for a reply.
 
-        `asked_ns` is when the line left, if the reply names its line.
+        `asked_ns` is the monotonic time at which the answered line was written, if the reply names
+        that line. Otherwise it is None.
         """
         left = self._left
         if asked_ns is not None:
@@ -522,14 +564,15 @@ class PromptedTimes:
         return Placed("prompts", due_ns, dt / NS_PER_S, bridged / NS_PER_S)
 
     def skip(self) -> None:
-        """Note that the next reply was damaged."""
+        """Remove the line that the next reply answers, because the reply was damaged."""
         if self._left:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest line that it can answer.
+        """Discard the lines that are older than the one which the first reply answers.
 
-        Only the wire time of a reply is known yet.
+        The usual delay is not known yet. So the reply is assigned to the newest line that was sent
+        early enough for the wire time of a line and its reply.
         """
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
@@ -538,11 +581,14 @@ class PromptedTimes:
             self._delay = self._least = float(self._at - left[0])
 
     def _weigh(self, lines: int, since: int) -> None:
-        """Give up lines for which the last reply of a batch is too late.
+        """Give up lines whose replies were lost: the last reply of a batch is too late for them.
 
-        `since` is the time since the read before, ns.
-        If many replies are lost, the first reply of the batch decides instead, because it was made
-        after the batch before.
+        If many replies are lost, the first reply of the batch decides instead, because the board
+        made it after the previous batch.
+
+        Args:
+            lines: The number of replies in the batch.
+            since: The time since the previous read, ns.
         """
         left, at = self._left, self._at
         judged, soonest = lines - 1, float(self._soonest)
@@ -552,7 +598,7 @@ class PromptedTimes:
             self._batch += FAST * (since - self._batch)
         if len(left) < lines or self._delay is None:
             return
-        if at - left[lines - 1] < self._soonest:  # too soon for a reply: it answers the line before
+        if at - left[lines - 1] < self._soonest:  # too soon: the reply answers the previous line
             left.appendleft(self._passed)
             self._base = float(at - left[lines - 1])
         lost = 0
@@ -562,35 +608,36 @@ class PromptedTimes:
                 break
             self._passed, lost = left.popleft(), lost + 1
         self._losses += LOSING * (lost / (lines + lost) - self._losses)
-        # Giving up a line too late makes a reply look late, but nothing makes one look early. The
-        # base is therefore the least delay, and it rises slowly.
+        # If a line is given up too late, a reply looks late, but nothing makes a reply look early.
+        # So the base is the least delay, which rises slowly.
         self._base = min(self._base + RISE_NS, at - left[lines - 1])
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Return whether the line given up last was not lost.
+        """Give up lines whose replies were lost.
 
-        If it was, give up the lines lost now.
+        Return True if the line that was given up last was given up too early: the present reply
+        answers it. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
         self._missing -= LOSING * self._missing
-        # No reply comes sooner than the least delay. One that seems to is a late reply to the line
-        # before.
+        # No reply comes sooner than the least delay. A reply that seems to come sooner is a late
+        # reply to the previous line.
         soonest = max(float(self._soonest), self._least)
         if left:
             self._soon = min(self._soon + CREEP * self._apart, at - left[0])
             if self._soon - soonest > LATE * self._apart:
-                # All of the last replies are late by more than a line, so replies were lost that
-                # the spread had hidden.
+                # All of the last replies are late by more than the time between two lines. So
+                # replies were lost, but the large spread had hidden this.
                 delay = self._delay = self._soon = soonest
                 wide = self._spread = 0.0
         while len(left) > 1:
             apart = left[1] - left[0]
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
                 break
-            # After a host stall two lines leave at once and the reply to the first one is late, but
-            # not so late that the reply to the second one should have been read too.
+            # After a host stall two lines are written at once and the reply to the first one is
+            # late, but not so late that the reply to the second one should have been read too.
             overdue = at - left[1] - delay > max(self._apart / 2, wide)
             close = apart < self._apart / 2 and not overdue
             if close and self._missing < RARE:
@@ -602,10 +649,11 @@ class PromptedTimes:
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
     def _shift(self, line: int) -> int:
-        """Return the excess of a lone reply's delay over the usual, ns, and update the usual.
+        """Return by how much the delay of a reply that was read alone exceeds the usual delay, ns.
 
-        Return 0 if the delay varies no more than the time of a read does by itself, or if an
-        adapter causes the variation.
+        Also update the usual delay. Return 0 if the delay varies no more than USB and the scheduler
+        cause, or if an adapter or a host stall causes the variation. `line` is the time at which
+        the answered line was written, ns.
         """
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:
