@@ -5,8 +5,12 @@ ratio of the configured effective track to the true one, and T the delay of the 
 
     g(t) = a w(t - T), which is about a w(t) - a T dw/dt for a small T
 
-A least-squares fit finds the coefficients a and -a T from means over a tenth of a second. It
-forgets old data only while the robot turns.
+A fit finds the coefficients a and -a T from means over a tenth of a second. It forgets old data
+only while the robot turns. For a it makes the error independent of w, as least squares do. For T it
+makes the error independent of the change z of the gyro's rate, not of dw/dt: z is an instrumental
+variable (Young, Recursive estimation and time-series analysis, 2011). The change of the wheels'
+rate has the same error as the rate itself, so coarse encoder counts on a straight drive would look
+like a delay of half a block.
 """
 
 from __future__ import annotations
@@ -15,16 +19,18 @@ import math
 from collections import deque
 
 BLOCK_S = 0.1
-"""Time over which rates are compared, s. Over a single line encoder counts are coarse."""
+"""Duration of a block, over which mean rates are compared, s. A single line has too few encoder
+counts."""
 
 LEAST_RATE = 0.05
-"""Least turn rate of a block, rad/s, for it to show the ratio."""
+"""Smallest turn rate, rad/s, at which a block contributes to the ratio."""
 
 LEAST_CHANGE = 0.3
-"""Least change of the rate, rad/s2, for a block to show the delay."""
+"""Smallest change of the turn rate, rad/s2, at which a block contributes to the delay."""
 
 MEMORY = 0.995
-"""Factor by which the weight of a block falls with each new one: the last 20 s of turning count."""
+"""Factor by which each new block of turning reduces the weight of the earlier ones. The last 20 s
+of turning have most of the weight."""
 
 ROUGH, FINE = 0.5, 0.1
 """Standard deviation of the ratio before any data, and the smallest one that is assumed.
@@ -39,25 +45,26 @@ The delay of the gyro hardly matters over such a turn.
 """
 
 KEPT, PRIOR = 0.9, 0.1
-"""Factor by which the weight of a stretch falls with each new one, and weight of the prior."""
+"""Factor by which each new stretch reduces the weight of the earlier ones, and weight of the
+assumption `ROUGH` in stretches."""
 
 DELAY_S = 0.2
 """Standard deviation of the delay before any data, s."""
 
-NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
-"""The sums of the delay before any data."""
+NO_DELAY = 0.0, 0.0, 0.0, 1.0 / DELAY_S**2, 1.0 / DELAY_S**2
+"""Initial values of the five sums that contain the delay: of w dw, z w, z g, z dw and z z."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""Standard deviation of a block's mean: in rad/s, and as a share of the rate."""
+"""Standard deviation of a block's mean rate: a constant in rad/s, and a share of the rate."""
 
 LAG_S = 0.05
-"""Delay of the gyro that is tolerated until the delay is known, s."""
+"""Delay of the gyro that causes no contradiction until the delay is known, s."""
 
 CERTAIN_S = 0.004
 """Standard deviation of the delay below which it is reported, s."""
 
 WINDOW_S = 0.2
-"""Time over which wheels and gyro must differ to contradict each other, s."""
+"""Time over which the turns of wheels and gyro are compared for a contradiction, s."""
 
 LEAST_SLIP = 0.015
 """Difference of the turns over `WINDOW_S` that is never a contradiction, rad.
@@ -74,20 +81,24 @@ class Match:
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
-        """The prior: the ratio is roughly 1."""
-        self._wd, self._dg, self._dd = NO_DELAY
+        """Least-squares sums. Their initial values mean that the ratio is roughly 1."""
+        self._wd, self._zw, self._zg, self._zd, self._zz = NO_DELAY
         self._off = self._way = 0.0
-        """Turn that the ratio did not predict, and whole turn, in the present stretch, rad."""
+        """Turn of the gyro that the fit did not predict, and whole turn of the wheels, both in the
+        present stretch, rad."""
         self._ways = PRIOR * STRETCH**2
         self._offs = ROUGH**2 * self._ways
-        """Weighted sums of the squares of both over the stretches before."""
+        """Weighted sums of the squares of `_way` and `_off` over the completed stretches, rad2."""
         self._lag = LAG_S
         self.blocks = 0.0
         """Number of blocks of turning that are remembered."""
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
-        """The turn rate from the wheels now, and at the start of the block."""
+        """The turn rate according to the wheels now, and at the start of the block, rad/s."""
+        self._blocks: deque[tuple[float, float, float]] = deque(maxlen=3)
+        """Mean rates of wheels and gyro, rad/s, and change of the wheels' rate, rad/s2, of the last
+        blocks without slip."""
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
 
@@ -97,21 +108,21 @@ class Match:
         return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
-        """Return the difference between the delay and the assumed delay, s, or None if uncertain.
+        """Return the delay of the gyro minus the assumed one, s, or None if it is uncertain.
 
-        If it returns a number, the caller must assume the new delay from then on.
+        If it is a number, the caller must assume the new delay from then on.
         """
         ratio, slope = self.ratio, self._slope
-        spread = self._dd - self._wd * self._wd / self._ww
-        if ratio < ROUGH / 2 or spread * (CERTAIN_S * ratio) ** 2 < 1.0:
+        spread = self._known**2 / (self._zz - self._zw * self._zw / self._ww)
+        if ratio < ROUGH / 2 or spread * (CERTAIN_S * ratio) ** 2 < 1.0 or self._known < 0.0:
             return None
-        self._wd, self._dg, self._dd = NO_DELAY
+        self._wd, self._zw, self._zg, self._zd, self._zz = NO_DELAY
         self._lag = CERTAIN_S
         self._solve()
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """Take a feedback line.
+        """Add a feedback line.
 
         Args:
             wheels: the turn according to the wheels, rad.
@@ -127,13 +138,19 @@ class Match:
         self._gyro += gyro
         self._time += dt
         if self._time >= BLOCK_S * 0.95:
-            if not slips:
-                self._learn(smooth)
+            if slips:
+                self._blocks.clear()
+            else:
+                change = (smooth - self._began) / self._time
+                block = self._wheels / self._time, self._gyro / self._time, change
+                self._blocks.append(block)
+            if len(self._blocks) == 3:
+                self._learn()
             self._wheels = self._gyro = self._time = 0.0
             self._began = smooth
 
     def contradiction(self, variance: float) -> bool:
-        """Return whether the gyro contradicts the wheels over the last `WINDOW_S`.
+        """Return whether the gyro contradicts the wheels over the last `WINDOW_S` s.
 
         `variance` is the variance of the gyro's turn over this time, rad2.
         """
@@ -157,14 +174,17 @@ class Match:
             sums[1] -= old[1]
             sums[2] -= old[2]
 
-    def _learn(self, ends: float) -> None:
-        wheels, gyro = self._wheels / self._time, self._gyro / self._time
-        change = (ends - self._began) / self._time
+    def _learn(self) -> None:
+        """Learn from the second of three blocks: z is the change from the first to the third."""
+        (_, before, _), (wheels, gyro, change), (_, after, _) = self._blocks
         if abs(wheels) < LEAST_RATE and abs(change) < LEAST_CHANGE:
             return
+        z = (after - before) / (2.0 * BLOCK_S)
+        if z * change < 0.0:
+            z = 0.0
         weight = 1.0 / (BLOCK_NOISE + BLOCK_SHARE * abs(wheels)) ** 2
-        self._way += wheels * self._time
-        self._off += (gyro - self.ratio * wheels - self._slope * change) * self._time
+        self._way += wheels * BLOCK_S
+        self._off += (gyro - self.ratio * wheels - self._slope * change) * BLOCK_S
         if abs(self._way) >= STRETCH:
             self._offs = KEPT * self._offs + self._off * self._off
             self._ways = KEPT * self._ways + self._way * self._way
@@ -172,17 +192,23 @@ class Match:
         self._ww = MEMORY * self._ww + weight * wheels * wheels
         self._wg = MEMORY * self._wg + weight * wheels * gyro
         self._wd = MEMORY * self._wd + weight * wheels * change
-        self._dd = MEMORY * self._dd + weight * change * change
-        self._dg = MEMORY * self._dg + weight * change * gyro
+        self._zw = MEMORY * self._zw + weight * z * wheels
+        self._zg = MEMORY * self._zg + weight * z * gyro
+        self._zd = MEMORY * self._zd + weight * z * change
+        self._zz = MEMORY * self._zz + weight * z * z
         if abs(wheels) >= LEAST_RATE:
             self.blocks = MEMORY * self.blocks + 1.0
         self._solve()
 
     def _solve(self) -> None:
-        """Solve the least-squares equations for the coefficients of w and dw/dt."""
-        det = self._ww * self._dd - self._wd * self._wd
-        self.ratio = (self._wg * self._dd - self._dg * self._wd) / det
+        """Solve the two equations for the coefficients of w and dw/dt."""
+        along = self._zw / self._ww
+        self._known = self._zd - along * self._wd
+        """What the data say about the delay, as the inverse of a variance, 1/s2. If they say less
+        than half of what was assumed without data, the delay does not change the ratio."""
+        known = self._known * DELAY_S**2 > 0.5
+        self._slope = (self._zg - along * self._wg) / self._known if known else 0.0
+        self.ratio = (self._wg - self._slope * self._wd) / self._ww
         """The ratio a: the turn of the gyro divided by the turn of the wheels."""
-        self._slope = (self._dg * self._ww - self._wg * self._wd) / det
         self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
         """Standard deviation of the ratio."""

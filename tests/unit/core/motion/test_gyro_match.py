@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable
 
 import pytest
@@ -64,6 +65,30 @@ def test_a_delay_that_was_told_is_not_told_again() -> None:
 @pytest.mark.parametrize("rate", [0.0, 0.8], ids=["standing", "turning steadily"])
 def test_without_a_change_of_rate_there_is_no_delay_to_be_found(rate: float) -> None:
     assert matched(30.0, rate=lambda t: rate).delay() is None
+
+
+def test_the_encoder_counts_of_a_straight_drive_are_no_delay() -> None:
+    match = matched(20.0, ratio=1.0)
+    match.delay()
+    dice, count = random.Random(1), math.tau / 400 * 0.125 / 0.266
+    before = 0
+    for _ in range(2000):
+        # The sides differ by a count or not, as their fractions of counts happen to fall.
+        now = dice.choice((0, 1))
+        match.add((now - before) * count, dice.gauss(0.0, 1e-4), 0.05, slips=False)
+        before = now
+    found = match.delay()
+    assert found is None or abs(found) < 0.005
+
+
+def test_changes_of_the_wheels_that_the_gyro_does_not_follow_leave_a_ratio() -> None:
+    match, pattern = Match(), (0.0, 0.0, 0.1, 0.1, 0.0, 0.0, -0.1, -0.1)
+    for n in range(4000):
+        wheels, gyro = pattern[n // 10 % 8], pattern[(n // 10 + 3) % 8]
+        match.add(wheels + 0.01, gyro + 0.01, DT, slips=False)
+        assert math.isfinite(match.ratio)
+        assert abs(match.ratio) < 3.0
+        match.delay()
 
 
 def test_a_robot_that_stands_teaches_nothing() -> None:
