@@ -13,9 +13,9 @@ from acsard.core.messages.one_line import short
 from acsard.core.messages.schema import BatterySummary
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import chosen
+from acsard.top.drive_screen import lines
 from acsard.top.roster import table
-from acsard.top.teleop import lines
-from tests.unit.top import test_roster, test_teleop
+from tests.unit.top import test_drive_screen, test_roster
 from tests.unit.top.screens import BEFORE, SEEN, STATE, lines_of
 
 WIDTHS = (40, 80, 160)
@@ -42,7 +42,9 @@ def screens(width: int) -> dict[str, list[str]]:
     states = {"robot2": WAITING, "robot3": WARNED}
     robots = [replace(test_roster.ROW, robot_id=name, state=one) for name, one in states.items()]
     return {
-        "drive": [one.plain for one in lines(replace(test_teleop.SEEN, state=WAITING), width)],
+        "drive": [
+            one.plain for one in lines(replace(test_drive_screen.SEEN, state=WAITING), width)
+        ],
         "top": lines_of(replace(SEEN, state=WARNED, before=BEFORE), width),
         "fleet": table([test_roster.ROW, *robots], width),
         "echo state --short": [short(STATE), short(WAITING), short(WARNED)],

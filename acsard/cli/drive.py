@@ -11,8 +11,8 @@ from acsard.cli.connection import add_bus, connected, require_one
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.top import terminal
+from acsard.top.drive_screen import HELP
 from acsard.top.keyboard import Keyboard, Ride
-from acsard.top.teleop import HELP
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

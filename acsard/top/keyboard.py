@@ -12,10 +12,10 @@ from acsard.client import Client
 from acsard.client.commander import GRACE_S, ZEROS, Commander, Wish, objection
 from acsard.client.follower import Watch
 from acsard.core.values import NS_PER_S, REST, Twist
-from acsard.top.teleop import Teleop
+from acsard.top.drive_screen import Teleop
 
 HOLD_S = 0.6
-"""Time that one key press drives, s.
+"""Time for which one key press drives the robot, s.
 
 It is longer than a keyboard's delay before the first repeat (0.25 to 0.5 s); otherwise the robot
 would stutter.
@@ -33,7 +33,7 @@ _SPEEDS = {
 
 
 class Keyboard:
-    """The command that the keys pressed so far ask for. The class is pure."""
+    """Converts key presses to commands. The class is pure."""
 
     def __init__(self, linear: float, angular: float) -> None:
         self.linear, self.angular = linear, angular
@@ -42,7 +42,7 @@ class Keyboard:
         self._zeros = ZEROS
 
     def press(self, key: str, now: float) -> None:
-        """Handle a key, or an arrow's escape sequence, that was pressed at `now` s."""
+        """Process a key, or an arrow's escape sequence, pressed at `now` (monotonic clock, s)."""
         if key in _SPEEDS:
             self.linear *= _SPEEDS[key][0]
             self.angular *= _SPEEDS[key][1]
@@ -53,7 +53,7 @@ class Keyboard:
             self._move, self._until, self._zeros = (0, 0), now, ZEROS
 
     def wish(self, now: float) -> Twist | None:
-        """Return the command for the keys pressed until `now` s, or None to send nothing."""
+        """Return the command to send at `now` (monotonic clock, s), or None to send nothing."""
         if now < self._until:
             return Twist(self.linear * self._move[0], self.angular * self._move[1])
         if self._zeros:
@@ -63,7 +63,7 @@ class Keyboard:
 
 
 class Ride:
-    """The connection between the keys and the robot: sends commands and follows `state`."""
+    """Connects the keys and the robot: sends the commands, and receives the robot's state."""
 
     def __init__(self, robot: Client, keyboard: Keyboard) -> None:
         self._robot, self._keyboard = robot, keyboard
@@ -74,7 +74,7 @@ class Ride:
         self._watch = Watch(robot, self._fine)
 
     def step(self, typed: str) -> None:
-        """Handle these key presses, send the command that is due, and take new messages."""
+        """Process the typed keys, send the command that is due, and process received states."""
         now = time.monotonic()
         now_ns = round(now * NS_PER_S)
         for key in split(typed):
@@ -82,7 +82,7 @@ class Ride:
         wish = self._keyboard.wish(now)
         if wish is not None:
             self._commander.take(Wish(wish), now_ns)
-        # One command a step: the daemon may overlook a zero with a speed directly behind it.
+        # Send one command per step: the daemon may miss a zero that a speed follows directly.
         sent = self._commander.send(now_ns)
         if sent is not None:
             self._robot.send(sent.twist.linear, sent.twist.angular)
@@ -91,11 +91,11 @@ class Ride:
         self.take()
 
     def take(self) -> None:
-        """Take the messages that have arrived, and query `state` if it is late."""
+        """Process the states that have arrived, and query the state if it is late."""
         self._watch.look(time.monotonic())
 
     def end(self) -> None:
-        """Send the last zeros."""
+        """Send the final zero commands, which stop the robot."""
         for _ in range(ZEROS):
             self._robot.send(0.0, 0.0)
 
@@ -119,7 +119,7 @@ class Ride:
 
 
 def split(text: str) -> list[str]:
-    """Split the text of one terminal read into keys. An arrow key is three characters."""
+    """Split the text of one terminal read into keys. An arrow key has three characters."""
     keys, at = [], 0
     while at < len(text):
         size = 3 if text.startswith("\x1b[", at) else 1

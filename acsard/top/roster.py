@@ -13,28 +13,28 @@ from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import brief, charge, warnings
 from acsard.daemon.bus.robot_discovery import ALL, nobody, seen
-from acsard.top.teleop import reason
+from acsard.top.drive_screen import reason
 
 HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
 
 ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
-"""Maximum width of each column but the last, which takes the rest. The first is as wide as its
-longest id."""
+"""Maximum widths of all columns except the last, which gets the remaining width. The first column
+is as wide as its longest id."""
 
 NAME, WHY = 12, 32
-"""Minimum widths of the first and last column. A long id may not narrow the last column below its
-minimum, unless the first would fall below its own."""
+"""Minimum widths of the first and last column. The first column becomes narrower to leave the last
+one its minimum, but never narrower than its own minimum."""
 
 BATTERY = HEADS.index("BATTERY")
 """Column of the state of charge. The table has it only if a robot has a battery."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""Modes that need attention; they are listed first, because the lines may not all fit. The robots
-with a warning come next."""
+"""Modes that need attention. Robots in these modes are listed first, because the lines may not all
+fit. Robots with a warning come next."""
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
-    """Return a header and a line for each robot, the urgent ones first.
+    """Return a header and a line for each robot, the urgent robots first.
 
     There are at most `height` lines of at most `width` characters.
     """
@@ -43,7 +43,7 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
     powered = any(row[BATTERY] for row in cells[1:])
     shown = [n for n in range(len(HEADS)) if n != BATTERY or powered]
-    # A narrow terminal lacks these columns; the first is the first to go.
+    # If the terminal is too narrow, these columns are left out one by one, in this order.
     for column in map(HEADS.index, ("VERSION", "PLACE", "LINK", "BATTERY")):
         if column in shown and sum(rooms[n] + 2 for n in shown) - 2 > width:
             shown.remove(column)
@@ -64,9 +64,9 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
 
 def shortened(names: Sequence[str], room: int) -> list[str]:
-    """Shorten names to `room` characters by cutting out a part in the same place of each.
+    """Shorten names to `room` characters by cutting out a part, at the same place in each.
 
-    The cut is in the middle, unless more names stay distinct with a cut elsewhere.
+    The cut is in the middle, unless a cut elsewhere keeps more names distinct.
     """
     if all(len(name) <= room for name in names):
         return list(names)
@@ -103,7 +103,7 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _why(state: RobotState) -> str:
-    """Return the warnings in few words, the reason of the mode, and the details.
+    """Return brief warnings, the reason of the mode, and the details of the warnings.
 
     In a mode that needs attention the reason comes first, because a terminal cuts the end.
     """
@@ -129,7 +129,10 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Sort by urgency, then by id. Absence counts before the last reported mode."""
+    """Return the sort key of a row: its urgency, then its id.
+
+    If the robot is gone or silent, its last reported mode is ignored.
+    """
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
         return URGENT.index(what), row.robot_id
@@ -146,9 +149,10 @@ class Roster(Fleet):
         return [replace(row, here=bool(row.here)) for row in super().rows()]
 
     def gather(self) -> list[Row]:
-        """Wait until every robot that is present has answered; return no rows if none is there.
+        """Wait until all named robots have answered, and return the rows.
 
-        It takes 1.5 s, or 3 s if no robot is there: on a busy computer the first answer is late.
+        The wait ends after 1.5 s. Without any robot it ends after 3 s, because the first answer is
+        late on a busy computer; then there are no rows.
         """
         began, rows = time.monotonic(), self.rows()
         while not self.whole:
@@ -163,7 +167,7 @@ class Roster(Fleet):
     def whole(self) -> bool:
         """Whether all named robots are present and have reported their state and version.
 
-        This is never true if all robots were requested, because their number is unknown.
+        It is never true if the user did not name robots, because their number is unknown.
         """
         with self._lock:
             known = list(self._known.values())
@@ -179,7 +183,7 @@ class Roster(Fleet):
 
     @property
     def more(self) -> str:
-        """Note that some robots are left out, or ""."""
+        """A sentence which says that some robots are left out, or "" if none is."""
         if not self.left_out:
             return ""
         return (
@@ -188,7 +192,7 @@ class Roster(Fleet):
         )
 
     def hint(self) -> str:
-        """Return the reason why there may be no robots to show."""
+        """Return a sentence that explains why there are no robots to show."""
         if ALL in self._ids:
             return nobody(self._robot.where.endpoint)
         return "none of these robots is present"

@@ -24,22 +24,22 @@ from acsard.core.messages.state_warnings import WARNING
 from acsard.core.values import AcsardError
 from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.output import has_screen, plain
+from acsard.top.drive_screen import HELP, Teleop, lines, moves, news, parting
 from acsard.top.feed import Feed
 from acsard.top.keyboard import Ride
 from acsard.top.roster import Roster, table
 from acsard.top.screen import screen
-from acsard.top.teleop import HELP, Teleop, lines, moves, news, parting
 
 PERIOD_S = 0.25
-"""Period in which a screen is drawn, s."""
+"""Interval at which a screen is drawn, s."""
 
 KEYS_S = 0.05
-"""Period in which the keys of a drive are read, s."""
+"""Interval at which the keys of a drive are read, s."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Shortest time between two reports without a screen, s.
+"""Shortest intervals between two reports on a terminal without a screen, s.
 
-In this order, they apply after a change, while the robot moves, and while nothing happens.
+They apply, in this order, after a change, while the robot moves, and at other times.
 """
 
 NO_END = 10**9
@@ -57,8 +57,8 @@ def once(feed: Feed) -> str:
 
 
 def live(feed: Feed) -> None:
-    """Show the screen and update it until a key or a signal."""
-    # A failed query is no problem, because the screen says that it waits for a state.
+    """Show the screen and update it until `q` is typed, the input ends or a signal arrives."""
+    # A failed query does not matter, because the screen says that it waits for a state.
     with suppress(AcsardError):
         feed.ask()
     console = Console()
@@ -71,7 +71,7 @@ def live(feed: Feed) -> None:
 
 
 def drive(ride: Ride) -> None:
-    """Drive by the typed keys, and show the robot, until a signal."""
+    """Drive by the typed keys, and show the robot, until the input ends or a signal arrives."""
     if has_screen():
         console = Console()
         _hold(lambda suspend: _steer(ride, console, suspend))
@@ -80,7 +80,7 @@ def drive(ride: Ride) -> None:
 
 
 def part(ride: Ride) -> None:
-    """Wait until the robot stands, at most 2 s, and print a last report.
+    """Wait until the robot has stopped, at most 2 s, and print a last report.
 
     Without the wait, this report would say that the robot drives although it stops a moment later.
     """
@@ -89,7 +89,7 @@ def part(ride: Ride) -> None:
         ride.take()
         seen, took = ride.seen(), time.monotonic() - left
         rests = seen.state is not None and seen.age < took and not moves(seen.state)
-        # A robot usually stands within 2 s after its own ramp.
+        # A robot usually stops within 2 s, by its own deceleration ramp.
         if rests or took > 2.0:
             print("\n".join(parting(seen, output_size().columns)), flush=True)
             return
@@ -97,7 +97,7 @@ def part(ride: Ride) -> None:
 
 
 def roster(fleet: Roster) -> None:
-    """Show a line for each robot and update them until a key or a signal."""
+    """Show a line for each robot, and update them until `q`, the end of input or a signal."""
     console = Console()
 
     def draw() -> RenderableType:
@@ -153,7 +153,7 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
 
 
 def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
-    """Drive and show the screen; return True at ^Z and False when the input ends."""
+    """Drive and show the screen. Return True at ^Z, and False when the input ends."""
     with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
@@ -177,7 +177,7 @@ def _be_lenient() -> None:
 
 @contextmanager
 def until_told() -> Iterator[None]:
-    """End the block at the first terminating signal, or when its terminal closes.
+    """End the block at the first terminating signal, or when the terminal closes.
 
     Later signals are ignored during the cleanup: a terminal that closes under a shell sends two,
     and Ctrl-C may be held down.
@@ -234,7 +234,7 @@ def keys() -> Iterator[Callable[[float], str | None]]:
 
 
 def _drive_in_lines(ride: Ride) -> None:
-    """Drive until a signal; print some lines after each change, and at intervals."""
+    """Drive until the input ends or a signal arrives; print a report when one is due."""
     due, page = News(), Page()
     with until_told(), keys() as read:
         while (typed := read(KEYS_S)) is not None:
@@ -252,14 +252,14 @@ def output_size() -> os.terminal_size:
 
 
 class News:
-    """Throttle for reports on a terminal that cannot show a screen. The class is pure."""
+    """Decides when a report is due on a terminal that cannot show a screen. The class is pure."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
         self._at = -QUIET_S
 
     def tell(self, seen: Teleop, now: float) -> bool:
-        """Return whether a report is due at `now` s, and remember it as printed."""
+        """Return whether a report is due at `now`, s; if it is, remember it as printed."""
         state = seen.state
         words = ("", "") if state is None else (state.mode, state.reason)
         what = (*words, seen.objection, seen.linear, seen.angular, seen.silent)
@@ -272,14 +272,17 @@ class News:
 
 
 class Page:
-    """Reports with the help, repeated before it scrolls out of sight. The class is pure."""
+    """Adds the help to reports, again before it scrolls out of sight. The class is pure."""
 
     def __init__(self) -> None:
         self._shown = NO_END
-        """Lines printed since the help began."""
+        """Number of lines printed since the first line of the help."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """Return these lines, below the help if they are the first or would scroll it away."""
+        """Return the lines of a report, below the help if that would not be in sight otherwise.
+
+        `height` is the number of lines of the terminal.
+        """
         self._shown += len(told)
         if self._shown < height:
             return told

@@ -5,10 +5,10 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.core.messages.schema import RobotState
-from acsard.top.teleop import HELP
+from acsard.top.drive_screen import HELP
 from acsard.top.terminal import NO_END, News, Page
 from tests.unit.top.screens import STATE
-from tests.unit.top.test_teleop import SEEN
+from tests.unit.top.test_drive_screen import SEEN
 
 
 def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:

@@ -41,11 +41,11 @@ class Teleop(Struct, frozen=True):
     objection: str = ""
     """Reason why the robot does not follow the keys, or ""."""
     silent: bool = False
-    """Whether the robot counts as silent, so that the shown data is old."""
+    """True if the robot is silent, so the shown data is old."""
 
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
-    """Return the screen as lines of at most `width` characters."""
+    """Return the screen as at most `height` lines (None: no limit) of at most `width` cells."""
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
     shown = [Text(head, "bold")]
@@ -74,7 +74,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
 
 
 def news(seen: Teleop, width: int) -> list[str]:
-    """Return the content without the help, wrapped between words and between figures."""
+    """Return the lines of a report: the content of the screen, without the help."""
     told = [f"keys ask {asked(seen)}"]
     if seen.state is None or seen.silent:
         return _words([silence(seen), *told], width)
@@ -85,7 +85,7 @@ def news(seen: Teleop, width: int) -> list[str]:
 
 
 def parting(seen: Teleop, width: int) -> list[str]:
-    """Return the last message: whether the robot stands, and where."""
+    """Return the lines of the last report: whether the robot moves, why, and its pose."""
     if seen.state is None or seen.silent:
         return _words([f"left: {silence(seen)}"], width)
     what = "still moves" if moves(seen.state) else "stands"
@@ -96,19 +96,19 @@ def parting(seen: Teleop, width: int) -> list[str]:
 
 
 def moves(state: RobotState) -> bool:
-    """Return whether any measured speed differs from zero; a robot without feedback has none."""
+    """Return whether any measured speed differs from zero. Without feedback, this is False."""
     return any((state.linear, state.angular, *state.wheels))
 
 
 def silence(seen: Teleop) -> str:
-    """Return a message that the robot is silent, and for how long."""
+    """Return a sentence which says that nothing is received, and for how long."""
     if seen.state is None and not seen.silent:
         return "waiting for the first state"
     return f"nothing received from the daemon for {seen.age:.0f} s: does it run?"
 
 
 def reason(state: RobotState) -> str:
-    """Return the reason of the mode, without the mode itself."""
+    """Return the reason of the mode, without the name of the mode."""
     return printable(state.reason.removeprefix(f"{state.mode}: "))
 
 
@@ -123,7 +123,7 @@ def measured(state: RobotState) -> list[Text]:
 
 
 def _words(told: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
-    """Wrap sentences, and figures below them; continued lines are indented."""
+    """Wrap the sentences `told`, and the figures below them. Continued lines are indented."""
     width = max(20, width)
     lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)
     return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.motion.modes import Mode
-from acsard.top.teleop import HELP, Teleop, lines, news, parting
+from acsard.top.drive_screen import HELP, Teleop, lines, news, parting
 from acsard.top.text import MODES
 from tests.each import each
 from tests.unit.top.screens import STATE
