@@ -1,55 +1,58 @@
 """acsard: the hardware interface daemon of a four-wheel differential-drive robot.
 
-One process with one asyncio event loop drives the robot. Below it is a microcontroller on a serial
-line, above it a Zenoh bus, and a control step runs between them every 10 ms. TLS connections from
-a network end in another process, the gateway.
+One process, the daemon, drives the robot with one asyncio event loop. It exchanges lines with a
+microcontroller on a serial port, and messages with clients on a Zenoh bus. It runs a control step
+every 10 ms. TLS connections from the network end in a second process, the gateway.
 
-      one task, every 10 ms (earlier when a fresh command or feedback is in hand)
+      one task, every 10 ms (earlier if a new command or feedback has arrived)
 
  serial -> received bytes ---+                          +-> report -> encode -> bus
                              +-> robot.step(inputs) ----+
  bus -> decode -> commands --+         (pure)           +-> line -> guard -> serial
 
-`Robot.step` does, in this order: fold the feedback into odometry, choose one command, gate it by
-mode, limit it, invert the kinematics, report. No other function decides anything.
+`Robot.step` updates the odometry from the feedback, chooses one command, checks that the mode
+allows it, limits it, computes the wheel speeds and reports, in this order. No other function
+decides how the robot moves.
 
-Where to look: each package may import only those below it. `pyproject.toml` states
-this order as contracts, and `lint-imports` checks them.
+Where to look: each package may import only the packages below it in this list.
+`pyproject.toml` states this order as contracts, and `lint-imports` checks the contracts.
 
     cli/             one file per subcommand: its options, a call into another package, output
     bench/           `acsard bench`: measures a daemon from outside
     foxglove/        `acsard foxglove`: a live server for Foxglove
-    report/          `acsard recording report`: what a recording shows, as a page
+    report/          `acsard recording report`: turns a recording into an HTML page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a process of its own
-    calibration/     `acsard calibrate`, by a log or a drive of its own, and `acsard accuracy`: how
-                     much each cause contributes to the odometry's error
-    machine/         what an administrator does with the computer: `acsard doctor`, certificates for
+    calibration/     `acsard calibrate`: calibrates from a recorded drive or a new one;
+                     `acsard accuracy`: how much each cause contributes to the odometry's error
+    machine/         tools for the administrator of the computer: `acsard doctor`, certificates for
                      other machines, the serial ports, the system service
-    client/          follow and drive a robot from Python, synchronous or with asyncio; the
-                     follower and the commander hold the rules and time limits of all tools
-    daemon/          the process: control loop, latch file, ways down
-    daemon/gateway/  `acsard gateway`: the process in which TLS ends
+    client/          follows and drives a robot from Python, synchronously or with asyncio; its
+                     follower and commander have the rules and time limits that all tools use
+    daemon/          the daemon's process: control loop, latch file, shutdown
+    daemon/gateway/  `acsard gateway`: the process in which TLS connections end
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
-    recording/       the black box: steps to MCAP and back, a ring of files, replay
-    terminal/        tables and output of all tools, by the library rich; questions to the person
-                     beside the robot: at a terminal, or through a program in JSON
-    host/            what every process uses: clock, timers, threads and the mailboxes between
-                     them, child processes, files, rate limits, systemd, logs, errors
-    checkup/         `acsard mcu check`: one module for each question to the board
+    recording/       the black box: writes the steps to MCAP files, deletes old files, reads the
+                     files, and replays them
+    terminal/        prints tables and output of all tools with the library rich; asks the person
+                     beside the robot questions, at a terminal or through a program that uses JSON
+    host/            the parts that every process uses: clock, timers, threads and the mailboxes
+                     between them, child processes, files, rate limits, systemd, logs, errors
+    checkup/         `acsard mcu check`: one module for each check of the board
     core/            the robot as a pure function: no clock, no I/O, no thread
 
 Inside `core/`, in the same order:
 
     core/simulator/  the vehicle, the simulated microcontroller and its faults
     core/robot.py    the order of a step; core/guard.py checks each outgoing line
-    core/incoming/   what comes in over the bus: a sample becomes a command, a query a reply
+    core/incoming/   input from the bus: turns samples into commands, and answers queries
     core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
     core/messages/   the published structs, the table of keys, encodings, reports, schemas
     core/motion/     kinematics, odometry, consistency checks, arbiter, freshness, limits, modes
     core/link/       the serial line: codec, checksum, negotiation, sample times, link state
-    core/config/     acsard.toml becomes one frozen Config, or errors that name key and mend
+    core/config/     turns acsard.toml into one frozen Config, or into errors that name the key
+                     and the remedy
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs
     core/formatting.py  safe text, figures, durations and counts for every message
     core/thinning.py    curves and paths of any length in a bounded number of points
@@ -57,10 +60,11 @@ Inside `core/`, in the same order:
 Three invariants hold, and each is tested:
 
 1. Nothing in `core/` does I/O, and in the daemon only `host/clock.py` reads a clock.
-2. No wheel speed grows unless a fresh command, a live link and mode `driving` agree in the same
-   step. Otherwise it only falls, and without a link the command is zero at once. The guard checks
-   exactly this, and that each ramp ends in time, with code of its own.
-3. No line is held back to be sent later. If it cannot go now, the next line supersedes it.
+2. A wheel speed grows only in a step with a fresh command, a live link and the mode `driving`.
+   Otherwise it only falls. Without a link the commanded speed is zero at once. The guard checks
+   this rule with code of its own, and also checks that each ramp ends in time.
+3. No line is kept to be sent later. If the serial port cannot take a line now, the line is dropped,
+   and the next line supersedes it.
 """
 
 __version__ = "0.1.0"

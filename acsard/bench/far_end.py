@@ -1,9 +1,8 @@
-"""The far end of the wire in a benchmark: a program that simulates the board on a pty.
+"""The far end of the serial wire in a benchmark: a program that simulates the board on a pty.
 
-It is a process of its own that the kernel wakes directly, with real-time priority where that is
-permitted. Its times are therefore those of the wire, independent of the measured and the measuring
-program. Its first line of output is the device. When its input ends, it writes all recorded data
-and ends.
+The far end is a separate process with real-time priority, if that is permitted. So it measures the
+times on the wire independently of the daemon and of the benchmark program. Its first line of output
+is the path of the pty. When its standard input ends, it writes all recorded data and ends.
 """
 
 from __future__ import annotations
@@ -27,17 +26,20 @@ from acsard.host.timerfd import TimerFd
 
 
 class Part(msgspec.Struct, frozen=True):
-    """Role of the far end."""
+    """The parameters of the far end, which it reads from a file at its start."""
 
     config: dict[str, object]
     free_running: float = 0.0
-    """Time between reports by the board's own clock, s; 0 to answer each line."""
+    """Period of the reports of a board that reports without being asked, s.
+
+    0 means that the board answers each line.
+    """
     baud_rate: int = 0
-    """Baud rate of this end, if it is one that the configuration does not allow; else 0."""
+    """Baud rate of the far end, which the configuration need not allow; 0: as configured."""
 
 
 class NumberedMcu(FakeMcu):
-    """Simulated board with the usual timing, each of whose lines reports a different speed."""
+    """A simulated board with the usual timing. It reports another speed in each line."""
 
     def __init__(self, config: Config, now_ns: int) -> None:
         super().__init__(config, now_ns)
@@ -49,7 +51,7 @@ class NumberedMcu(FakeMcu):
         return [forward * speed for _, forward in self._wiring]
 
     def _pass(self, now_ns: int) -> None:
-        # The simulated vehicle does not move.
+        # Advance only the time: the reported speeds do not depend on a simulated vehicle.
         self._now_ns = max(self._now_ns, now_ns)
 
 
@@ -64,7 +66,7 @@ class FarEnd:
         self._timer = TimerFd()
 
     def play(self, until_fd: int) -> None:
-        """Run until `until_fd` becomes readable."""
+        """Simulate the board until the file descriptor `until_fd` becomes readable."""
         poll = select.poll()
         for fd in (self._pty.fileno(), self._timer.fileno(), until_fd):
             poll.register(fd, select.POLLIN)
@@ -100,10 +102,10 @@ class FarEnd:
 def main(part: Part) -> None:
     """Run until standard input ends, then write the recorded data."""
     try:
-        # A microcontroller does not wait for its host.
+        # Other processes must not delay the simulated board: a real one has its own processor.
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(80))
     except OSError:
-        # Without real-time priority the times are only as good as the machine is idle.
+        # Without real-time priority the times are accurate only on an idle machine.
         pass
     config = from_builtins(part.config)
     if part.baud_rate:

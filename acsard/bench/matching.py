@@ -1,7 +1,7 @@
-"""The record of a benchmark, and the figures that follow from it; pure.
+"""The record of a benchmark, and the figures that are computed from it; pure.
 
-Every command and every feedback line of a benchmark has a speed of its own. So each output of the
-measured daemon is paired with its input by its content and not by its time. Times are monotonic, in
+Successive commands and feedback lines of a benchmark have different speeds. So each output of the
+measured daemon is matched with its input by the speed, and not by the time. Times are monotonic, in
 ns.
 """
 
@@ -18,18 +18,18 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Instant
 
 STEPS = 1000
-"""Number of different speeds. Lines that are further apart are distinguished by their time."""
+"""Number of different speeds. Two lines with the same speed are distinguished by their time."""
 
 LOWEST, STEP = 5.0, 0.02
-"""Lowest speed and step, rad/s. Neighbouring speeds are so close that a limit on acceleration
-does not change them.
+"""Lowest speed and step of the speeds, rad/s. Successive speeds are so close to each other that the
+limits on acceleration do not change them.
 """
 
 PATIENCE_NS = 1_000_000_000
-"""Time after which a command that has not reached the wire is lost, ns."""
+"""Time after which a command that has not reached the wire counts as lost, ns."""
 
 Chunk = tuple[int, bytes]
-"""Monotonic time in ns and the bytes that were sent or received then."""
+"""Monotonic time, ns, and the bytes that were sent or received at that time."""
 
 
 class Summary(Struct, frozen=True):
@@ -47,13 +47,14 @@ class Fed(Struct, frozen=True):
     delay_ns: int
     """Time from the line's last byte to the sample, ns."""
     waiting: int
-    """Number of newer lines handed over by the time of the sample."""
+    """Number of newer lines that the far end had already written at the time of the sample."""
 
 
 def staircase(number: int) -> float:
-    """Return the wheel speed that stands for `number`, rad/s.
+    """Return the speed of all wheels, rad/s, that encodes the number of a command or a line.
 
-    The speeds rise over the even steps of the scale and fall over the odd ones.
+    The speeds rise and fall with a period of `STEPS`. Rising speeds use the even steps of the scale
+    and falling speeds the odd ones, so that all speeds of a period differ.
     """
     half = STEPS // 2
     place = number % STEPS
@@ -62,9 +63,9 @@ def staircase(number: int) -> float:
 
 
 def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
-    """Return the lines without line ends, each with the time of its first byte.
+    """Return the lines in these bytes, each with the time of its first byte.
 
-    Empty lines are left out.
+    The lines have no line end and no trailing comma. Empty lines are left out.
     """
     lines, held, began_ns = [], b"", 0
     for at_ns, data in chunks:
@@ -79,9 +80,10 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 
 
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
-    """Return the ns from each command to its first line; lost commands are left out.
+    """Return the time from each command to its first line, ns. Lost commands are left out.
 
-    `sent` holds the time of each command and the line that it must become.
+    `sent` has the time of each command and the line that the daemon must make of it. `lines` has
+    the lines on the wire.
     """
     times: dict[bytes, list[int]] = {}
     for at_ns, line in lines:
@@ -98,10 +100,13 @@ def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int
 def lines_to_samples(
     said: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
 ) -> list[Fed]:
-    """Return the delay of each feedback line that became a sample, matched by linear speed in m/s.
+    """Return the delay of each feedback line that became an odometry sample.
 
-    `said` holds the time and the speed of each line, and `samples` those of each odometry sample. A
-    sample that repeats a line is left out.
+    Lines and samples are matched by their linear speed. A sample that repeats a line is left out.
+
+    Args:
+        said: the time, ns, and the linear speed, m/s, of each feedback line.
+        samples: the time, ns, and the linear speed, m/s, of each odometry sample.
     """
     all_ns = [at_ns for at_ns, _ in said]
     places: dict[int, list[int]] = {}
@@ -123,7 +128,10 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return exact percentiles, each of them a measured duration; None for an empty sequence."""
+    """Return the percentiles of durations; None for an empty sequence.
+
+    Each percentile is one of the measured durations, not an interpolation.
+    """
     if not durations_ns:
         return None
     import numpy as np
@@ -134,23 +142,23 @@ def summary(durations_ns: Sequence[int]) -> Summary | None:
 
 
 class Seen(Struct, frozen=True):
-    """All data on the wire, with monotonic times in ns."""
+    """All data that the far end received and sent, with monotonic times in ns."""
 
     heard: list[Chunk] = []
-    """Bytes from the daemon, with the times at which they were readable."""
+    """Bytes from the daemon, with the times at which the far end could read them."""
     said: list[Chunk] = []
-    """Lines to the daemon, with the times at which the last byte was handed over."""
+    """Bytes to the daemon, each chunk with the time just before the far end wrote it."""
 
 
 class Sent(Struct, frozen=True):
-    """A command, with the time at which it was published and the line that it must become."""
+    """A command: the time at which it was published, and the line that it must become."""
 
     at_ns: int
     line: bytes
 
 
 class Sample(Struct, frozen=True):
-    """An odometry sample, with its arrival and its content."""
+    """An odometry sample, with its time of arrival `at` and its content."""
 
     at: Instant
     stamp_ns: int
@@ -163,9 +171,9 @@ class Record(Struct, frozen=True):
     """The raw times of one run."""
 
     began_ns: int
-    """Time just before the daemon was started."""
+    """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """Time window that counts: from the end of the start to the beginning of the end."""
+    """The time that is evaluated, ns: from the end of the start-up to the begin of the shutdown."""
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]
@@ -180,7 +188,7 @@ class Record(Struct, frozen=True):
 
 
 def command_waits(record: Record) -> list[int]:
-    """Return the ns from each command to its line on the wire; lost commands are left out."""
+    """Return the time from each command to its line on the wire, ns. Lost commands are left out."""
     if record.seen is None:
         return []
     sent = [(sent.at_ns, sent.line) for sent in record.sent]

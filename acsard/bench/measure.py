@@ -1,6 +1,7 @@
 """Runs one benchmark and computes the figures from its record.
 
-The measured daemon has the user's configuration with some changes, in a file of its own.
+The measured daemon uses the user's configuration with some changes, which is written to a temporary
+file.
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ from acsard.host.errors import MendableError
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
-    """Return the configuration to measure with: it has its own robot id, bus and source.
+    """Return the configuration of the measured daemon, with its own robot id, bus and source.
 
-    With the simulator, a command must reach the next line unchanged, and feedback that does not
-    match it must not be a fault. Lines are plain there, because the sequence number of a checked
-    line would hide the speed by which it is recognized.
+    With the simulated board, three more things change. The limits let each command reach the next
+    line unchanged. Feedback that contradicts the commands is not a fault. Lines have no sequence
+    number, because each line is recognized by its text.
     """
     own = replace(
         config,
@@ -79,7 +80,7 @@ def bench_config(config: Config, *, simulated: bool) -> Config:
 
 
 def free_endpoint() -> str:
-    """Return a loopback address on which no process listens."""
+    """Return an endpoint on the loopback interface at which no process listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -92,9 +93,9 @@ def write(config: Config, where: Path) -> Path:
 
 
 def measure(config: Config, port: str, seconds: float) -> Result:
-    """Measure for `seconds`: a quarter without commands, the rest with commands.
+    """Measure a daemon for `seconds`: a quarter without commands, then the rest with commands.
 
-    With an empty `port` the simulated board is measured.
+    `port` is the serial port; "" means the simulated board.
     """
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(config, Path(where))

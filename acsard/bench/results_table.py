@@ -1,4 +1,4 @@
-"""Prints the figures of `acsard bench`, with the machine and the measuring points."""
+"""Makes the tables of the figures of `acsard bench`, with the machine and the measuring points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ POINTS = {
     "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
-"""The figures measured from outside, and their points; "here" is the benchmark's own process."""
+"""The figures measured from outside, and between which points; "here" is the benchmark process."""
 
 OWN = {
     "period_lateness": "period due (the first of several missed) -> its step",
@@ -30,7 +30,10 @@ OWN = {
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
     "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
-"""The figures that the daemon measures within its own process, as `latencies.Name` defines them."""
+"""The figures that the daemon measures itself, and between which points.
+
+`latencies.Name` has their names.
+"""
 
 
 class Machine(Struct, frozen=True):
@@ -64,23 +67,25 @@ class Result(Struct, frozen=True, omit_defaults=False):
     commands_seen: int | None
     """Number of commands whose line was seen on the wire; null on a real port."""
     lines_said: int | None
-    """Number of feedback lines handed over; null on a real port."""
+    """Number of feedback lines that the far end wrote; null on a real port."""
     lines_told: int
-    """Number of feedback lines that became odometry here."""
+    """Number of feedback lines of which the benchmark received the odometry."""
     lines_waiting_max: int | None
-    """Largest number of newer lines handed over by the time of a sample; null on a real port."""
-    lines_sent: int
-    """Lines that the daemon handed to the port, counted up to the same moment as
-    `missed_periods`.
+    """Largest number of newer feedback lines already written when a sample arrived.
+
+    Null on a real port.
     """
+    lines_sent: int
+    """Number of lines that the daemon wrote to the port, read at the same time as
+    `missed_periods`."""
     missed_periods: int
     cpu_percent_following: float
-    """Share of one core with one subscriber to the odometry and without commands."""
+    """Processor use with one subscriber to the odometry and without commands, % of one core."""
     cpu_percent_commanded: float
-    """Share of one core with one subscriber to the odometry and 25 commands a second."""
+    """Processor use with one subscriber to the odometry and 25 commands a second, % of one core."""
     resident_mb: float
     start_up_ms: float | None
-    """Time from the start of the process to its first line on the port; null on a real port."""
+    """Time from the start of the daemon to its first line on the port, ms; null on a real port."""
 
 
 def this_machine() -> Machine:
@@ -95,7 +100,7 @@ def this_machine() -> Machine:
 
 
 def _cpu_model() -> str:
-    """Return the processor's name from the kernel, or a board's name from the device tree."""
+    """Return the name of the computer board from the device tree, else that of the processor."""
     try:
         board = Path("/proc/device-tree/model").read_text().strip("\0\n ")
         if board:

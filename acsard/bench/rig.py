@@ -2,10 +2,10 @@
 
     bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  far_end.py (simulated MCU)
 
-The three processes share one monotonic clock, so a time from one can be subtracted from a time of
-another. This module starts, commands and ends the daemon and collects raw times; `matching.py`
-evaluates them. Any program that accepts `--config` and `--port` and uses the same keys can take the
-daemon's place.
+The three processes use the same monotonic clock, so their times can be compared. This module starts
+the daemon, sends commands to it, ends it and collects raw times, which `matching.py` evaluates. The
+measured program is usually acsard. Any other program that accepts `--config` and `--port` and uses
+the same keys can be measured in its place.
 """
 
 from __future__ import annotations
@@ -44,16 +44,22 @@ from acsard.host.child import end, end_with_parent, environment, how_it_ended
 from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, UnreachableError
 
 END_S = 5.0
-"""Time limit for the end of a process, s. It usually takes 0.2 s."""
+"""Time limit for the end of a process, s. A process usually needs 0.2 s to end."""
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
-    """Return an error that describes the unexpected end of a process."""
+    """Return an error that describes the unexpected end of the process `who`.
+
+    `code` is its return code, and `said` its own message, or "" without one.
+    """
     return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
 def daemon_ended(code: int, log: Path) -> MendableError:
-    """Return why the daemon ended by itself, with its own message and exit code if it gave them."""
+    """Return an error that says why the daemon ended by itself.
+
+    It has the daemon's own message from the file `log`, and its exit code, if they are known.
+    """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
     said = [line for line in lines if line.strip() and not line.startswith("{")]
@@ -81,7 +87,8 @@ T = TypeVar("T")
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
 START_S = 15.0
-"""Time limit of the start, s. It takes 0.3 s, and 2 s more if opening the port resets the board."""
+"""Time limit of the start, s. A start usually takes 0.3 s, and 2 s more if opening the port resets
+the board."""
 
 SETTLED = 10
 """Number of odometry samples after which the link is up and the start is over."""
@@ -92,13 +99,24 @@ LOOK_S = 0.5
 FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
-"""Range of the time between two commands, s. It is evenly distributed, so commands fall anywhere
-within a period.
+"""Shortest and longest time between two commands, s. The times are uniformly distributed, so that
+commands arrive at any phase of the control period.
 """
 
 
 class Rig:
-    """Context in which the daemon is up and linked; `end` returns the record."""
+    """Context manager that starts the daemon and waits until its link to the board is up.
+
+    `follow` and `command` measure, and `end` returns the record.
+
+    Args:
+        config: the configuration in `file`.
+        file: the configuration file of the measured program.
+        words: the command line that starts the measured program.
+        port: the serial port; "" starts a far end that simulates the board.
+        free_running: as `Part.free_running`.
+        wire_baud_rate: as `Part.baud_rate`.
+    """
 
     def __init__(
         self,
@@ -172,7 +190,7 @@ class Rig:
         hidden = ("ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG", "STATE_DIRECTORY")
         words = [*self._words, "--config", str(self._file), "--port", port]
         env = environment(hidden)
-        # The measured daemon must not leave files behind, so its latches go to the temporary
+        # The measured daemon must not leave files behind, so it writes its latches to the temporary
         # directory.
         env["XDG_STATE_HOME"] = str(self._log.parent)
         with self._log.open("wb") as log:
@@ -207,7 +225,7 @@ class Rig:
             time.sleep(0.01)
 
     def _why(self) -> str:
-        """Return the condition that the daemon waits for, if it replies."""
+        """Return the daemon's reason for its state, to complete an error; "" without a reply."""
         try:
             return f": {self.state().reason}"
         except NoAnswerError:
@@ -227,7 +245,10 @@ class Rig:
         self._arrived.append((clock.now(), sample.payload.to_bytes()))
 
     def follow(self, seconds: float) -> float:
-        """Only listen for `seconds`; return the share of a core that the program used."""
+        """Receive odometry for `seconds` without sending commands.
+
+        Returns the processor use of the measured program as a share of one core.
+        """
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         end_ns = began_ns + int(seconds * NS_PER_S)
         while (left_ns := end_ns - clock.mono_ns()) > 0:
@@ -236,10 +257,15 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
-        """Send commands at random phases for `seconds`.
+        """Send commands at random intervals for `seconds`.
 
-        Returns the share of a core that the program used. `wheel_speed` returns the speed of all
-        wheels for the n-th command, rad/s.
+        Returns the processor use of the measured program as a share of one core.
+
+        Args:
+            seconds: the duration, s.
+            wheel_speed: a function that returns the speed of all wheels, rad/s, for the number of a
+                command, which counts from 0.
+            seed: the seed of the random intervals.
         """
         phases, number = random.Random(seed), 0
         self._neutral(phases)
@@ -255,7 +281,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zeros until they count: a daemon must first learn the delay of a new sender."""
+        """Send zeros until the daemon accepts them. It first checks the delay of a new sender."""
         before = self._counted()
 
         def look() -> bool | None:
@@ -267,7 +293,7 @@ class Rig:
         time.sleep(0.2)
 
     def _counted(self) -> int | None:
-        """Return the number of commands so far, or None if the program does not report it."""
+        """Return the number of accepted commands, or None if the program does not report it."""
         try:
             return self.state().counters.get("commands", 0)
         except NoAnswerError:
@@ -302,9 +328,9 @@ class Rig:
         end(self.process, END_S)
 
     def end(self) -> Record:
-        """End the program and return the record; the rig cannot be used again."""
+        """End the measured program and return the record. The rig cannot be used again."""
         window_ns = (self._settled_ns, clock.mono_ns())
-        # Wait for messages that are still under way.
+        # Wait for messages that have not arrived yet.
         time.sleep(0.1)
         self._alive()
         self.leave()
@@ -322,7 +348,7 @@ class Rig:
 
 
 def _last_words(far_end: subprocess.Popen[bytes]) -> Seen:
-    """End the far end, and return the data that it recorded."""
+    """End the process of the far end, and return the data that it recorded."""
     assert far_end.stdin is not None
     assert far_end.stdout is not None
     far_end.stdin.close()

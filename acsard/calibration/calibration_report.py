@@ -40,28 +40,37 @@ class Refusal(Struct, frozen=True):
 class Report(Struct, frozen=True):
     """The object that `--json` prints.
 
-    An error `..._before` is that with the configured multipliers, and `..._after` that with the new
-    ones, measured on parts of the log that the fit did not use. It is None if nothing measures it.
+    A field `..._error_before` has the error with the configured multipliers, and
+    `..._error_after` the error with the new multipliers. Both are measured on parts of the log that
+    the fit did not use. They are None if no sensor measures the error.
     """
 
     log: str
     reference: str
-    """Sensors that the wheels were compared with."""
+    """Sensors or tool that the wheels were compared with, in words."""
     scale: str
-    """Sensors that measured the wheels' size. If it is "", the mean radius stays as configured."""
+    """Sources of the wheels' size, in words. "" means that the mean radius stays as configured."""
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
     wheel_separation_multiplier_std: float | None
-    """Standard deviation; None, like the next two, for a quantity that stays as configured."""
+    """Standard deviation of the multiplier; None if the track stays as configured."""
     left_wheel_radius_multiplier_std: float | None
+    """Standard deviation of the multiplier; None if the ratio of the radii stays as configured."""
     right_wheel_radius_multiplier_std: float | None
+    """Standard deviation of the multiplier; None if the ratio of the radii stays as configured."""
     covariance: Sequence[Sequence[float]]
-    """Covariance of the three multipliers, in the order of the fields above."""
+    """Covariance of the multipliers of wheel separation, left radius and right radius."""
     odometry: dict[str, float]
-    """Settings of `[odometry]`: the deviations of the geometry and, if it is better, the noise."""
+    """New settings of `[odometry]` by name.
+
+    They are the standard deviations of the geometry and, if the noise is better, the noise.
+    """
     feedback: dict[str, float]
-    """Settings of `[feedback]` without which the daemon would take sound wheels for faulty."""
+    """New settings of `[feedback]` by name.
+
+    It is empty unless the daemon takes healthy wheels for faulty with the present settings.
+    """
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
@@ -71,6 +80,7 @@ class Report(Struct, frozen=True):
     left_wheel_radius: float
     """Radius of the left wheels, m."""
     right_wheel_radius: float
+    """Radius of the right wheels, m."""
     turn_error_before: float | None
     """Heading error after a turn of 360 deg, deg."""
     turn_error_after: float | None
@@ -78,23 +88,33 @@ class Report(Struct, frozen=True):
     """Heading error after 10 m straight ahead, deg."""
     straight_error_after: float | None
     heading_error_before: float | None
-    """Heading error over whole drives, deg rms."""
+    """RMS heading error over whole drives, deg."""
     heading_error_after: float | None
     position_error_before: float | None
-    """Position error over whole drives, m rms."""
+    """RMS position error over whole drives, m."""
     position_error_after: float | None
     heading_noise_before: float | None
-    """Uncertainty of the heading by noise after 10 m of such driving, deg, as configured.
+    """Standard deviation of the heading, deg, after 10 m of such driving, by the configured noise.
 
-    It is None, like the next three, if the noise of `[odometry]` stays as configured, or if no
-    sensor shows it.
+    It is None if the noise settings of `[odometry]` stay as configured.
     """
     heading_noise_after: float | None
+    """Standard deviation of the heading, deg, after 10 m of such driving, by the new noise.
+
+    It is None if the noise settings of `[odometry]` stay as configured.
+    """
     distance_noise_before: float | None
-    """Uncertainty of the distance by noise after 10 m, m, as configured."""
+    """Standard deviation of the distance, m, after 10 m of such driving, by the configured noise.
+
+    It is None if the noise settings stay as configured, or if the log has no positions.
+    """
     distance_noise_after: float | None
+    """Standard deviation of the distance, m, after 10 m of such driving, by the new noise.
+
+    It is None if the noise settings stay as configured, or if the log has no positions.
+    """
     time_offsets: dict[str, float]
-    """Delay of each sensor behind the wheels, s."""
+    """Delay of each sensor behind the wheels, s, by the name of the sensor."""
     gyro_bias: float
     """Gyro bias, rad/s."""
     runs: int
@@ -106,15 +126,20 @@ class Report(Struct, frozen=True):
     kept: Sequence[str]
     """Quantities that stay as configured, because the log does not improve them, in words."""
     notes: Sequence[str]
+    """Sentences about the log that the user should know."""
     written: str | None
-    """File that contains the multipliers now, or None."""
+    """File to which the tool wrote the settings, or None."""
     refused: None = None
 
 
 def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
-    """Return the report of a calibration from a log, or from the guided drive of this name.
+    """Return the report of a calibration.
 
-    `written` is the name of the file that now contains the multipliers, or "".
+    Args:
+        log: the name of the log, or of the guided drive.
+        calibration: the calibration.
+        drive: the configured geometry.
+        written: the name of the file to which the tool wrote the settings, or "".
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()
@@ -149,7 +174,10 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the uncertainty of heading (deg) and distance (m) by the noise that is written."""
+    """Return the standard deviations of heading (deg) and distance (m) by noise.
+
+    They are `NOTHING` if the noise settings stay as configured.
+    """
     noise = calibration.noise
     if noise is None or not noise.better:
         return NOTHING, NOTHING
@@ -158,7 +186,7 @@ def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
-    """Return the standard deviation of each multiplier, or None for one that stays."""
+    """Return the standard deviation of each multiplier; None for one that stays as configured."""
     kept = TRACK in calibration.kept, RATIO in calibration.kept, RATIO in calibration.kept
     deviations = calibration.multipliers.std.tolist()
     return [None if stays else std for stays, std in zip(kept, deviations, strict=True)]

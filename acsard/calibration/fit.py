@@ -25,18 +25,19 @@ class P(IntEnum):
     """Indices of the parameters, which are an array of `COUNT` numbers."""
 
     LEFT = 0
-    """Radius of the left wheels, as a ratio to the configured wheel radius."""
+    """Ratio of the left wheels' radius to the configured wheel radius."""
     RIGHT = 1
+    """Ratio of the right wheels' radius to the configured wheel radius."""
     INVERSE_TRACK = 2
-    """Ratio of the wheel separation to the effective track. Turns are linear in it."""
+    """Ratio of the wheel separation to the effective track. Turns are linear in this ratio."""
     TRACK_GROWTH = 3
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     DELAY = 4
     """Delay of the positions behind the wheels, s."""
     SENSOR_X = 5
-    """Place on the robot whose positions are measured, m ahead."""
+    """Distance of the sensor of positions ahead of the robot's middle, m."""
     SENSOR_Y = 6
-    """The same place, m to the left."""
+    """Distance of the sensor of positions to the left of the robot's middle, m."""
     BIAS_ERROR = 7
     """Error of the gyro's bias, rad/s."""
     SCALE_ERROR = 8
@@ -46,11 +47,11 @@ class P(IntEnum):
 COUNT = len(P)
 
 HUBER = 2.0
-"""Size of a residual, in usual sizes, above which its weight falls (Huber's weight)."""
+"""Ratio of a residual to the usual size above which the weight of the residual falls (Huber)."""
 
 
 class Base(Struct, frozen=True):
-    """The configured geometry, which the parameters are relative to. Lengths are in m."""
+    """The configured geometry, to which the parameters are relative. Lengths are in m."""
 
     radius: float
     separation: float
@@ -86,8 +87,9 @@ class Base(Struct, frozen=True):
 class Evidence(Struct, frozen=True):
     """The weighted normal equations of one sensor, block by block.
 
-    With Jacobian J (derivatives of the predictions with respect to the parameters), residuals r and
-    weights W: `normal` is J^T W J, and `score` is J^T W r. `fit` gives each sensor its noise.
+    Let J be the Jacobian (the derivatives of the predictions with respect to the parameters), r the
+    residuals and W their weights. Then `normal` is J^T W J, and `score` is J^T W r. `fit` divides
+    both by the noise variance of the sensor.
     """
 
     normal: Floats
@@ -119,7 +121,10 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number apart from units. It is infinite if a parameter is missing."""
+    """Return the condition number of normal equations, independent of the parameters' units.
+
+    It is infinite if the equations do not contain one of the parameters.
+    """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
         return np.inf
@@ -129,7 +134,7 @@ def condition(normal: Floats) -> float:
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
     """Return Huber's weight of each residual: 1 for a usual one, and less for an outlier.
 
-    The usual size is the standard deviation that the median suggests, and at least `least`.
+    The usual size is the standard deviation estimated from the median, but at least `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
@@ -141,29 +146,44 @@ Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Size of a step that ends the fit, and size below which the last step counts as converged."""
+"""Limits for the change of radii and track in a step.
+
+A step below `SMALL` ends the fit. The fit has converged if its last step is below `SETTLED`.
+"""
 
 USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
-"""Prior standard deviations of the parameters that a log may not determine, in their units."""
+"""Prior standard deviations of parameters that a log may not determine, in their own units."""
 
 GYRO_SCALE = 0.005
-"""Prior standard deviation of a MEMS gyro's scale, a fraction. Only positions show this error."""
+"""Prior standard deviation of a MEMS gyro's scale, as a fraction.
+
+Only a comparison with positions shows the error of the scale.
+"""
 
 HELD = 1e9
-"""Weight that holds a combination of parameters: the mean radius if no sensor measures it."""
+"""Weight in the normal equations of a constraint (`Held`), large enough to hold it.
+
+For example, a constraint holds the mean radius if no sensor measures it.
+"""
 
 Held = tuple[Floats, float]
-"""Weights of the parameters, shape (COUNT,), and the value at which their weighted sum is held."""
+"""Constraint of a fit: it holds a weighted sum of the parameters at a value.
+
+The weights of the parameters, shape (COUNT,), come first, and then the value.
+"""
 
 MANY = 16
-"""Number of blocks from which on the jackknife also leaves out pairs of neighbouring blocks."""
+"""Minimum number of blocks for a jackknife that also leaves out pairs of neighbouring blocks."""
 
 LEAST_BLOCKS = 5
-"""Smallest number of blocks. Fewer do not show how much blocks differ."""
+"""Minimum number of blocks. Fewer blocks do not show how much blocks differ."""
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t for at least 3 degrees of freedom; at 2 it is infinite."""
+    """Return the variance of Student's t for `free` degrees of freedom.
+
+    Fewer than 3 degrees of freedom are taken as 3, because the variance is infinite at 2.
+    """
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
 
@@ -185,17 +205,20 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters of a fit without the blocks of this mask, by one linear step."""
+        """Return the parameters without the evidence of the blocks in this mask.
+
+        They are computed from the fit to all blocks by one linear step.
+        """
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
         found[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
         return found
 
     def marginal(self) -> Floats:
-        """Return the normal equations of both radii and the track, other parameters eliminated.
+        """Return the normal equations of both radii and the inverse track.
 
-        If no sensor measures the mean radius, the result has two parameters: the difference of the
-        radii, and the inverse of the track.
+        All other parameters are eliminated. If no sensor measures the mean radius, the result has
+        only two parameters: the difference of the radii, and the inverse track.
         """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > P.INVERSE_TRACK]
@@ -208,7 +231,8 @@ class Fit(Struct, frozen=True):
     def covariance(self, runs: Sequence[int] = ()) -> Floats:
         """Return the covariance of the parameters by the jackknife and the prior assumptions.
 
-        `runs` has the number of the run of each block, if the log has several runs.
+        `runs` has the number of the run of each block. With at least `LEAST_BLOCKS` runs, the
+        jackknife also leaves out whole runs. () means that it does not.
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
@@ -229,9 +253,10 @@ class Fit(Struct, frozen=True):
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Return the changes of the parameters without each group of blocks, and their variances.
 
-        A variance is that of the jackknife, widened to that of Student's t. If a few groups cause
-        most of it, it has only that many degrees of freedom. Their number is the estimate of
-        Satterthwaite (An approximate distribution of estimates of variance components, 1946).
+        `group` has the number of the group of each block. The variances are those of the jackknife,
+        widened to those of Student's t. If a few groups cause most of a variance, it has only that
+        many degrees of freedom. Satterthwaite's estimate gives their number (An approximate
+        distribution of estimates of variance components, 1946).
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
@@ -249,11 +274,11 @@ def fit(
     """Return the fit of the parameters to the evidence of all sensors.
 
     Args:
-        sources: the sensors.
+        sources: the evidence of each sensor as a function of the parameters.
         start: the parameters to start from, which must be nearly right.
         places, gyro: whether positions and a gyro are among the sources.
-        bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not depend
-            on the bias.
+        bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not change
+            the bias.
         held: combinations of parameters that the fit does not change.
     """
     active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
@@ -272,9 +297,9 @@ def fit(
         known, prior = _known(parameters, held, usual)
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
-        # Far from the solution, take only a part of the step: the linearization holds only near its
-        # point. After a third of the steps, halve each step. Otherwise an outlier could count in
-        # every other step only, and the fit would not converge.
+        # Far from the solution, take only a part of the step, because the linearization holds only
+        # nearby. After a third of the steps, halve each step. Otherwise a residual could be an
+        # outlier in every other step only, and the fit would not converge.
         size = float(np.max(np.abs(step[: P.DELAY])))
         whole = 1.0 if at < MOST_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
@@ -315,7 +340,10 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[P, float]
 ) -> tuple[Floats, Floats]:
-    """Return the prior information at the present parameters as normal equations."""
+    """Return the normal equations of the prior information at these parameters.
+
+    `held` has the constraints, and `usual` the prior standard deviations.
+    """
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
@@ -327,6 +355,6 @@ def _known(
 
 
 def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
-    """Solve for the active parameters. All others keep their value."""
+    """Solve normal equations for the parameters with the indices `active`."""
     part = normal[np.ix_(active, active)]
     return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])

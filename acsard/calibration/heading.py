@@ -26,10 +26,13 @@ REST_S, EDGE_S = 0.6, 0.3
 """Shortest rest for the bias, and the margin at both ends in which the robot may shake, s."""
 
 TURNED_BY_HAND = 0.05
-"""Deviation from the usual bias, rad/s, above which a resting robot is being turned by hand."""
+"""Difference between a rest's bias and the usual one, rad/s, that shows a turn by hand.
+
+A rest with a larger difference is not used.
+"""
 
 LEAST_SAMPLES = 5
-"""Smallest number of gyro samples in a rest."""
+"""Minimum number of gyro samples in a rest."""
 
 OUTLIER = 6.0
 """Multiple of the median deviation above which a gyro sample at rest is left out."""
@@ -38,25 +41,29 @@ WALK = 5e-5
 """Smallest random walk of the gyro bias that is assumed, rad/s per square root of a second."""
 
 UNSEEN_WALK = 2e-4
-"""Random walk that is assumed if a single rest shows none, rad/s per square root of a second."""
+"""Random walk of the gyro bias that is assumed if no run has two rests.
+
+It is in rad/s per square root of a second.
+"""
 
 ROW_S = 1.0
-"""Approximate time over which turns are compared, s."""
+"""Approximate length of the intervals over which turns are compared, s."""
 
 GRID_S, FURTHEST_S = 0.02, 2.0
 """Step and range of the search for the sensor's delay, s."""
 
 DEGREES = 10.0
-"""Multiple of the wheels' turn above which a yaw is in degrees instead of radians."""
+"""Ratio of the turn by a yaw to that by the wheels above which the yaw must be in degrees."""
 
 
 class Heading(Struct, frozen=True):
     """The heading of a run as a sensor measures it, rad, at the sensor's own times."""
 
     t: Floats
+    """Times of the sensor's samples, s."""
     angle: Floats
     gaps: Floats
-    """Gaps of the samples, one row (begin, end) each, in s."""
+    """Gaps between the samples, one row (begin, end) each, in s."""
 
 
 class Headings(Struct, frozen=True):
@@ -69,9 +76,12 @@ class Headings(Struct, frozen=True):
     delay: float
     """Delay of the sensor's times behind those of the wheels for the same event, s."""
     bias: float
-    """Usual bias at rest, rad/s. The bias that was subtracted is interpolated between the rests."""
+    """Median of the gyro's bias in all rests, rad/s; 0 without a gyro.
+
+    The bias that was subtracted from the turn rates is interpolated between the rests instead.
+    """
     bias_unknown: bool
-    """Whether the robot never rested. The bias is then unknown, and the fit has to find it."""
+    """Whether the robot never rested. A comparison with the wheels then has to show the bias."""
     bias_std: float = 0.0
     """Standard deviation of the bias while the robot moves, rad/s.
 
@@ -80,10 +90,10 @@ class Headings(Struct, frozen=True):
 
 
 TURNING = 0.05
-"""Turn rate below which a row counts as straight, rad/s."""
+"""Turn rate up to which the robot is considered to drive straight, rad/s."""
 
 FASTEST = 0.95
-"""Fraction of the turned angle that was turned more slowly than `Rates.fastest`."""
+"""Fraction of the turned angle that the robot turned more slowly than `Rates.fastest`."""
 
 
 class Rows(Struct, frozen=True):
@@ -109,12 +119,16 @@ class Rates(Struct, frozen=True):
     """The turn rates of a log, rad/s."""
 
     mean: float
-    """Mean, weighted by the turned angle."""
+    """Mean turn rate, weighted by the turned angle."""
     fastest: float
+    """Rate below which the robot turned the fraction `FASTEST` of the angle."""
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
-    """Return the headings by yaw_rate, or None. Raises `LogError` if it never changes."""
+    """Return the headings by the column yaw_rate, or None if no run has it.
+
+    Raises `LogError` if the turn rate never changes.
+    """
     if not any(len(run.gyro) for run in driven):
         return None
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
@@ -183,11 +197,11 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return the mean without outliers, and the variance of this mean.
+    """Return the mean of the samples of a rest without outliers, and the variance of this mean.
 
     The variance comes from the means of five parts, so it is right for correlated noise as well.
-    The median would be wrong for a coarse gyro, because it is always one of the gyro's discrete
-    values.
+    The median of a coarse gyro would be wrong, because it is always one of the discrete values that
+    the gyro reports.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
@@ -202,7 +216,8 @@ def _mean(samples: Floats) -> tuple[float, float]:
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     """Return the standard deviation of the mean bias over all runs, rad/s.
 
-    Its causes are the noise in the rests and the random walk of the bias between the rests.
+    It is caused by the noise in the rests and by the random walk of the bias outside of them.
+    `seconds` has the length of each run, s.
     """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
@@ -229,8 +244,8 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    The turns of the wheels are the differences of both sides. If the sign of one side is wrong,
-    they are the sums, so both are tried.
+    `found` has the heading of each run by the sensor. The turns of the wheels are the differences
+    of both sides. If the sign of one side is wrong, they are the sums, so both are tried.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -257,7 +272,10 @@ def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Return the correlation for shifts from -reach to reach. At a positive one `later` lags."""
+    """Return the correlation of two series for shifts from -reach to reach samples.
+
+    A positive shift means that `later` lags behind `earlier`.
+    """
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
@@ -265,7 +283,11 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Return the rows of all blocks with samples of the sensor; of all blocks without a sensor."""
+    """Divide the blocks `parts` into rows of about `ROW_S` s, and return the motion in each row.
+
+    A row is left out if the heading sensor has no samples there. If `headings` is None, all rows
+    are returned.
+    """
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
@@ -290,7 +312,7 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of these rows; `by_wheels` has their turns from the wheels, rad."""
+    """Return the turn rates of a log. `by_wheels` has the turn of each row by the wheels, rad."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -304,7 +326,10 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def level(rows: Rows) -> Rows:
-    """Return the rows without their part proportional to time: an unknown constant gyro bias."""
+    """Subtract from the motion in the rows the part that is proportional to time.
+
+    An unknown constant gyro bias then has no effect on a comparison with the wheels.
+    """
     share = rows.seconds / float(rows.seconds @ rows.seconds)
     turned, left, right, fast = (
         column - rows.seconds * float(share @ column)
@@ -320,9 +345,10 @@ def _fast(run: Run) -> Floats:
 
 
 NOISE, SHARE = 0.01, 0.03
-"""Usual residual of a row: `NOISE` rad per second and the fraction `SHARE` of the turn.
+"""Usual residual of a row: `NOISE` rad per second, and the fraction `SHARE` of the turn.
 
-Both are added as squares. A row with a much larger residual is an outlier.
+The usual residual is the root of the sum of their squares. A row with a much larger residual is an
+outlier.
 """
 
 
@@ -359,12 +385,15 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
 
 
 def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
-    """Return the weight of each row. `by_wheels` is its turn according to the wheels, rad."""
+    """Return Huber's weight of each row. `by_wheels` has the turns according to the wheels, rad."""
     return huber(residual / np.hypot(NOISE * rows.seconds, SHARE * by_wheels), 1.0)
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the turn rate of the sensor minus that of the turns `by_wheels` (rad), rad/s."""
+    """Return the bias of the heading sensor, rad/s: its turn rate minus that of the wheels.
+
+    `by_wheels` has the turn of each row according to the wheels, rad.
+    """
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
     for _ in range(10):
@@ -374,9 +403,11 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 
 
 def first(rows: Rows, base: Base) -> Floats:
-    """Return g_l and g_r divided by `base.gain`, by robust least squares, without a start value.
+    """Return the factors of the left and of the right wheels that fit the sensor's turns best.
 
-    A negative one means that the sign of this side's wheels, or of the sensor, is wrong.
+    A factor is radius / effective track (g_l and g_r in the module's equation), divided by
+    `base.gain`. The robust least-squares fit needs no starting values. A negative factor means that
+    the sign of this side's wheels, or of the sensor, is wrong.
     """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))
@@ -390,5 +421,5 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the turn of each row by the wheels, rad, with the factors `sides` of `first`."""
+    """Return the turn of each row by the wheels, rad. `sides` has the two factors from `first`."""
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

@@ -1,8 +1,9 @@
-"""The improvement that a calibration brings, judged by whole drives that the fit did not use.
+"""The improvement that a calibration brings, measured on whole drives that the fit did not use.
 
 Each run is left out in turn, and the parameters that were found without it are tested on it. If the
-log has fewer than three runs, each fifth of the log counts as a run. The tool chooses between
-several fits by this error, and gives no values that are worse than the configured ones.
+log has fewer than three runs, each fifth of the log is left out instead. The tool chooses between
+several fits by the error in these tests. It gives no values that are worse than the configured
+ones.
 """
 
 from __future__ import annotations
@@ -22,65 +23,71 @@ from acsard.calibration.runs import Block, Mask, Run, cumulative
 
 FOLDS = 5
 LEAST_RUNS = 3
-"""Smallest number of runs for which whole runs are left out, not fifths of the log."""
+"""Minimum number of runs of a log. With fewer runs, parts of the log are left out, not runs."""
 
 STRAIGHT = 0.1
 """Largest curvature of a straight drive according to the wheels, rad/m."""
 
 STRAIGHT_M = 1.0
-"""Smallest sum of the straight drives for which their error is given, m.
+"""Minimum total length of the straight drives for which their error is given, m.
 
-From a few millimetres, the error after 10 m would be noise.
+An error after 10 m that is extrapolated from a few millimetres would be noise.
 """
 
 
 class BeforeAfter(Struct, frozen=True):
-    """An error with the configured and with the new multipliers; None if nothing measures it."""
+    """An error with the configured and with the new multipliers; None if no sensor measures it."""
 
     before: float | None
+    """The error with the configured multipliers."""
     after: float | None
+    """The error with the new multipliers."""
 
 
 NOTHING = BeforeAfter(None, None)
 
 SURE = 2.0
-"""Number of standard deviations by which a gain must exceed 0, as for a confidence of 95 %."""
+"""Number of standard deviations by which a sure gain exceeds 0, as for a confidence of 95 %."""
 
 HALVED = float(np.log(2.0))
-"""Gain that is sure whatever its standard deviation is.
+"""Gain that is always sure, whatever its standard deviation is: the error is halved.
 
-In a guided drive, a single leg may show nearly all of the error.
+In a guided drive, a single leg may show nearly all of the error, so the deviation is large.
 """
 
 NEAR, FAR = 2.0, 3.0
 """Distances of the new multipliers from the configured ones, in standard deviations.
 
-Below `NEAR` the log does not contradict the configured ones. Chance explains a distance beyond
-`FAR` in one log of thirty. Beyond it the necessary gain falls: it is half as large at twice `FAR`.
+Up to `NEAR`, the log does not contradict the configured multipliers. Chance causes a distance
+above `FAR` in one log of thirty. Above `FAR`, the necessary gain falls with the distance: at twice
+`FAR` it is half as large.
 """
 
 LEAST_SQUARE = 1e-9
-"""Sum of squares, m2 or deg2, that is added to both errors so that neither is 0."""
+"""Constant, m2 or deg2, that is added to both sums of squared errors so that neither is 0."""
 
 
 class Improvement(Struct, frozen=True):
-    """Odometry errors before, and after the calibration on data that the fit did not use."""
+    """Odometry errors before and after the calibration, on data that the fit did not use."""
 
     turn: BeforeAfter
     """Heading error after a turn of 360 deg, deg."""
     straight: BeforeAfter
     """Heading error after 10 m straight ahead, deg, by turns that the wheels do not show.
 
-    It is unknown if the straight drives are shorter than `STRAIGHT_M` in all.
+    It is None if the straight drives together are shorter than `STRAIGHT_M`.
     """
     heading: BeforeAfter
     """RMS error of the heading over whole drives, deg. Each drive is rotated to fit best."""
     place: BeforeAfter
     """RMS error of the position over whole drives, m. Each drive is shifted and rotated to fit."""
     gain: float = np.inf
-    """Logarithm of the error before over that after, of whole drives: heading plus position."""
+    """Logarithm of the ratio of the error before to the error after, over whole drives.
+
+    If the log has headings and positions, it is the sum of both logarithms.
+    """
     chance: float = 0.0
-    """Standard deviation of `gain` by the differences of the drives, as that of Student's t."""
+    """Standard deviation of `gain` by the differences between drives, widened as Student's t."""
     apart: float = FAR
     """Distance of the new multipliers from the configured ones, in standard deviations."""
 
@@ -95,10 +102,11 @@ UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
 
 
 class Fold(Struct, frozen=True):
-    """A drive that is left out, as a mask of blocks, and the parameters without these blocks."""
+    """A drive that is left out, and the parameters of a fit without it."""
 
     drive: Block
     blocks: Mask
+    """Mask of the blocks that the fit leaves out, because they overlap the drive."""
     parameters: Floats
 
 
@@ -123,7 +131,10 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 
 
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
-    """Return a fold for each drive that has blocks. It leaves out each block that it overlaps."""
+    """Return a fold for each drive of `left_out`, without the blocks `parts` that overlap it.
+
+    A drive that overlaps no block, or all of them, has no fold.
+    """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
     )
@@ -136,7 +147,10 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
-    """Return the parameters with the track of the mean turn rate for all, like the odometry."""
+    """Return the parameters with one track for all turn rates: that at the mean turn rate.
+
+    The odometry also uses one track for all turn rates.
+    """
     fixed = parameters.copy()
     fixed[P.INVERSE_TRACK] *= 1.0 - fixed[P.TRACK_GROWTH] * rate.mean
     fixed[P.TRACK_GROWTH] = 0.0
@@ -153,7 +167,7 @@ def improvement(
         held: the folds of the fit.
         configured: the parameters with the configured multipliers.
         base: the configured geometry.
-        rows: the log's rows, with the turns that the heading sensor measured; 0 without a sensor.
+        rows: the log's rows, with the turns by the heading sensor. Without a sensor they are 0.
         places: for each fold, the measured positions of the drive that it left out.
         steps: the wheel steps of each run.
     """
@@ -186,7 +200,10 @@ def improvement(
 
 
 def rms(sums: Floats) -> BeforeAfter:
-    """Return the errors of these sums of squares before and after, and their number."""
+    """Return the RMS errors before and after.
+
+    `sums` has the sum of squares before, the sum of squares after, and the number of samples.
+    """
     before, after, count = sums.tolist()
     if not count:
         return NOTHING
@@ -194,7 +211,11 @@ def rms(sums: Floats) -> BeforeAfter:
 
 
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
-    """Return the errors for `unit` of these sums: errors before and after, and amount driven."""
+    """Return the errors before and after for a drive of the amount `unit`.
+
+    `sums` has the sum of errors before, the sum of errors after, and the amount that was driven.
+    The amount is an angle or a distance.
+    """
     before, after, amount = sums.tolist()
     if not amount:
         return NOTHING
@@ -204,8 +225,8 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     """Return `Improvement.gain` and `Improvement.chance`.
 
-    Each kind of error has the sums of squares before and after and the number of samples, one row
-    for each drive. The deviation is that of the jackknife over the drives.
+    `kinds` has one array for each kind of error, with a row for each drive: the sum of squares
+    before, the sum of squares after, and the number of samples.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -219,9 +240,10 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 
 
 def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
-    """Return the gain of these drives, and its standard deviation by the jackknife over them.
+    """Return the gain of the drives in a mask, and its standard deviation.
 
-    `gain` is a function of the drives that are used.
+    `gain` computes the gain of the drives in a mask. The standard deviation is that of the
+    jackknife over the drives. It is infinite for a single drive.
     """
     count = int(drives.sum())
     if count == 1:
@@ -234,13 +256,19 @@ def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, flo
 def _by_group(
     before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
 ) -> Floats:
-    """Return the sums of the absolute errors of the groups, before and after, and `amount`."""
+    """Return the sum of the groups' absolute errors before, that after, and `amount`.
+
+    The error of a group is the sum over its rows. Only the rows in the mask `among` are used.
+    """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
 
 
 def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
-    """Return the sums of squared errors before and after, deg2, and their number, by drive."""
+    """Return the sums of squared heading errors before and after, deg2, and their number.
+
+    The result has a row for each fold. `before` and `after` have the error of each row's turn, rad.
+    """
     found = np.zeros((len(held), 3))
     for number, fold in enumerate(held):
         out = fold.blocks[rows.block]
@@ -255,7 +283,10 @@ def _of_positions(
     held: Sequence[Fold], configured: Floats, base: Base,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Floats:  # fmt: skip
-    """Return the sums of squared errors before and after, m2, and their number, by drive."""
+    """Return the sums of squared position errors before and after, m2, and their number.
+
+    The result has a row for each fold.
+    """
     found = np.zeros((len(held), 3))
     present = [path(run, base, configured) for run in steps]
     for number, (fold, out) in enumerate(zip(held, places, strict=True)):

@@ -37,7 +37,7 @@ APPLIED = "applied_linear", "applied_angular"
 """Columns of the commanded twist, in m/s and rad/s."""
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
-"""Known units by column, as factors to s, m and rad. All other columns take the units `RATE`."""
+"""Factors from known units to SI, by column. Columns that are not listed have units of `RATE`."""
 
 SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad", APPLIED[0]: "m/s"}
 
@@ -57,7 +57,10 @@ def parted(cell: str) -> tuple[str, str]:
 
 
 def factor(name: str, unit: str) -> float | None:
-    """Return the factor from a unit of the column `name` to SI, or None if it is unknown."""
+    """Return the factor from a unit of the column `name` to SI, or None for an unknown unit.
+
+    If `unit` is "", the column is in SI units.
+    """
     known = UNITS.get(name, RATE)
     return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
 
@@ -68,25 +71,29 @@ WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Sizes above which a value is impossible, in rad/s, s, rad or m.
+"""Absolute values above which a value is impossible, in the SI unit of its column.
 
-Values in degrees and nanoseconds stay below them, so that later checks can name the wrong unit.
+`BOUNDS` has them by column, and `PLACE_BOUND` is for all other columns. Values in degrees and
+nanoseconds stay below these bounds, so that later checks can name the wrong unit.
 """
 
 RATES = frozenset((*WHEELS, "yaw_rate"))
 """Columns in which spikes are removed."""
 
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
-"""Definition of a spike, which is a number that was recorded wrongly.
+"""Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as both neighbours and as the usual rate. Of the rates
-above `SLOW` rad/s, only the fraction `FEW_VALUES` exceeds the usual rate. A robot that rarely moves
-can exceed the usual rate as much, but not in a single sample.
+A spike is more than `SPIKE` times as large as each of its neighbours and as the usual rate. Only
+the fraction `FEW_VALUES` of the rates above `SLOW` rad/s exceeds the usual rate. A robot that
+rarely moves can also exceed the usual rate by this factor, but not in a single sample.
 """
 
 
 def bounded(columns: dict[str, Floats]) -> Iterator[str]:
-    """Replace impossible values by NaN in place, and yield a sentence for each changed column."""
+    """Replace impossible values by NaN in place, and yield a sentence for each changed column.
+
+    `columns` has the columns of the log by name, in SI units.
+    """
     order = np.argsort(columns["t"], kind="stable")
     for name, values in columns.items():
         with np.errstate(invalid="ignore"):
@@ -119,7 +126,10 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values far above `usual` and above both neighbours that are not NaN."""
+    """Return a mask of the values that are far above `usual` and far above both neighbours.
+
+    The neighbours of a value are the nearest values that are not NaN.
+    """
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)
@@ -129,7 +139,7 @@ def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
 
 
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
-"""Columns of wheel speeds in rad/s: of each wheel, or the mean of each side."""
+"""Columns of wheel speeds, rad/s. `FOUR` are those of each wheel, `TWO` the means of each side."""
 
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED)
 COLUMNS = (*NUMBERS, "run")
@@ -139,16 +149,19 @@ MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a"
 """Contents of a cell without a value, in lower case."""
 
 COUNTS = re.compile(r"tick|count|(?:^|_)enc")
-"""Pattern of the names of columns with encoder counts, which no renaming makes speeds."""
+"""Pattern for names of columns with encoder counts. To rename such a column is no remedy."""
 
 COMMENTS = ("#", "%")
 """First characters of the comment lines above the table."""
 
 BEHIND = re.compile(r"(?:^|\s)#")
-"""Pattern for the begin of a comment after a number. It does not match "1.#QNAN"."""
+"""Pattern for the start of a comment after a number. It does not match "1.#QNAN"."""
 
 FEW, SHARE = 3, 0.01
-"""Largest number of unreadable rows, and largest fraction of all rows; the larger limit counts."""
+"""Limits for unreadable rows: a number of rows, and a fraction of the readable rows.
+
+The larger limit applies. A file with more unreadable rows is refused.
+"""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
@@ -183,9 +196,10 @@ class Table(Struct, frozen=True):
 
     @classmethod
     def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
-        """Return the table of one run in which each sample of each sensor is a row, by time.
+        """Return the table of one run. Each sample of each sensor is a row.
 
-        Each sensor has the column "t", and columns of its own.
+        The rows are sorted by time. Each of `sensors` has its columns by name: "t", and columns
+        that no other sensor has.
         """
         ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
         columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
@@ -198,7 +212,7 @@ class Table(Struct, frozen=True):
 
 
 def read(data: bytes) -> Table:
-    """Return the table in the bytes of a CSV file. Raises `LogError`."""
+    """Parse the bytes of a CSV file. Raises `LogError` if the file cannot be used."""
     lines = _text(data).splitlines()
     number, header, separator = _header(lines)
     names = _columns([name for name, _ in header], number)
@@ -303,7 +317,7 @@ def _columns(header: list[str], number: int) -> list[str]:
 
 
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
-    """Return a hint to the column of the header that may be one of `names`, or ""."""
+    """Return a hint to a column of `header` that may be meant by one of `names`, or ""."""
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (is {times[0][:40]} it? rename it t, in s)"

@@ -22,18 +22,18 @@ SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
 
 
 SAME = 1e-4
-"""Difference of two multipliers that means nothing."""
+"""Difference between two multipliers that is too small to matter."""
 
 
 class Deviations(Struct, frozen=True):
     """Standard deviations of the geometry, as fractions."""
 
     track: float
-    """That of the effective track, compared with the mean radius."""
+    """Relative standard deviation of the ratio of effective track to mean radius."""
     ratio: float
-    """That of the ratio of both radii."""
+    """Relative standard deviation of the ratio of both radii."""
     scale: float
-    """That of the mean radius, to which all distances are proportional."""
+    """Relative standard deviation of the mean radius, to which all distances are proportional."""
 
     @classmethod
     def of(cls, odometry: OdometryConfig, base: Base) -> Deviations:
@@ -53,6 +53,7 @@ class Multipliers(Struct, frozen=True):
     """The multipliers of wheel separation, left and right wheel radius, and their covariance."""
 
     values: Floats
+    """The multipliers in the order of `SEPARATION`, `LEFT_RADIUS` and `RIGHT_RADIUS`."""
     covariance: Floats
 
     @property
@@ -67,15 +68,15 @@ class Multipliers(Struct, frozen=True):
     def apart(self, base: Base) -> float:
         """Return how far these multipliers are from the configured ones, in standard deviations.
 
-        A combination that no sensor measures is equal in both.
+        A combination of multipliers that no sensor measures is equal in both, and adds nothing.
         """
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
 
     def own(self) -> Deviations:
-        """Return the standard deviations that the settings of `[odometry]` declare.
+        """Return the standard deviations of these multipliers as `[odometry]` declares them.
 
-        The odometry treats them as independent.
+        The odometry treats the three deviations as independent.
         """
         shares = self.covariance / np.outer(self.values, self.values)
         rows = np.array([[1.0, -0.5, -0.5], [0.0, -1.0, 1.0], [0.0, 0.5, 0.5]])
@@ -83,16 +84,16 @@ class Multipliers(Struct, frozen=True):
 
 
 def configured(base: Base) -> Multipliers:
-    """Return the configured multipliers, with a covariance of zero because it is unknown."""
+    """Return the configured multipliers. Their covariance is unknown, and is given as zero."""
     return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
 
 
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that fit best at the turn rates of the log.
 
-    `parameters` and `covariance` are those of a fit. The variance of the track is that of the best
-    constant track there. The turns that skid more or less than usual belong to the noise of the
-    odometry.
+    `parameters` and `covariance` are those of a fit, and `rate` has the turn rates of the log. The
+    variance of the track is that of the constant track that is best at these rates. It does not
+    include that some turns skid more than others: this belongs to the noise of the odometry.
     """
     inverse, growth = parameters[P.INVERSE_TRACK], parameters[P.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -105,7 +106,10 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
 
 
 TAPE_M = 0.01
-"""Standard deviation of a distance by tape, m. It includes the choice of the point on the robot."""
+"""Standard deviation of a distance by tape, m.
+
+It includes the error with which a person chooses the point on the robot.
+"""
 
 UNKNOWN = 1.0
 """Standard deviation of the logarithm of the scale if no sensor has measured the scale."""
@@ -114,11 +118,11 @@ LEAST_M = 0.5
 """Shortest distance between start and end of a run, m, that a tape may measure."""
 
 STRAIGHT = 0.8
-"""Smallest straightness of a run, as in `Extent.straight`."""
+"""Minimum of `Extent.straight` for a run that a tape may measure."""
 
 
 class Tape(Struct, frozen=True):
-    """A measured straight-line distance from the start to the end of a run."""
+    """A straight-line distance from the start to the end of a run, measured by tape."""
 
     metres: float
     run: str = ""
@@ -135,22 +139,36 @@ class Extent(Struct, frozen=True):
 
     @property
     def straight(self) -> float:
-        """Distance divided by length: 1 for a straight line, 0 for at most `LEAST_M`."""
+        """Distance divided by length, 1 for a straight line; 0 for a distance up to `LEAST_M`."""
         return self.distance / self.length if self.distance > LEAST_M else 0.0
 
 
 Follow = Callable[[Floats, int], Extent]
-"""Function from multipliers (as in `Multipliers.values`) and a run's number to its extent."""
+"""Function that returns the extent of a run.
+
+Its arguments are multipliers, as in `Multipliers.values`, and the number of the run.
+"""
 
 
 def scaled(
     found: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
 ) -> tuple[Multipliers, str]:
-    """Return the corrected multipliers, and the name of the run that the distance belongs to.
+    """Correct the multipliers by a distance that was measured by tape.
 
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
-    `names` has the names of the runs. `known` says that positions have already measured the scale.
-    Raises `RefusedError` if the log has no such run, or the run is not straight enough.
+
+    Args:
+        found: the multipliers before the correction.
+        tape: the distance.
+        names: the names of the runs.
+        follow: the function that computes the extent of a run.
+        known: whether positions have already measured the scale.
+
+    Returns:
+        The corrected multipliers, and the name of the run that the distance belongs to.
+
+    Raises:
+        RefusedError: the log has no such run, or the run is not straight enough.
     """
     if tape.run and tape.run not in names:
         raise RefusedError(
@@ -166,7 +184,8 @@ def scaled(
             f"{extent.length:.2f} m: drive straight ahead for 2 m or more in a separate run, and "
             "measure from start to end"
         )
-    # Derivatives of the logarithm of the distance with respect to those of the multipliers.
+    # Derivatives of the logarithm of the distance with respect to the logarithms of the
+    # multipliers.
     jacobian = np.zeros(3)
     for index in (SEPARATION, LEFT_RADIUS, RIGHT_RADIUS):
         longer = found.values.copy()

@@ -1,17 +1,20 @@
 """Fits the noise of `[odometry]` to drives that the fit of the geometry did not use.
 
 A window is about half a minute of a drive. Its residuals are the headings or the positions of a
-sensor minus those of the wheels, at times that lie seconds apart. An error that lasts for a turn,
-like that of a track that changes with the turn rate, thus counts as much as over a whole drive. The
-residuals are modelled as normal with mean 0. Their covariance is linear in the noise (`Source`, x
-below), with a matrix C_i for each source of errors, and K for the known errors of the geometry:
+sensor minus those of the wheels, at times that lie seconds apart. So an error that lasts for a
+whole turn has the same effect as over a whole drive. For example, a track that changes with the
+turn rate causes such an error.
+
+The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
+has one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is the
+covariance that the known uncertainty of the geometry causes:
 
     V = K + sum over i of x_i C_i
 
-The start of the window, and its heading if only positions are measured, are unknown and are
-projected out (restricted maximum likelihood: Patterson & Thompson, Biometrika 58, 1971). The steps
-of Zhou, Hu, Qiao, Cho & Zhou (MM Algorithms for Variance Components Models, 2019) find x. The sums
-are over the windows, and no x_i becomes negative:
+The pose at the start of the window is unknown and is projected out (restricted maximum likelihood:
+Patterson & Thompson, Biometrika 58, 1971). The iteration of Zhou, Hu, Qiao, Cho & Zhou (MM
+Algorithms for Variance Components Models, 2019) finds x. Its sums are over the windows, and it
+keeps each x_i from becoming negative:
 
     x_i <- x_i sqrt(sum of r' V^-1 C_i V^-1 r / sum of tr(V^-1 C_i))
 """
@@ -38,7 +41,7 @@ from acsard.core.config.settings import OdometryConfig
 
 
 class Source(IntEnum):
-    """Indices of the noise by its source. Up to `TRACK` it is the robot's, then the sensors'."""
+    """Indices of the sources of noise. The robot causes those up to `TRACK`, sensors the others."""
 
     DISTANCE = 0
     """Variance of the distance per metre, m."""
@@ -47,11 +50,11 @@ class Source(IntEnum):
     SKID = 2
     """Variance of the heading per radian turned, rad."""
     SLIP = 3
-    """Square of the share of each distance that is lost for a whole window."""
+    """Variance of the fraction of the distance that is lost. It is constant within a window."""
     RATIO = 4
-    """Square of the ratio of both radii, as it changes from window to window."""
+    """Relative variance of the ratio of both radii. The ratio is constant within a window."""
     TRACK = 5
-    """Square of the share by which the track changes from window to window."""
+    """Relative variance of the effective track. The track is constant within a window."""
     HEADING = 6
     """Variance of a measured heading, rad2."""
     DRIFT = 7
@@ -64,91 +67,98 @@ COUNT = len(Source)
 SENSORS = np.arange(COUNT) > Source.TRACK
 RATES = np.arange(COUNT) < Source.SLIP
 START = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
-"""Noise from which the search starts. It only has to be positive."""
+"""Noise, by `Source`, from which the search starts. The numbers only have to be positive."""
 
 WINDOW_S, APART_S = 32.0, 4.0
 """Length of a window and time between its residuals, s. A shorter drive is one window."""
 
 LEAST = 4
-"""Smallest number of times in a window."""
+"""Minimum number of intervals between the residuals of a window."""
 
 MOST_WINDOWS = 80
-"""Number of windows that are enough, spread over the log."""
+"""Largest number of windows that are used. A longer log contributes every n-th of its windows."""
 
 FINE_S = 0.5
-"""Length of the steps in which the errors arise, s."""
+"""Length of the steps into which the motion of a window is divided, s.
+
+The errors of different steps are independent, except those of `SLIP`, `RATIO` and `TRACK`.
+"""
 
 MOST_FOLDS = 10
-"""Number of groups of drives of which each is left out once. Each costs two searches."""
+"""Largest number of groups of drives. Each group is left out once, which costs two searches."""
 
 STEPS, FEWER_STEPS = 150, 60
-"""Number of steps of a search, and of one that starts from the noise of the whole log."""
+"""Number of steps of a search, and of a search that starts from the noise of the whole log."""
 
 OUTLIER = 9.0
-"""Mean square of a window's residuals, in variances, beyond which the window counts less."""
+"""Mean square of a window's normalized residuals above which the window has a smaller weight."""
 
 ROUNDING = 1e-12
-"""Variance that is added to each residual, so that a perfect sensor has a covariance."""
+"""Variance that is added to each residual, so that a perfect sensor has a regular covariance."""
 
 FLOOR = 0.25
-"""Smallest variance rate that is given, in its own standard deviations.
+"""Minimum of each variance rate in the result, as a multiple of the rate's standard deviation.
 
-A log of a minute often explains everything by the geometry and leaves a rate of 0. The covariance
-of the pose would then claim that some directions have no error at all.
+In a log of a minute, the geometry often explains all errors, and the fit finds a rate of 0. The
+covariance of the pose would then claim that some directions have no error at all.
 """
 
 CHANGES = 0.1
-"""Smallest variance rate, as a fraction of the one that would replace the noise that lasts.
+"""Minimum of each variance rate, as a fraction of a rate with the effect of lasting noise.
 
-No window shows how long an error lasts beyond its end. Without this rate, one robot of eight had a
-covariance without width.
+`Windows.lasting` has the factor from lasting noise (`SLIP`, `RATIO` and `TRACK`) to that rate. A
+window does not show how long an error lasts beyond the window's end. Without this minimum, the pose
+covariance of one robot in eight had no width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
-"""Gain that is sure whatever its standard deviation is.
+"""Gain of log likelihood per residual that is significant whatever its standard deviation is.
 
-A residual loses this likelihood if its stated standard deviation is twice the true one.
+A residual whose stated standard deviation is twice the true one loses this much.
 """
 
 MOST = 1.0
-"""Largest setting that is given. The configuration accepts it for a rate and for a deviation."""
+"""Largest value of a setting in the result. The configuration accepts it for each setting."""
 
 METRES = 10.0
-"""Distance for which the uncertainty is reported, m."""
+"""Distance for which the uncertainty by noise is reported, m."""
 
 
 class Windows(Struct, frozen=True):
-    """Windows with n residuals each. Smaller ones are filled up with residuals without effect."""
+    """Windows with n residuals each. A smaller window is padded with residuals without effect."""
 
     drive: npt.NDArray[np.int64]
     """Number of the drive of each window."""
     size: Floats
-    """Number of true residuals of each window."""
+    """Number of residuals of each window, without the padding."""
     residual: Floats
-    """Residuals without the start of the window, shape (windows, n)."""
+    """Residuals after the unknown start pose was projected out, shape (windows, n)."""
     effects: Floats
-    """The matrices C_i, shape (windows, COUNT, n, n)."""
+    """Covariance of the residuals by noise of 1 of each source, shape (windows, COUNT, n, n)."""
     known: Floats
-    """The matrix K, shape (windows, n, n)."""
+    """Covariance of the residuals by the known uncertainties, shape (windows, n, n)."""
     lasting: Floats
-    """Rate of `DISTANCE`, `YAW` and `SKID` that has the effect of lasting noise over a window.
+    """Factors from lasting noise to a variance rate with the same effect over a mean window.
 
-    These are the ratios to `SLIP`, `RATIO` and `TRACK` in a mean window.
+    They convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad).
     """
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
-        """Return some of the windows."""
+        """Return the windows that `chosen`, a mask or an array of indices, selects."""
         return Windows(
             self.drive[chosen], self.size[chosen], self.residual[chosen], self.effects[chosen],
             self.known[chosen], self.lasting,
         )  # fmt: skip
 
     def covariance(self, noise: Floats) -> Floats:
-        """Return the covariance matrix of the residuals of each window, for this noise."""
+        """Return the covariance of the residuals, shape (windows, n, n), for noise by `Source`."""
         return np.asarray(np.tensordot(self.effects, noise, (1, 0)) + self.known)
 
     def search(self, start: Floats, free: Mask, steps: int = STEPS) -> Floats:
-        """Return the noise that explains the windows best. Noise that is not `free` stays."""
+        """Return the noise with the greatest likelihood, found in `steps` steps from `start`.
+
+        Sources outside the mask `free` keep the noise of `start`.
+        """
         noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(COUNT, -1)
         for _ in range(steps):
             inverse = np.linalg.inv(self.covariance(noise))
@@ -162,10 +172,11 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return the noise for another drive, with rates of at least `FLOOR` and `CHANGES`.
+        """Return the noise for other drives, with rates of at least the minimum.
 
-        Noise that a few residuals show is widened like the variance of Student's t. Windows overlap
-        by half, so each residual counts half.
+        `FLOOR` and `CHANGES` define the minimum. If only a few residuals show a rate, the rate is
+        widened like the variance of Student's t. Windows overlap by half, so each residual counts
+        as half a degree of freedom.
         """
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
@@ -178,7 +189,7 @@ class Windows(Struct, frozen=True):
         return np.asarray(np.maximum(noise, least))
 
     def likelihood(self, noise: Floats) -> Floats:
-        """Return the logarithm of the likelihood of each window, without its constant."""
+        """Return the log likelihood of each window for this noise, without its constant term."""
         covariance = self.covariance(noise)
         solved = np.linalg.solve(covariance, self.residual[:, :, None])[:, :, 0]
         squares = np.einsum("wi,wi->w", solved, self.residual)
@@ -187,17 +198,21 @@ class Windows(Struct, frozen=True):
 
 
 class Noise(Struct, frozen=True):
-    """The noise of the odometry as a log shows it, and whether it describes other drives better."""
+    """The noise of the odometry that a log shows, compared with the configured noise."""
 
     found: Floats
+    """The noise that the log shows, by `Source`."""
     present: Floats
-    """The configured noise."""
+    """The configured noise of the robot, by `Source`."""
     gain: float
-    """Gain of likelihood of a residual in drives that the fit did not use, as a logarithm."""
+    """Gain of log likelihood per residual of the found over the configured noise.
+
+    It is measured on drives that the fit did not use.
+    """
     chance: float
-    """Standard deviation of `gain` by the differences of the drives, as that of Student's t."""
+    """Standard deviation of `gain` by the differences between drives, widened as Student's t."""
     places: bool
-    """Whether positions show the noise of the distance."""
+    """Whether the log has positions. Without them, it does not show the noise of the distance."""
     turning: float
     """Turn per metre in this log, rad/m."""
     track: float
@@ -205,15 +220,21 @@ class Noise(Struct, frozen=True):
 
     @property
     def better(self) -> bool:
-        """Whether the noise describes other drives better by more than chance explains."""
+        """Whether the found noise describes other drives better by more than chance explains."""
         return self.gain > min(SURE * self.chance, TWICE)
 
     def heading(self) -> tuple[float, float]:
-        """Return the uncertainty of the heading by noise after `METRES`, rad, now and then."""
+        """Return the heading's standard deviation by noise after `METRES`, rad.
+
+        The first one is by the configured noise, and the second one by the found noise.
+        """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the uncertainty of the distance by noise after `METRES`, m, now and then."""
+        """Return the distance's standard deviation by noise after `METRES`, m.
+
+        The first one is by the configured noise, and the second one by the found noise.
+        """
         return self._after(Source.DISTANCE, Source.SLIP, None)
 
     def _after(self, rate: Source, lasting: Source, skid: Source | None) -> tuple[float, float]:
@@ -236,9 +257,9 @@ def settings(
     Args:
         known: the standard deviations of the new geometry.
         track: the new multiplier of the wheel separation.
-        kept: the quantities that stay as configured. Their deviations stay too.
+        kept: the quantities that stay as configured, `TRACK` or `RATIO` of `plausibility`.
         odometry: the present settings.
-        shown: the noise, or None if it stays as configured.
+        shown: the noise that the log shows, or None if the noise stays as configured.
         scaled: whether the size of the wheels was measured.
     """
     found, x = {}, np.zeros(COUNT) if shown is None else shown.found
@@ -247,7 +268,7 @@ def settings(
         found["wheel_separation_multiplier_std"] = track * std
     if RATIO not in kept or shown is not None:
         found["wheel_radius_ratio_std"] = math.hypot(known.ratio, math.sqrt(x[Source.RATIO]))
-        # The ratio's deviation takes the place of these two.
+        # The deviation of the ratio of both radii replaces those of the single radii.
         for side in ("left_wheel_radius_multiplier_std", "right_wheel_radius_multiplier_std"):
             if getattr(odometry, side):
                 found[side] = 0.0
@@ -267,22 +288,25 @@ class Reference(Struct, frozen=True):
 
     runs: Sequence[Run]
     headings: Headings | None
+    """The headings by a sensor; None if the log has none."""
     places: bool
+    """Whether the log has positions."""
     steps: Sequence[WheelSteps]
     """The wheel steps of each run."""
     base: Base
     parameters: Floats
+    """The parameters of the fit. Those from `P.DELAY` on describe the sensors."""
 
 
 def noise(
     held: Sequence[Fold], seen: Reference, known: Deviations, odometry: OdometryConfig
 ) -> Noise | None:
-    """Return the noise, or None if the log has too few drives or windows.
+    """Return the noise that a log shows, or None if fewer than two drives have windows.
 
     Args:
-        held: the drives, with the parameters that were found without them.
+        held: the drives, each with the parameters that were found without it.
         seen: the sensors.
-        known: the standard deviations of these parameters.
+        known: the standard deviations of the geometry in these parameters.
         odometry: the present settings.
     """
     motions: list[_Motion] = []
@@ -325,11 +349,13 @@ class _Motion(Struct, frozen=True):
     distance: Floats
     """Distance of each step, m."""
     turn: Floats
+    """Turn of each step, rad."""
     track: float
+    """Effective track, m."""
 
     @property
     def metres(self) -> float:
-        """Distance ahead and back, m."""
+        """Sum of the distances ahead and back, m."""
         return float(np.abs(self.distance).sum())
 
     @property
@@ -339,7 +365,7 @@ class _Motion(Struct, frozen=True):
 
     @classmethod
     def of(cls, t: Floats, way: Path, track: float) -> _Motion:
-        """Return the motion between these times."""
+        """Return the motion along the path `way` from the first to the last of the times `t`."""
         count = max(1, round((t[-1] - t[0]) / FINE_S))
         edges = np.linspace(t[0], t[-1], count + 1)
         heading, place = np.interp(edges, way.t, way.heading), np.interp(edges, way.t, way.place)
@@ -353,19 +379,23 @@ class _Window(Struct, frozen=True):
 
     residual: Floats
     start: Floats
-    """Effects of the unknown start, shape (residuals, unknowns)."""
+    """Effects of the unknown start pose on the residuals, shape (residuals, unknowns)."""
     motion: _Motion
     along: Floats
     """Effect of an error of each step's distance, shape (residuals, steps)."""
     yaw: Floats
     """Effect of an error of each step's turn, shape (residuals, steps)."""
     sensor: dict[Source, Floats]
-    """The matrices C_i of the sensor's errors."""
+    """Covariance of the residuals by sensor noise of 1, by the source of the noise."""
     bias: Floats | float = 0.0
-    """Covariance of the residuals by the uncertainty of the gyro's bias."""
+    """Covariance of the residuals by the uncertainty of the gyro's bias; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
-        """Return the residuals, C_i and K without the unknown start."""
+        """Return the residuals, their covariance by source and their known covariance.
+
+        The unknown start pose is projected out of all three. The known covariance comes from the
+        deviations `known` of the geometry and from the gyro's bias.
+        """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
         effects = np.zeros((COUNT, len(self.residual), len(self.residual)))
@@ -390,7 +420,7 @@ class _Window(Struct, frozen=True):
 def _windows(
     held: Sequence[Fold], seen: Reference, known: Deviations, motions: list[_Motion]
 ) -> Windows | None:
-    """Return the windows of all drives, and add their motions to `motions`."""
+    """Return the windows of all drives, or None without windows. Add their motions to `motions`."""
     rows = []
     for number, fold in enumerate(held):
         for window in _of_drive(fold, seen):
@@ -439,7 +469,10 @@ def _of_drive(fold: Fold, seen: Reference) -> Iterator[_Window]:
 
 
 def _times(begin: float, end: float) -> Iterator[Floats]:
-    """Yield the times of the residuals of each window. Neighbouring windows overlap by half."""
+    """Yield the times, s, of the residuals of each window between `begin` and `end`.
+
+    Neighbouring windows overlap by half.
+    """
     whole = min(end - begin, WINDOW_S)
     if whole > 0.0:
         count = max(1, round(2 * (end - begin) / WINDOW_S) - 1)
@@ -451,7 +484,10 @@ def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
-    """Return the window of these times, at which the heading was measured at `at`."""
+    """Return the window of the residuals of the heading at the wheels' times `t`, s.
+
+    `at` has the same moments as times of the heading sensor, s. `way` is the path of the wheels.
+    """
     motion, since = _Motion.of(t, way, track), t - t[0]
     turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since
     residual = turned / (1 + parameters[P.SCALE_ERROR]) - np.interp(t, way.t, way.heading)
@@ -468,7 +504,11 @@ def _by_headings(
 def _by_places(
     t: Floats, at: Floats, place: Complexes, way: Path, track: float, parameters: Floats
 ) -> Iterator[_Window]:
-    """Yield the window of these positions, whose residuals are medians around the times `t`."""
+    """Yield the window of the positions `place` (x + iy, m), measured at the times `at`, s.
+
+    Each residual is the median over the positions that are nearest to one of the times `t`. If one
+    of these times has no position, no window is yielded. `way` is the path of the wheels.
+    """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))
     if np.bincount(group, minlength=len(t)).min() == 0:
@@ -494,5 +534,5 @@ def _by_places(
 
 
 def _both(places: Complexes) -> Floats:
-    """Return both coordinates of each place, first all of x."""
+    """Return the x coordinates of all places, and then their y coordinates."""
     return np.concatenate((places.real, places.imag))

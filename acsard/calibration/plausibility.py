@@ -24,12 +24,15 @@ LEAST_ANGLE = 2 * np.pi
 """Smallest total turn of the robot, rad."""
 
 LEAST_ROLL = 3.0
-"""Smallest angle by which the wheels must roll in all, together and against each other, rad."""
+"""Minimum total angle of the wheels, rad.
+
+Both sides must roll this angle in the same direction, and this angle in opposite directions.
+"""
 
 ALIKE = 0.98
-"""Squared correlation of the mean and the difference of both sides at which a log is refused.
+"""Squared correlation of the mean and the difference of both sides above which a log is refused.
 
-Such a robot drives the same curve all the time.
+A robot with a higher correlation drives the same curve all the time.
 """
 
 WORST = 0.2, 0.03
@@ -44,25 +47,32 @@ DRIVE = (
 )
 
 UNLIKE = 0.5
-"""Largest fraction of the sum of a sensor's squared motions that the wheels may not explain."""
+"""Largest fraction of a sensor's sum of squares that the wheels may leave unexplained."""
 
 UNITS = 8.0
-"""Factor by which a result may be too large or too small. Beyond it, a unit must be wrong."""
+"""Largest factor by which a result may differ from the configuration.
+
+If it differs by more, a unit must be wrong.
+"""
 
 LEAST_TURN = 0.2
 """Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
 
-Even a robot that skids turns further. If it turns less, its wheel speeds are probably in rpm.
+Even a robot that skids turns further. If the ratio is smaller, the wheel speeds are probably in
+rpm.
 """
 
 FAR_SIZE = 2e-3
 """Ratio of the measured radius to the configured one below which the positions have a wrong unit.
 
-Between it and 1 / `UNITS`, the wheel speeds have a wrong unit.
+If the ratio is between `FAR_SIZE` and 1 / `UNITS`, the wheel speeds have a wrong unit.
 """
 
 FASTEST_TURN = 12.0
-"""Fastest credible turn rate, rad/s. No robot turns twice a second, so a higher one is in deg/s."""
+"""Fastest credible turn rate, rad/s. No robot turns twice in a second.
+
+A higher rate is in fact in deg/s.
+"""
 
 LEAST_CHI = 0.4
 """Smallest ratio of effective track to wheel separation.
@@ -74,19 +84,25 @@ LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
 """Range of multipliers that the configuration accepts."""
 
 NOTABLE_S, FAR_S = 0.005, 0.5
-"""Delay of a sensor, s, from which it is reported, and above which the advice is to set clocks."""
+"""Limits for the delay of a sensor, s.
+
+A delay of at least `NOTABLE_S` is reported. Above `FAR_S` the report advises to set the clocks.
+"""
 
 LARGE_BIAS = 0.05
-"""Gyro bias, rad/s, above which it is reported."""
+"""Gyro bias, rad/s, above which the bias is reported."""
 
 ONE_SIDED = 0.1
-"""Ratio of the turns to both sides below which the report says that one side is missing."""
+"""Ratio of the turns to one side and to the other below which they are reported as one-sided."""
 
 ODD_SIZE = 1.25
-"""Ratio of the measured radius to the configured one from which it is reported."""
+"""Factor between the measured and the configured radius from which the radius is reported."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
-"""Ratios of effective track to wheel separation that are usual. Others are reported."""
+"""Usual range of the ratio of effective track to wheel separation.
+
+A ratio outside this range is reported.
+"""
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
@@ -97,10 +113,10 @@ def drives_enough(parts: Sequence[Block]) -> None:
 
 
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
-    """Raise `RefusedError` if the wheels lack a movement that the fit needs.
+    """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    Both sides must roll in opposite directions and in the same direction, and the proportion of the
-    two movements must vary. If `spins` is true, turns on the spot are enough.
+    The sides must roll in the same direction and in opposite directions, and the proportion of both
+    movements must vary. If `spins` is true, turns on the spot alone are enough.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "against each other")):
@@ -120,7 +136,7 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `RefusedError` if the robot hardly turns. `turned` is the turn of each row, rad."""
+    """Raise `RefusedError` if the robot hardly turns. `turned` has the turn of each row, rad."""
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
@@ -135,11 +151,11 @@ TRACK, RATIO = "the effective track", "the ratio of left to right"
 def unsure(
     found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
 ) -> dict[str, float]:
-    """Return the relative standard deviations that are too large to be useful, by name.
+    """Return the relative standard deviations that are too large to be useful, by quantity.
 
-    The names are `TRACK` and `RATIO`, and `worst` has the limits in this order. `track_std` is the
-    standard deviation of the track as a fraction. It leaves out that the track itself varies with
-    the turn rate and from block to block.
+    The quantities are `TRACK` and `RATIO`, and `worst` has their limits in this order. `track_std`
+    is the relative standard deviation of the track. It does not include that the track itself
+    varies with the turn rate and from block to block.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -157,20 +173,24 @@ def separates_track(fitted: Fit) -> bool:
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
 
-    `sides` is the result of `heading.first`, which fits the wheels to the sensor best.
+    `source` names the sensor. `sides` is the result of `heading.first`, which fits the wheels to
+    the sensor best.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
     if not spread or float(off @ off) > UNLIKE * spread:
         raise RefusedError(
-            f"{source} does not follow the wheels. Check that it is the yaw axis (not roll or "
-            "pitch), that it is from the same drive, that its clock agrees within 2 s, that the "
-            "wheels touched the ground, and that the wheels' columns are speeds, not angles"
+            f"{source} does not follow the wheels. Check that it is the yaw rate (not roll or "
+            "pitch), that both come from the same run and their clocks differ by less than 2 s, "
+            "that the wheels touched the ground, and that their columns are speeds, not angles"
         )
 
 
 def positions_follow(begun: StartingPoint) -> None:
-    """Raise `RefusedError` if the positions do not follow the path of the wheels."""
+    """Raise `RefusedError` if the positions do not follow the path of the wheels.
+
+    `begun` is the result of `positions.search`.
+    """
     if begun.unexplained > UNLIKE:
         raise RefusedError(
             "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
@@ -179,10 +199,12 @@ def positions_follow(begun: StartingPoint) -> None:
 
 
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
-    """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
+    """Raise `RefusedError` if wheels and sensors turn to different sides. It names the wrong sign.
 
-    `sides` is the result of `heading.first`, and `begun` that of `search`. They are None without
-    the sensor.
+    Args:
+        source: the name of the heading sensor, or "" without one.
+        sides: the result of `heading.first`, or None without a heading sensor.
+        begun: the result of `positions.search`, or None without positions.
     """
     by_places = by_heading = ""
     if begun is not None:
@@ -223,7 +245,10 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 
 
 def _wrong_sign(sides: Floats) -> str:
-    """Return which sign is wrong: that of the "left" or "right" wheels, of each "turn", or ""."""
+    """Return "left" or "right" for wheels with a wrong sign, "turn" if both are wrong, or "".
+
+    `sides` has a factor for the left and the right wheels, which is negative for a wrong sign.
+    """
     left, right = (sides > 0.0).tolist()
     if left:
         return "" if right else "right"
@@ -245,21 +270,22 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
 
 def turn_rates(source: str, rows: Rows) -> None:
-    """Raise `RefusedError` if the turns are in degrees, because no robot turns this fast.
+    """Raise `RefusedError` if the sensor's turns are too fast for a robot, so must be in degrees.
 
-    The wheels are not compared here: if their speeds are in degrees too, both errors hide each
-    other.
+    `source` names the sensor. The turns are not compared with those of the wheels: if the wheel
+    speeds are in degrees too, both errors hide each other.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > FASTEST_TURN:
         raise RefusedError(
-            f"{source} is in degrees (multiply by pi / 180): it shows turns of {rate:.0f} rad/s; "
-            "also check that the wheel speeds are in rad/s, not deg/s, rpm or mm/s"
+            f"{source} seems to be in degrees (multiply by pi / 180), because as radians the robot "
+            f"would turn at {rate:.0f} rad/s; also check that the wheel speeds are in rad/s, not "
+            "deg/s, rpm or mm/s"
         )
 
 
 def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
-    """Raise `RefusedError` if the turns are so far from the wheels' that a unit must be wrong.
+    """Raise `RefusedError` if the turns differ so much from the wheels' that a unit must be wrong.
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
@@ -284,7 +310,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
 
 def distance_units(size: float, base: Base) -> None:
-    """Raise `RefusedError` if distances are so far from the wheels' that a unit must be wrong.
+    """Raise `RefusedError` if distances differ so much from the wheels' that a unit must be wrong.
 
     `size` is the ratio of the measured radius to the configured one.
     """
@@ -305,7 +331,7 @@ def distance_units(size: float, base: Base) -> None:
 
 
 def in_range(values: Floats) -> None:
-    """Raise `RefusedError` if the configuration does not accept these multipliers."""
+    """Raise `RefusedError` if the configuration does not accept the multipliers `values`."""
     if np.all((values >= LEAST_FACTOR) & (values <= MOST_FACTOR)):
         return
     shown = ", ".join(f"{value:.3g}" for value in values)

@@ -1,4 +1,4 @@
-"""Evidence from positions, of any source: the path of the wheels is compared with the positions.
+"""Evidence from positions of any source. The path of the wheels is compared with the positions.
 
 The path of each block is first shifted and rotated so that it fits the positions best. The
 residuals of this alignment are the evidence, so no start pose, frame or yaw is needed. Places are
@@ -7,9 +7,10 @@ complex numbers x + iy in m.
 `search` finds parameters from which the fit to positions can start, because the fit needs a track
 that is nearly right. The search tries tracks from a tenth to thirty times the configured one, with
 turns to either side and with one side of the wheels reversed. For each of them, the size of the
-path gives the radius. A turn on the spot moves no position. Positions therefore often determine
-such a turn only up to whole turns: 90 deg to the left end like 270 deg to the right. If several
-starting points explain the positions about as well, the one of the more usual robot is chosen.
+path gives the radius. A turn on the spot does not change the position. Positions therefore often
+determine such a turn only up to whole turns: the robot faces the same way after 90 deg to the left
+as after 270 deg to the right. If several starting points explain the positions about equally well,
+the search chooses the one of the more usual robot.
 """
 
 from __future__ import annotations
@@ -26,16 +27,19 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
 LEAST_POINTS = 5
-"""Smallest number of positions in a block, which has three unknowns: shift (two) and rotation."""
+"""Minimum number of positions in a segment.
+
+A segment has three unknowns: a shift along two axes, and a rotation.
+"""
 
 FINE_S = 0.02
 """Time step in which the path is summed, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Difference between a step of the positions and the wheels' motion that counts as a jump.
+"""Limit for the difference between two positions, beyond the distance that the wheels rolled.
 
-It is `JUMP` standard deviations plus `JUMP_M` m. After a jump, the position is an outlier, or the
-source has relocalized.
+It is `JUMP` standard deviations plus `JUMP_M` m. A larger difference is a jump: the position after
+it is an outlier, or the source has relocalized.
 """
 
 SPEED_S = 0.05
@@ -64,12 +68,16 @@ class WheelSteps(Struct, frozen=True):
     """The motion of the wheels of a run, in the steps in which its path is summed."""
 
     t: Floats
-    """Ends of the steps, s, with the begin of the first one in front."""
+    """Times at which the steps begin and end, s: one more than there are steps."""
     left: Floats
     """Angle that the left wheels roll in each step, rad."""
     right: Floats
+    """Angle that the right wheels roll in each step, rad."""
     fast: Floats
-    """|right - left| (right - left) in each step, rad2/s."""
+    """Integral of |w| w over each step, rad2/s.
+
+    w is the speed of the right minus that of the left wheels, rad/s.
+    """
 
 
 class Path(Struct, frozen=True):
@@ -83,13 +91,13 @@ class Path(Struct, frozen=True):
     derivatives: dict[P, Complexes]
     """Derivatives of `place` with respect to parameters, by the index of the parameter."""
     heading_derivatives: dict[P, Floats]
-    """Derivatives of `heading` with respect to the same parameters."""
+    """Derivatives of `heading`, with respect to the same parameters as in `derivatives`."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Return the sensor's place when it measured positions, with the derivatives of the place.
+        """Return the places of the sensor, m, and their derivatives, at the times of positions.
 
-        `t` has the recorded times of the positions, which are delayed by the parameter DELAY. The
-        derivatives have the shape (times, COUNT).
+        `t` has the recorded times of the positions, s, which are late by the parameter `P.DELAY`.
+        The derivatives with respect to the parameters have the shape (times, COUNT).
         """
         t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
@@ -111,7 +119,10 @@ class Path(Struct, frozen=True):
 
 
 def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
-    """Return the positions of each block, split at jumps."""
+    """Return the positions of each block of `parts`, split at jumps.
+
+    A segment with fewer than `LEAST_POINTS` positions is left out.
+    """
     edges = [jumps(run) for run in driven]
     found = []
     for number, part in enumerate(parts):
@@ -139,7 +150,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
-    """Return the wheel steps of a run, each of about `fine_s` s or one sample."""
+    """Return the wheel steps of a run. A step lasts about `fine_s` s, and at least one sample."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -172,16 +183,17 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the places as in `Path.place`, but faster, for a track that does not change."""
+    """Return the same places as `path` does, but faster, for a track that does not change."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return the headings at the ends of the steps, and the chord of each step's arc.
+    """Return the headings between the steps, rad, and the chord of each step's arc.
 
-    A chord is for an arc of length 1, as a complex number.
+    `turns` has the turn of each step, rad. A chord is the complex number that joins the ends of an
+    arc of length 1.
     """
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
@@ -201,16 +213,19 @@ class Aligned(Struct, frozen=True):
     block: int
     """Number of the block."""
     residual: Complexes
-    """Position minus path, m, times the root of the weight."""
+    """Position minus aligned path, m, times the root of the position's weight."""
     derivatives: Complexes
-    """Derivatives of the aligned path with respect to the parameters, times the root of the weight.
+    """Derivatives of the aligned path by the parameters, times the root of the position's weight.
 
-    The shift and the rotation of the alignment follow each change of a parameter.
+    They include the change of the alignment: its shift and rotation follow each parameter.
     """
 
 
 def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
-    """Align the path of each segment with its positions. Outliers have a smaller weight."""
+    """Align the path of the wheels with the positions of each segment.
+
+    Outliers among the positions have a smaller weight.
+    """
     for segment in segments:
         place, derivatives = paths[segment.run].at(segment.t, parameters)
         weight = np.ones(len(place))
@@ -234,7 +249,10 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
 def evidence(
     segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
 ) -> Evidence:
-    """Return the evidence at these parameters."""
+    """Return the evidence of the positions at these parameters, for `blocks` blocks.
+
+    `paths` must be computed with the same parameters.
+    """
     normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
     squares, counts = np.zeros(blocks), np.zeros(blocks)
     for part in aligned(segments, paths, parameters):
@@ -263,33 +281,41 @@ DELAYS = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that are tried, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Numbers of segments that are used to try and to refine: those with the longest reach."""
+"""Numbers of segments that are used: to try starting points, and to refine the best ones.
+
+The segments with the largest extent are used.
+"""
 
 MOST_POINTS = 80
 """Approximate number of positions per segment that are used, evenly spaced."""
 
 MOST_REFINED, FAR_WORSE = 4, 20.0
-"""Number of starting points to refine, and how many times worse than the best each may be."""
+"""Limits for the starting points that are refined.
+
+At most `MOST_REFINED` points are refined. A point that is more than `FAR_WORSE` times worse than
+the best one is not refined.
+"""
 
 USUAL_TURN = 0.31, 1.25
-"""Usual ratios of the robot's turn to the turn by its wheels and the wheel separation.
+"""Usual range of the robot's turn, divided by the turn that wheel radius and separation predict.
 
-The lowest is that of a robot that skids much, the highest that of a robot that does not skid.
+The lower end is that of a robot that skids much, the upper end that of a robot that does not skid.
 """
 
 NEAR_HEADING = 0.8, 1.25
-"""Usual ratios of the robot's turn by positions to the turn by a heading sensor."""
+"""Usual range of the robot's turn by positions, divided by its turn by a heading sensor."""
 
 WRONG_WAY = 4.0
-"""Factor by which the unexplained part of an unusual robot is multiplied.
+"""Factor by which a starting point counts as worse if the signs of its sides are unusual.
 
-Such a robot has one side reversed, or turns to the other side than its wheels.
+Its robot has one side reversed, or turns in the opposite direction to its wheels.
 """
 
 NOTHING = 1e-3
-"""Part of the positions' spread below which differences between starting points mean nothing.
+"""Constant that is added to `StartingPoint.unexplained` before starting points are compared.
 
-It is the noise of positions, which no starting point explains.
+It stands for the noise of the positions, which no starting point explains. Smaller differences
+therefore hardly matter.
 """
 
 STRAYED = 1.3
@@ -304,13 +330,16 @@ class StartingPoint(Struct, frozen=True):
 
     parameters: Floats
     unexplained: float
-    """Part of the positions' spread, as squares, that the path of the wheels leaves unexplained."""
+    """Fraction of the variance of the positions that the path of the wheels does not explain."""
 
 
 def search(
     segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
 ) -> StartingPoint:
-    """Return the best starting point. `sides` is the result of `heading.first`, or None."""
+    """Return the best starting point for the fit to positions.
+
+    `sides` is the result of `heading.first`, or None without a heading sensor.
+    """
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
     steps = {run: wheel_steps(driven[run], COARSE_S) for run in needed}
@@ -347,13 +376,16 @@ def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
 
 
 def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
-    """Return the starting points that leave no more unexplained than both of their neighbours."""
+    """Return the points of `tried` that leave no more unexplained than either neighbour."""
     left = [np.inf, *(point.unexplained for point in tried), np.inf]
     return [p for at, p in enumerate(tried) if p.unexplained <= min(left[at], left[at + 2])]
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return a factor of at least 1, which is larger for a less usual robot."""
+    """Return a factor of at least 1, which is larger for a less usual robot.
+
+    `sides` is the result of `heading.first`, or None without a heading sensor.
+    """
     signed = point.parameters[[P.LEFT, P.RIGHT]] * point.parameters[P.INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
     like = np.ones(2)
@@ -365,14 +397,14 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the robot's turn for a roll of the right wheels alone, relative to `Base.gain`."""
+    """Return the robot's turn per radian of the right wheels alone, divided by `Base.gain`."""
     return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
 
 
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the starting point with the delay of the positions that suits it best."""
+    """Return the starting point, with the best delay of the positions from `DELAYS`."""
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
@@ -385,10 +417,10 @@ def _tried(
     base: Base,
     shape: tuple[float, float, float],
 ) -> StartingPoint:
-    """Return the starting point for a shape of the path.
+    """Return the starting point for a shape of the path, with the size that fits best.
 
-    `shape` has the sign of the left side, the ratio of configured to true track, and the delay of
-    the positions in s.
+    `shape` has the sign of the left side (1 or -1), the ratio of configured to true track (negative
+    if the robot turns in the opposite direction to its wheels), and the delay of the positions, s.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
@@ -397,7 +429,7 @@ def _tried(
     for segment in kept:
         along = np.interp(segment.t - shape[2], steps[segment.run].t, paths[segment.run])
         centred, centred_path = segment.place - segment.place.mean(), along - along.mean()
-        # Each path is rotated in the best way; all share one scale.
+        # Each path is rotated so that it fits best, but all paths share one scale.
         cross += abs(complex(np.vdot(centred_path, centred)))
         size += float(np.sum(np.abs(centred_path) ** 2))
         squares += float(np.sum(np.abs(centred) ** 2))
@@ -414,7 +446,7 @@ def _refined(
 ) -> StartingPoint:
     """Return the starting point after a fit to a few segments.
 
-    The fit also finds where on the robot the positions are measured, and outliers count less.
+    The fit also finds where on the robot the positions are measured. Outliers have less weight.
     """
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 

@@ -28,26 +28,41 @@ from acsard.recording.file import Recording
 from acsard.recording.mcap_records import DAMAGE, MAGIC
 
 MOST_BYTES = 1 << 30
-"""Size of the largest CSV file or recording of acsard. It is read into memory as a whole."""
+"""Maximum size of a CSV file or of a recording of acsard, bytes. Both are read into memory."""
 
 MOST_RECORD_BYTES = 1 << 28
-"""Size of the largest record of a bag that is read. A chunk of rosbag2 has less than 1 MiB."""
+"""Maximum size of a record in a bag, bytes. A chunk of rosbag2 has less than 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
-"""Exceptions for a damaged bag: those of MCAP, of LZ4, and of a channel without its schema."""
+"""Exceptions for a damaged bag.
+
+MCAP and LZ4 raise them, and a channel whose schema is missing causes a `KeyError`.
+"""
 
 OTHER_BAGS = {
     ".db3": (b"SQLite format 3\0", "in SQLite: convert it to MCAP with `ros2 bag convert`"),
     ".bag": (b"#ROSBAG V", "of ROS 1: convert it to ROS 2 in MCAP with `rosbags-convert`"),
     ".zstd": (b"\x28\xb5\x2f\xfd", "compressed as a whole file: unpack it with `zstd -d`"),
 }
-"""Bags that are not read, by their suffix: their first bytes, and what to do."""
+"""Kinds of bags that this module cannot read, by their suffix.
+
+Each has its first bytes, and a phrase that names the kind and says how to convert it.
+"""
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
-    """Return the calibration from a recorded drive: a file, or the directory of a bag.
+    """Return the calibration from a recorded drive.
 
-    Raises `LogError`, `RefusedError`, and `MendableError` for a file that cannot be read.
+    Args:
+        log: the file of the drive, or the directory of a bag.
+        config: the configuration of the robot.
+        tape: a distance that was measured by tape, or None.
+        choice: the topics and the axis to use in a bag.
+
+    Raises:
+        LogError: the log cannot be used.
+        MendableError: the file cannot be read.
+        RefusedError: the log gives no calibration.
     """
     try:
         table = _table(log, config, choice)
@@ -97,12 +112,15 @@ def _other_bag(what: str) -> str:
 
 
 def _is_ours(log: Path) -> bool:
-    """Return whether an MCAP file is a recording of acsard, as far as its beginning shows."""
+    """Return whether an MCAP file is a recording of acsard, according to its header.
+
+    A file with a damaged header is treated as a recording.
+    """
     with log.open("rb") as stream:
         try:
             return _reader(stream).get_header().profile == "acsard"
         except (*DAMAGE, StopIteration):
-            return True  # the reader of recordings names the damage
+            return True  # the reader of recordings then reports the damage
 
 
 def _reader(stream: IO[bytes]) -> NonSeekingReader:
@@ -123,7 +141,7 @@ def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
 def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
     """Yield the messages of a bag in their order in the file.
 
-    If the bag is cut off or damaged, the messages before that place are yielded, and a sentence is
+    If the bag is cut off or damaged, the messages before the damage are yielded, and a sentence is
     added to `notes`.
     """
     with file.open("rb") as stream:

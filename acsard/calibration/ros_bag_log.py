@@ -1,12 +1,12 @@
 """Builds the table of a log from the messages of a ROS 2 bag.
 
-The wheels come from a `JointState`, the turn rates from an `Imu`, and the positions from a
-`PoseStamped` or an `Odometry`. The types choose the topics. If several topics fit, or if a topic
-should not be used, the user names the topics with `--topic`.
+The wheel speeds come from a `JointState`, the turn rates from an `Imu`, and the positions from a
+`PoseStamped` or an `Odometry`. This module chooses the topics by their types. If several topics
+fit, or if a topic should not be used, the user names the topics with `--topic`.
 
-An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. So it is
-used only if the user names it, or if the bag has no other reference. In the second case it is
-refused if it turns exactly as the wheels do.
+An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. So an
+`Odometry` is used only if the user names its topic, or if the bag has neither turn rates nor other
+positions. In the second case the log is refused if the odometry turns exactly as the wheels do.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TYPES: dict[str, type[JointState | Imu | Odometry | PoseStamped]] = {
     "nav_msgs/msg/Odometry": Odometry,
     "geometry_msgs/msg/PoseStamped": PoseStamped,
 }
-"""The types that are read, by their ROS name."""
+"""Message types that this module reads, by ROS name."""
 
 REFERENCES = "a gyro (sensor_msgs/msg/Imu) or positions (geometry_msgs/msg/PoseStamped)"
 
@@ -45,29 +45,32 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 LEAST_MESSAGES = 20
-"""Smallest number of messages with which a topic is a candidate."""
+"""Minimum number of messages with a value that a topic needs to be used."""
 
 CLOCKS_APART_S = 1.0
-"""Difference between the delays of two topics above which their stamps are of different clocks.
+"""Largest difference between the delays of two topics whose stamps come from one clock, s.
 
 The delay of a topic is the median time from the stamp of a message to its recording.
 """
 
 STEP_S = 1.0
-"""Length of the intervals in which the turns of a sensor and of the wheels are compared, s."""
+"""Length of the intervals over which the turns of a sensor and of the wheels are compared, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
-"""Correlations with the turns of the wheels.
+"""Limits for the correlation between the turns about an IMU axis and the turns of the wheels.
 
-If that of the axis in use is below `UPRIGHT` and that of another axis above `LYING`, the other axis
-points up or down.
+If the chosen axis is below `UPRIGHT` and another axis is above `LYING`, that other axis points up
+or down, and the log is refused.
 """
 
 OWN = 3e-3
-"""Share of the turns by which an odometry that was computed from the wheels differs from them."""
+"""Largest RMS difference between an odometry and the wheels from which it was computed.
+
+It is a fraction of the RMS turn.
+"""
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
-"""Delays of an odometry that are tried in the comparison with the wheels, s."""
+"""Delays of an odometry behind the wheels that the comparison of both tries, s."""
 
 
 class RosMessage(NamedTuple):
@@ -87,7 +90,7 @@ class Choice(Struct, frozen=True):
     """The topics and the axis that the user chose."""
 
     topics: tuple[str, ...] = ()
-    """The topics to use. () means that the types decide."""
+    """The topics to use. () means that the tool chooses them by their message types."""
     axis: str = ""
     """The axis of the IMU that points up, one of `AXES`; "" means z."""
 
@@ -100,7 +103,7 @@ class _Topic:
         self.kind = TYPES[type_]
         self.came, self.made, self.values = array("q"), array("q"), array("d")
         self.wheels: tuple[str, ...] = ()
-        """For a `JointState`: the columns of the log that its joints give."""
+        """Columns of the log that the joints of a `JointState` give; () for other types."""
         self.joints: set[str] = set()
         self.unreadable, self.why = 0, ""
 
@@ -111,7 +114,10 @@ class _Topic:
         return f"{printable(self.name)} ({self.kind.__name__})"
 
     def take(self, message: RosMessage, joints: Sequence[str]) -> None:
-        """Add a message. `joints` has the configured joints of the wheels."""
+        """Add the values of a message, or count the message as unreadable.
+
+        `joints` has the configured names of the wheel joints, in the order of `FOUR`.
+        """
         if message.encoding != "cdr":
             self._refuse(f"it is encoded as {message.encoding or 'nothing'}, not as cdr")
             return
@@ -146,7 +152,11 @@ class _Topic:
         return pose.position.x, pose.position.y, _yaw(pose.orientation)
 
     def _joints(self, message: JointState, joints: Sequence[str]) -> Sequence[float]:
-        """Return the angles and then the speeds of the columns; NaN for what is not there."""
+        """Return the angles (rad) of all columns, then the speeds (rad/s) of all columns.
+
+        Angles or speeds that the message does not contain are NaN. The result is () if the joints
+        give no columns, or other columns than the first message of the topic.
+        """
         columns = wheel_joints(tuple(message.name), tuple(joints))
         self.joints.update(message.name[:8])
         self.wheels = self.wheels or tuple(columns)
@@ -184,7 +194,7 @@ _SHORT = {
     "fl": ("fl", "lf"), "fr": ("fr", "rf"), "rl": ("rl", "lr", "bl", "lb"),
     "rr": ("rr", "br", "rb"), "left": ("l",), "right": ("r",),
 }  # fmt: skip
-"""Abbreviations in the names of joints, by the column of the log."""
+"""Abbreviations of a wheel or a side in the names of joints, by the column of the log."""
 
 _COLUMN = {word: column for column, words in _SHORT.items() for word in words}
 
@@ -192,7 +202,7 @@ _NO_WHEEL = ("caster", "castor", "steer")
 
 
 def wheel_of(joint: str) -> str:
-    """Return the column that the name of a joint shows, such as "fl" or "left", or ""."""
+    """Return the column of the log, such as "fl" or "left", for a joint's name; "" if unclear."""
     name = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint).lower()
     if any(word in name for word in _NO_WHEEL):
         return ""
@@ -206,11 +216,13 @@ def wheel_of(joint: str) -> str:
 
 @cache
 def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, list[int]]:
-    """Return the indices of the wheels' joints by the column of the log; empty if a side lacks.
+    """Return the indices of the wheel joints in `names`, by the column of the log.
+
+    The result is empty unless both sides have a wheel joint.
 
     Args:
-        names: the joints of a message.
-        joints: the joints of the configuration, in the order of `FOUR`.
+        names: the names of the joints in a message.
+        joints: the configured names of the wheel joints, in the order of `FOUR`.
     """
     if set(joints) <= set(names):
         return {column: [names.index(joint)] for column, joint in zip(FOUR, joints, strict=True)}
@@ -228,9 +240,9 @@ def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, l
 
 
 def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice) -> Table:
-    """Return the log in the messages of a bag. Raises `LogError`.
+    """Return the table that the messages of a bag give. Raises `LogError`.
 
-    `joints` has the configured joints of the wheels, in the order of `FOUR`.
+    `joints` has the configured names of the wheel joints, in the order of `FOUR`.
     """
     topics: dict[str, _Topic] = {}
     others: dict[str, str] = {}
@@ -282,7 +294,10 @@ class _Log:
     # Choice of the topics
 
     def _chosen(self) -> tuple[_Topic, _Topic | None, _Topic | None]:
-        """Return the topics of the wheels, of the gyro and of the positions."""
+        """Return the topics of the wheels, of the gyro and of the positions.
+
+        Raises `LogError` if the bag lacks the wheels, or has nothing to compare them with.
+        """
         names = self._choice.topics
         known = {topic.name: topic for topic in self._topics}
         for name in names:
@@ -319,7 +334,11 @@ class _Log:
         return wheels, gyro, places
 
     def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
-        """Return the only topic that fits, or None. A named topic comes before all others."""
+        """Return the topic of `fit` to use, or None. Topics that the user named take precedence.
+
+        `what` describes the topic in error messages. If `free` is false, only a named topic is
+        used. Raises `LogError` if several topics can be used, or if the topic has too few messages.
+        """
         named = [topic for topic in fit if topic.name in self._choice.topics]
         for topic in named:
             if len(topic) < LEAST_MESSAGES:
@@ -364,7 +383,7 @@ class _Log:
     # Times
 
     def _times(self, used: Sequence[_Topic]) -> list[Floats]:
-        """Return the times of each topic's samples by one clock, s."""
+        """Return the sample times of each topic, s, all on the same clock."""
         since_ns = min(topic.came[0] for topic in used)
         came = [topic.seconds(topic.came, since_ns) for topic in used]
         made = [topic.seconds(topic.made, since_ns) for topic in used]
@@ -432,7 +451,7 @@ class _Log:
                 f"{printable(topic.name)}"
             )
         turns = np.isfinite(yaw)
-        # A source of positions without an orientation repeats one.
+        # A source that does not measure an orientation sends a constant one.
         return {"t": t, "x": x, "y": y} | (
             {"yaw": yaw} if turns.any() and float(np.ptp(yaw[turns])) > 0.0 else {}
         )
@@ -448,14 +467,14 @@ def _too_few(topic: _Topic) -> str:
 
 
 def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
-    """Return the speeds of wheels whose angles were recorded, with their times.
+    """Compute wheel speeds from recorded angles. Return the times, s, and the speeds, rad/s.
 
-    The mean of the speed over each period keeps the angle exactly: the sum of all steps is the
-    whole angle, however the times of the samples vary. No speed is computed across a gap, or across
-    a jump, at which a driver began again at 0.
+    Each speed is the mean over one sample period. So the speeds add up to exactly the angle that
+    the wheel turned, even if the sample times are uneven. No speed is computed across a gap or
+    across a jump. The angle jumps when a driver restarts at 0.
 
     Args:
-        t: the times, s.
+        t: the times of the angles, s.
         angles: the angles, one column for each wheel, rad.
     """
     whole = np.isfinite(angles).all(axis=1)
@@ -481,14 +500,20 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
 
 
 def _unwrapped(angles: Floats) -> Floats:
-    """Return angles without jumps of a whole turn, if they are all within one turn."""
+    """Remove the jumps of a whole turn from wheel angles, rad, that are all within one turn.
+
+    Angles that leave this range are returned as they are.
+    """
     jumps = np.abs(np.diff(angles)).max(initial=0.0) > np.pi
     within = float(np.ptp(angles)) <= 2 * np.pi + 1e-3 if len(angles) else False
     return np.unwrap(angles) if jumps and within else angles
 
 
 def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return the times of the wheels, and the angles of the left and of the right side."""
+    """Return the times of the wheel samples, s, and the angles of the left and right wheels, rad.
+
+    `wheels` has the columns of the log by name.
+    """
     t = wheels["t"]
     left, right = (
         np.mean([wheels[name] for name in wheels if name in names], axis=0)
@@ -509,7 +534,10 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
-    """Return the correlation of a sensor's turns with those of the wheels; NaN if unknown."""
+    """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown.
+
+    `rates` has the sensor's turn rates at the times `t`, and `sides` is the result of `_sides`.
+    """
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
     if len(edges) < 4:
@@ -523,7 +551,10 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether a yaw is computed from these wheels, so that it differs by less than `OWN`."""
+    """Return whether a yaw was computed from the wheels: it differs from them by at most `OWN`.
+
+    `yaw` is in rad at the times `t`, and `sides` is the result of `_sides`.
+    """
     held = np.isfinite(yaw)
     order = np.argsort(t[held], kind="stable")
     times, angle = t[held][order], np.unwrap(yaw[held][order])

@@ -1,7 +1,7 @@
 """Splits the table of a log into runs, and runs into blocks. A run has the samples of one drive.
 
 The times of a log may have any origin. Within a run they begin at 0. Rows that are out of order are
-sorted. If the times start again, or the wheels have no sample for a minute, a new run begins.
+sorted. A new run begins where the times jump back, or where the wheels have no sample for a minute.
 
 A block is a few seconds of driving. Every estimate of the calibration is a sum over blocks, and the
 standard deviations come from the differences between blocks. The errors within a block are
@@ -26,65 +26,70 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 RESTART_S = 1.0
-"""Step back in time, s, above which the time may have started again."""
+"""Backward step of the times, s, above which the times may have restarted."""
 
 FEW_RESTARTS = 100
-"""Largest number of restarts. With more of them, the rows are in no order at all."""
+"""Largest number of restarts. If there are more, the rows are unsorted, and no run is split."""
 
 SLOWEST_S = 0.7
 """Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
 
 LEAST_ROWS = 20
-"""Smallest number of wheel samples in a run, and in a log."""
+"""Minimum number of wheel samples in a run."""
 
 PAUSE_S = 60.0
 """Time without a wheel sample after which a new drive begins, s."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
-"""Period of the times, s, and mean number of rows per time. If both are exceeded, t was rounded."""
+"""Limits for rounded times: the median interval, s, and the mean number of rows per time.
+
+If the different times of a run exceed both limits, the column t was rounded.
+"""
 
 ROLLING, AGAIN = 0.2, 0.4
-"""Evidence for a logger that repeats a position until the next one arrives.
+"""Criterion for a logger that repeats a position or a yaw until the next one arrives.
 
-Above a speed of `ROLLING` rad/s, both sides together, a true position does not stay the same. The
-logger repeats positions if it does stay the same in more than the fraction `AGAIN` of these rows of
-the file. Positions of 10 Hz in rows of 20 Hz stay the same in about half of them.
+While the wheel speeds of both sides add up to more than `ROLLING` rad/s, a true position changes
+from row to row. The logger repeats values if more than the fraction `AGAIN` of these rows have the
+same value as the row before. For example, rows at 20 Hz repeat about half of the positions of a
+10 Hz source.
 """
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
 STREAMS = (WHEELS, "yaw_rate", "yaw", "x y", COMMANDS)
-"""The columns of each sensor."""
+"""Names of the sensors. Each name lists the sensor's columns, separated by spaces."""
 
 Streams = dict[str, tuple[Floats, ...]]
-"""The times and values of each sensor, by the names in `STREAMS`."""
+"""The times and values of each sensor, by its name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of runs in a log. With more of them, the column run does not name drives."""
+"""Largest number of different names in the column run. If there are more, they are not drives."""
 
 TOGETHER = 50
 """Number of rows that are summed before the front and rear wheel of a side are compared."""
 
 NOTED, APART = 0.15, 0.8
-"""Difference of the front and rear wheel of a side, as a fraction of the distance they rolled.
+"""Limits for the difference between the front and the rear wheel of a side.
 
-Above `NOTED` it is reported, above `APART` the log is refused.
+The difference is a fraction of the distance that the wheels rolled. The report mentions a
+difference above `NOTED`. A log with a difference above `APART` is refused.
 """
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
-"""Interval between two samples above which there is a gap: in s, and in usual periods.
+"""Limits for the interval between two samples: in s, and in median sample periods.
 
-A gap exceeds both. The motion within a gap is unknown.
+An interval that exceeds both is a gap. The motion within a gap is unknown.
 """
 
 STILL = 0.02
-"""Speed below which a wheel stands, rad/s."""
+"""Largest speed at which a wheel is considered to stand still, rad/s."""
 
 BLOCKS = 16
-"""Number of blocks that a log should have. Their length is limited by `LONGEST_S`."""
+"""Number of blocks into which a log is divided, unless they would exceed `LONGEST_S`."""
 
 LONGEST_S = 12.0
-"""Longest block, s, unless the caller asks for longer ones."""
+"""Longest block, s, unless the caller of `blocks` asks for longer ones."""
 
 SMOOTH_S = 0.3
 """Time over which a wheel speed is averaged before it is squared, s.
@@ -93,14 +98,17 @@ Without it, the speeds of a coarse encoder would be 0 in some samples and far to
 """
 
 LEAST_TURN = 0.2
-"""Angle of the faster side's wheels, rad, below which a block is not used."""
+"""Minimum angle, rad, that the wheels of at least one side turn in a block that is used."""
 
 MOST_JITTER_S = 5.0
-"""Largest variation of the delay between stamp and arrival, s. Beyond it, stamps are not used."""
+"""Largest variation of the delay from stamp to arrival, s.
+
+If it varies more, the times of arrival are used instead of the stamps.
+"""
 
 
 class Run(Struct, frozen=True, dict=True):
-    """The samples of one drive. Times are in s since `start`, in order, and each occurs once."""
+    """The samples of one drive. Times are in s since `start`, and strictly increase."""
 
     name: str
     start: float
@@ -127,12 +135,15 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def gaps(self) -> Floats:
-        """The gaps of the wheels, one row (begin, end) each, in s."""
+        """The gaps between the wheel samples, one row (begin, end) each, in s."""
         return gaps(self.t)
 
     @cached_property
     def rolled(self) -> tuple[Floats, Floats]:
-        """The angles of the left and the right wheels at the times `t`, rad. Gaps add nothing."""
+        """The angles of the left and the right wheels at the times `t`, rad.
+
+        The angles stay constant across a gap.
+        """
         steps = np.diff(self.t)
         steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
         left, right = (cumulative((v[1:] + v[:-1]) / 2 * steps) for v in (self.left, self.right))
@@ -140,7 +151,7 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def moving(self) -> Mask:
-        """Mask of the wheel samples at which a wheel turns."""
+        """Mask of the wheel samples at which the wheels of at least one side turn."""
         return np.asarray((np.abs(self.left) > STILL) | (np.abs(self.right) > STILL))
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
@@ -149,7 +160,7 @@ class Run(Struct, frozen=True, dict=True):
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
     def speed_difference(self, t: Floats) -> Floats:
-        """Return the right minus the left wheels' speed, rad/s, each averaged over `SMOOTH_S`."""
+        """Return the right minus the left wheels' speed, rad/s, averaged over `SMOOTH_S`."""
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -157,16 +168,19 @@ class Run(Struct, frozen=True, dict=True):
 
 
 class Notes:
-    """Sentences about a log. A sentence that occurs in many runs is listed once.
+    """Sentences about a log. A sentence that applies to several runs is listed once.
 
-    "{}" in a sentence stands for its count, summed over all runs.
+    A sentence may contain "{}". A count, summed over all runs, replaces it.
     """
 
     def __init__(self, sentences: Iterable[str]) -> None:
         self._sentences = {sentence: [0, 0] for sentence in sentences}
 
     def add(self, sentence: str, count: int = 0) -> None:
-        """Add a sentence. `count` is the count of one run; 0 adds nothing to a counted sentence."""
+        """Add a sentence about one run. `count` is the number that it adds to the sum for "{}".
+
+        A sentence with "{}" and a count of 0 is ignored.
+        """
         if count or "{}" not in sentence:
             sums = self._sentences.setdefault(sentence, [0, 0])
             sums[0], sums[1] = sums[0] + count, sums[1] + 1
@@ -187,7 +201,7 @@ class Log(Struct, frozen=True):
 
 
 def runs(table: Table) -> Log:
-    """Return the runs in a table. Raises `LogError` if it has no run that can be used."""
+    """Split a table into runs. Raises `LogError` if the table has no run that can be used."""
     notes = Notes(table.notes)
     columns = dict(table.columns)
     t = columns["t"]
@@ -247,8 +261,8 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
     """Return the difference of the wheels of a side, as a fraction of the distance they rolled.
 
-    Both wheels roll over the same floor, so a large difference means an error. Raises `LogError` if
-    it exceeds `APART`.
+    `front` and `rear` name the columns of the two wheels. Both wheels roll over the same floor, so
+    a large difference means an error. Raises `LogError` if the difference exceeds `APART`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
@@ -270,10 +284,10 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 
 
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Return the rows of each drive, split where the times start again.
+    """Split `rows` where the times `t` jump back. Return the rows of each drive.
 
-    Only rows with wheel speeds count: in a file, the rows of one sensor may all come after the rows
-    of another, each in its own order.
+    Only the times of rows with wheel speeds are checked. The times of other rows may jump back
+    within a drive, because a file may list all rows of one sensor after all rows of another.
     """
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
     back = np.flatnonzero(np.diff(t[wheels]) < -RESTART_S) + 1
@@ -282,18 +296,21 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     blocks = [part for part in np.split(wheels, back) if len(part) >= LEAST_ROWS]
     spans = sorted((float(np.min(t[part])), float(np.max(t[part]))) for part in blocks)
     if not any(a[1] > b[0] for a, b in pairwise(spans)):
-        return [rows]  # these are blocks of a single drive in another order
+        return [rows]  # the blocks do not overlap: they are parts of one drive, in another order
     return list(np.split(rows, np.searchsorted(rows, wheels[back])))
 
 
 def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
-    """Return the sorted times of the rows with speeds of both sides. A time may occur twice."""
+    """Return the sorted times of the rows with speeds of both sides. Times may repeat."""
     held = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
     return np.sort(t[rows[held]])
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
-    """Raise `LogError` if the times are not in seconds or too coarse."""
+    """Raise `LogError` if the times of a run are not in seconds or are too coarse.
+
+    `parts` has the rows of each drive of the run `name`.
+    """
     for rows in parts:
         times = _wheel_times(t, rows, columns)
         if len(times) < LEAST_ROWS:
@@ -313,9 +330,9 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Return the rows of each drive, split where the wheels have no sample for `PAUSE_S`.
+    """Split `rows` where the wheels have no sample for `PAUSE_S`. Return the rows of each drive.
 
-    Without the split, a single stamp of another day would make one drive of many hours.
+    Without the split, a single row with a time of another day would make a drive of many hours.
     """
     times = _wheel_times(t, rows, columns)
     ends = np.flatnonzero(np.diff(times) > PAUSE_S)
@@ -328,7 +345,7 @@ def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | None:
-    """Return the sensors of a drive, or None if it has too few rows of wheel speeds."""
+    """Return the samples of each sensor of a drive, or None if it has too few wheel samples."""
     streams = {name: _stream(columns, rows, name.split(), notes) for name in STREAMS}
     if len(streams[WHEELS][0]) >= LEAST_ROWS:
         return streams
@@ -351,9 +368,10 @@ def _run(name: str, streams: Streams) -> Run:
 
 
 def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
-    """Remove the values that a logger repeats until the next sample arrives, in place.
+    """Remove values from `drives`, in place, that a logger repeats until the next sample arrives.
 
-    The rows of all drives together show whether the logger repeats, because a short drive may not.
+    A short drive may not show whether the logger repeats values, so all drives are evaluated
+    together.
     """
     for what in ("yaw", "x y"):
         found = [(streams, *_repeats(streams, what)) for _, streams in drives]
@@ -372,7 +390,11 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return masks of the rows that repeat the value above, and of those while the wheels turn."""
+    """Return two masks of the rows of the sensor `what`.
+
+    The first mask has the rows that repeat the value of the row before. The second mask has the
+    rows at which the wheels turn.
+    """
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -384,7 +406,10 @@ def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
 def _stream(
     columns: dict[str, Floats], rows: Rows, names: Iterable[str], notes: Notes
 ) -> tuple[Floats, ...]:
-    """Return a sensor's sorted times and values, without rows in which one of them is empty."""
+    """Return a sensor's times and its values in the columns `names`, sorted by time.
+
+    Rows in which a value is missing are left out. If the log lacks a column, all arrays are empty.
+    """
     held = [columns.get(name) for name in names]
     if any(values is None for values in held):
         return (np.zeros(0),) * (1 + len(held))
@@ -394,7 +419,10 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
-    """Sort a stream by time. Of several samples with the same time, keep the first."""
+    """Yield the columns of a stream, sorted by time, of which the first column has the times.
+
+    Of several samples with the same time, only the first one is kept. `what` names the sensor.
+    """
     t = stream[0]
     notes.add(f"{{}} rows of {what} are out of order and were sorted", int((np.diff(t) < 0).sum()))
     order = np.argsort(t, kind="stable")
@@ -414,12 +442,13 @@ class Block(Struct, frozen=True):
     run: int
     """Number of the run."""
     begin: float
-    """Time in s, like `end`."""
+    """Begin of the block, s since the start of the run."""
     end: float
+    """End of the block, s since the start of the run."""
 
 
 def gaps(t: Floats) -> Floats:
-    """Return the gaps between sample times, one row (begin, end) each."""
+    """Return the gaps between the sample times `t`, one row (begin, end) each, in s."""
     steps = np.diff(t)
     if not len(steps):
         return np.zeros((0, 2))
@@ -440,10 +469,10 @@ def cumulative(steps: Floats) -> Floats:
 
 
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
-    """Return the rests of a run, one row (begin, end) each, in s. All wheels stand in a rest.
+    """Return the rests of a run, one row (begin, end) each, in s. In a rest, all wheels stand.
 
-    A margin of `edge_s` is cut off at both ends. Rests of which less than `least_s` remains are
-    left out.
+    A margin of `edge_s` is cut off both ends of each rest. If less than `least_s` remains, the rest
+    is left out.
     """
     moving = np.concatenate(([True], run.moving, [True])).astype(np.int8)
     changes = np.flatnonzero(np.diff(moving))
@@ -455,7 +484,8 @@ def rests(run: Run, least_s: float, edge_s: float) -> Floats:
 def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
     """Return the blocks of all runs, without those in which the robot hardly moved.
 
-    A block is `shortest_s` long, or longer if the log would otherwise have over `BLOCKS` blocks.
+    A block is about `shortest_s` long. If the log would then have more than `BLOCKS` blocks, the
+    blocks are longer, up to `LONGEST_S`.
     """
     moved = sum(float(np.minimum(np.diff(r.t), GAP_S) @ r.moving[1:]) for r in driven)
     length = float(np.clip(moved / BLOCKS, shortest_s, max(LONGEST_S, shortest_s)))
@@ -475,9 +505,10 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels turned enough from `begin` to `end`, back and forth included.
+    """Return whether the wheels of a side turned by at least `LEAST_TURN` from `begin` to `end`, s.
 
-    `left` and `right` are the angles at both times.
+    Turns ahead and back both add to the angle. `left` and `right` have the angles of both sides at
+    the two times, rad.
     """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
@@ -487,10 +518,11 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
 
 
 def on_arrival_clock(came: Floats, made: Floats) -> Floats:
-    """Return the times of the samples of one stream by the clock of their arrival, s.
+    """Return the sample times of one stream, s, on the clock of their arrival.
 
-    If the delays between the stamps `made` by the sender's clock and the times of arrival `came`
-    vary little, the times are the stamps plus the smallest delay. Otherwise they are `came`.
+    `came` has the times of arrival, and `made` the stamps by the sender's clock, both in s. If the
+    delay from stamp to arrival varies by at most `MOST_JITTER_S`, the sample times are the stamps
+    plus the smallest delay. Otherwise they are the times of arrival.
     """
     delay = came - made
     if float(np.ptp(delay)) > MOST_JITTER_S:

@@ -1,7 +1,7 @@
-"""Computes the calibration from a log: prepares it, fits, checks the result and evaluates it.
+"""Computes the calibration from a log: prepares the log, fits, checks and evaluates the result.
 
-To prepare a log means to cut it into blocks, to check it and to find parameters to start from. If a
-log gives no calibration, an error says why and what to do.
+To prepare a log means to cut it into blocks, to check it and to find starting parameters for the
+fit. If a log gives no calibration, an error says why and what to do.
 """
 
 from __future__ import annotations
@@ -47,23 +47,25 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryCon
 from acsard.core.values import AcsardError
 
 LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Lengths of blocks that are tried with positions, s.
+"""Lengths of blocks, s, that are tried if the log has positions.
 
-Many short blocks are better for fine positions. Long blocks are better for coarse ones, and for
-wheels whose errors hide the small turns of a short block. Drives that were left out decide. The
-shortest length is enough for a heading sensor, and too short for positions alone.
+Many short blocks are better for accurate positions. Long blocks are better for coarse positions,
+and for wheels whose errors hide the small turns of a short block. The tool chooses the length that
+is best on drives that the fit did not use. Positions without a heading sensor need more than the
+shortest length. A heading sensor without positions needs only the shortest length.
 """
 
 ENOUGH_BLOCKS = 8
-"""Smallest number of blocks for which longer blocks are tried.
+"""Minimum number of blocks. A greater length is not tried if it gives fewer blocks.
 
-With six blocks, the standard deviation of left to right was up to three times too small.
+With six blocks, the standard deviation of the ratio of left to right was up to three times too
+small.
 """
 
 PERFECT = 1e-4
-"""Fraction of the motion by which every true sensor differs from the wheels.
+"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion.
 
-Motion capture differs by less than 1e-3 on a good floor.
+For comparison: motion capture on a good floor differs by less than 1e-3.
 """
 
 
@@ -76,14 +78,18 @@ class Drives(Struct, frozen=True):
     turns: float
     """Number of turns of 360 deg to both sides together, according to the calibrated wheels."""
     fastest: float
-    """Rate of the fastest turns, rad/s."""
+    """Rate of the fastest turns, rad/s, as in `Rates.fastest`."""
 
     @classmethod
     def of(
         cls, runs: Sequence[Run], rows: Rows, by_wheels: Floats, base: Base, found: Multipliers,
         rate: Rates,
     ) -> Drives:  # fmt: skip
-        """Return the totals of these runs. `by_wheels` is the turn of each row, rad."""
+        """Return the totals of these runs.
+
+        `by_wheels` is the turn of each of the `rows` according to the calibrated wheels, rad.
+        `found` has the new multipliers, and `rate` the turn rates.
+        """
         size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
             len(runs), sum(float(run.t[-1]) for run in runs),
@@ -102,23 +108,29 @@ class Calibration(Struct, frozen=True):
     multipliers: Multipliers
     """The new multipliers."""
     scale: str
-    """Sensors that measured the distance: "positions", "distance", both, or "" for none."""
+    """Sources of the wheels' size: "positions", "distance" (a tape), both, or "" for none."""
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
     improvement: Improvement
     delays: dict[str, float]
-    """Delay of each sensor behind the wheels, s."""
+    """Delay of each sensor behind the wheels, s, by the name of the sensor."""
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
     """Sentences about the log that the user should know."""
     odometry: dict[str, float]
-    """Settings of `[odometry]` by name: the deviations of the geometry and, if known, the noise."""
+    """New settings of `[odometry]` by name.
+
+    They are the standard deviations of the geometry and, if the noise is better, the noise.
+    """
     kept: tuple[str, ...] = ()
-    """Quantities that stay as configured, `TRACK` and `RATIO` of `prepared`."""
+    """Quantities that stay as configured, `TRACK` and `RATIO` of `plausibility`."""
     feedback: dict[str, float] = {}
-    """Settings of `[feedback]` without which the daemon would take sound wheels for faulty."""
+    """New settings of `[feedback]` by name.
+
+    It is empty unless the daemon takes healthy wheels for faulty with the present settings.
+    """
     noise: Noise | None = None
     """The noise of the odometry; None if the log does not show it."""
 
@@ -129,11 +141,16 @@ def calibrate(
 ) -> Calibration:  # fmt: skip
     """Return the calibration of the robot that recorded this log.
 
-    `drive` has the geometry that the multipliers belong to, and the present multipliers. `odometry`
-    has the present noise, and `feedback` the present response time; None stands for those of a new
-    configuration. Raises
-    `LogError` if a sensor of the log cannot be used, and `RefusedError` if the log gives no
-    calibration, both with the notes of the log.
+    Args:
+        log: the log.
+        drive: the geometry that the multipliers belong to, and the present multipliers.
+        tape: a distance that was measured by tape, or None.
+        odometry: the present noise. None means the default settings.
+        feedback: the present response time. None means the default settings.
+
+    Raises:
+        LogError: a sensor of the log cannot be used. The error has the notes of the log.
+        RefusedError: the log gives no calibration. The error has the notes of the log.
     """
     follows = response(log.runs, drive, feedback or FeedbackConfig())
     if follows is not None:
@@ -151,17 +168,21 @@ class Prepared(Struct, frozen=True):
 
     runs: Sequence[Run]
     headings: Headings | None
-    """The headings by a sensor."""
+    """The headings by a sensor; None if the log has none."""
     base: Base
     """The configured geometry."""
     parts: list[Block]
     rows: Rows
-    """The turns. If the robot never rested, those of the gyro still contain the gyro's bias."""
+    """The motion in short intervals.
+
+    If the robot never rested, the turns by the gyro still contain the gyro's bias.
+    """
     segments: list[Segment]
     """The positions; empty if the log has none."""
     steps: list[WheelSteps]
     """The wheel steps of each run; empty if the log has no positions."""
     sources: list[Source]
+    """The evidence of each sensor as a function of the parameters."""
     start: Floats
     """The parameters from which the fit starts."""
 
@@ -169,7 +190,10 @@ class Prepared(Struct, frozen=True):
 def prepared(
     driven: Sequence[Run], headings: Headings | None, base: Base, length: float
 ) -> Prepared:
-    """Cut the runs into blocks of about `length` s, and check them. Raises `RefusedError`."""
+    """Cut the runs into blocks of about `length` s, check the log, and find starting parameters.
+
+    `headings` are by a sensor, or None without one. Raises `RefusedError` if a check fails.
+    """
     parts = blocks(driven, length)
     plausibility.drives_enough(parts)
     count, start = len(parts), base.start()
@@ -234,13 +258,17 @@ class Candidate(Struct, frozen=True):
     covariance: Floats
     """Covariance of the parameters, shape (COUNT, COUNT)."""
     rows: Rows
-    """The turns of the log, without the gyro's errors."""
+    """The motion in short intervals. The turns by a gyro are corrected for its bias and scale."""
     rate: Rates
     gyro_bias: float
+    """Gyro bias, rad/s; 0 without a gyro."""
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """`TRACK` or `RATIO` if it stays as configured, with its relative deviation by the log."""
+    """Quantities that stay as configured, `TRACK` or `RATIO`.
+
+    Each one has the relative standard deviation with which the log determines it, inf if unknown.
+    """
 
 
 def _calibrated(
@@ -270,14 +298,17 @@ def _calibrated(
         )  # fmt: skip
     known = _known(best, odometry)
     shown = _noise(best, known, odometry, present=bool(worse))
-    # The tape measures the size of the wheels, whatever the log determines.
+    # With a tape, the calibration gives the size of the wheels even if the log improves nothing.
     if worse and tape is None and (shown is None or not shown.better):
         raise RefusedError(worse)
     return _calibration(log, tape, best, odometry, shown)
 
 
 def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
-    """Return the deviations of the geometry. A kept quantity has its configured one."""
+    """Return the standard deviations of the geometry.
+
+    A quantity that stays as configured also keeps its configured standard deviation.
+    """
     base, own = best.made.base, best.result.own()
     now = Deviations.of(odometry, base)
     return Deviations(
@@ -290,7 +321,10 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the noise with the new geometry, or with the `present` one."""
+    """Return the noise that the log shows with the fitted geometry; None if it shows none.
+
+    If `present` is true, the configured geometry is used instead of the fitted one.
+    """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
@@ -306,9 +340,10 @@ def _noise(
 
 
 def _candidates(made: Prepared) -> list[Candidate]:
-    """Return the fit of all parameters, or the fits that keep what this one leaves unsure.
+    """Return the fit of all parameters if it leaves neither the track nor the ratio unsure.
 
-    Raises `RefusedError` if every fit leaves something unsure.
+    Otherwise return up to two fits: one keeps the ratio as configured, the other one the track.
+    Raises `RefusedError` if these also leave a quantity unsure, or if no fit converges.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
@@ -345,7 +380,10 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Return the parameters that a fit holds at the configured ones, by the quantity it keeps."""
+    """Return the constraints of each fit to try, by the quantity that it keeps as configured.
+
+    The quantity "" is for the fit that keeps none.
+    """
     ratio, track, growth = np.zeros((3, COUNT))
     ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
     track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
@@ -353,7 +391,7 @@ def _held(base: Base) -> dict[str, list[Held]]:
 
 
 def _candidate(made: Prepared, fitted: Fit) -> Candidate:
-    """Return a fit to these blocks with its improvement. Raises `RefusedError`."""
+    """Return a fit with its improvement. Raises `RefusedError` if the robot hardly turned."""
     headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
     gyro_scale = 1 + float(fitted.parameters[P.SCALE_ERROR])
@@ -425,7 +463,7 @@ def _stays(name: str, deviation: float) -> str:
 
 
 def _of_noise(shown: Noise | None) -> Iterator[str]:
-    """Yield a sentence about the noise that stays as configured."""
+    """Yield a sentence if some noise stays as configured. `shown` is the noise of the log."""
     if shown is None or not shown.better:
         yield (
             "the variances per metre and per radian stay as configured, because those of this log "
@@ -439,7 +477,10 @@ def _of_noise(shown: Noise | None) -> Iterator[str]:
 
 
 def _cuts(driven: Sequence[Run]) -> Iterator[str]:
-    """Yield a sentence about the gaps of the wheels, and one about the jumps of the positions."""
+    """Yield a sentence about gaps in the wheel speeds, and one about jumps of the positions.
+
+    A sentence is left out if the runs have no gaps or no jumps.
+    """
     if gaps := sum(len(run.gaps) for run in driven):
         yield f"the wheel speeds have {gaps} gaps: the tool uses no data across them"
     if jumps := sum(len(positions.jumps(run)) for run in driven):
@@ -450,7 +491,10 @@ def _cuts(driven: Sequence[Run]) -> Iterator[str]:
 
 
 def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
-    """Yield a sentence for each sensor that agrees with the wheels better than a true one can."""
+    """Yield a sentence for each sensor that agrees with the wheels better than is credible.
+
+    Its values were probably computed from the wheels.
+    """
     rows, headings, base = made.rows, made.headings, made.base
     if headings is not None:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)
@@ -473,9 +517,10 @@ def _own(what: str) -> str:
 
 
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
-    """Return a function from multipliers and the number of a run to the extent of its path.
+    """Return a function that computes the extent of a run's path.
 
-    The track changes with the turn rate as the fit found.
+    Its arguments are multipliers and the number of the run. As in the fit, the track changes with
+    the turn rate.
     """
 
     def follow(values: Floats, number: int) -> Extent:

@@ -1,14 +1,14 @@
 """Finds how soon the wheels of a log follow their commands, and how fast they can turn.
 
-The daemon expects of a healthy wheel that its speed y follows the command u with the time constant
+The daemon expects the speed y of a healthy wheel to follow the command u with the time constant
 `feedback.response_time` (T below). A wheel that contradicts this for `feedback.fault_time` is a
 fault:
 
     T dy/dt = u - y
 
-The response time that fits best is found by trying. The daemon's own witness of a wheel
-(`core/motion/wheel_witness.py`) judges the present one: it counts the time for which the sound
-wheels of the log are evidence of a fault.
+This module tries several response times, and takes the one that fits best. It also checks the
+present response time with the daemon's own fault detection, `core/motion/wheel_witness.py`. This
+detection measures the time for which healthy wheels of the log look faulty.
 """
 
 from __future__ import annotations
@@ -29,33 +29,36 @@ from acsard.core.motion.wheel_witness import SLACK, Expected, Witness
 from acsard.core.values import Twist
 
 TRIED = np.geomspace(0.01, 5.0, 60)
-"""Response times that are tried, s: the range of the setting."""
+"""Response times that are tried, s. They cover the range of the setting."""
 
 LEAST_ROWS, MOST_ROWS = 200, 30_000
-"""Smallest number of wheel samples with a command, and number that is enough.
+"""Minimum number of wheel samples, and maximum number of them that are used.
 
-The latter is five minutes at 100 Hz. More would only take memory.
+The maximum is five minutes at 100 Hz. More samples would only take memory.
 """
 
 FOLLOWS = 0.5
-"""Largest part of the speeds, as squares, that the model may leave unexplained."""
+"""Largest fraction of the sum of the squared speeds that the model may leave unexplained."""
 
 SPARE = 0.5
-"""Largest evidence against a sound wheel with the proposed response time, in fault times."""
+"""Largest time for which a wheel may look faulty with the proposed response time.
+
+It is a fraction of `feedback.fault_time`.
+"""
 
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
-"""Evidence for the highest speed of a wheel.
+"""Criterion for the highest speed of a wheel.
 
-For twice `STEADY_S` s the wheel stays below `REACHED` of its command. In the last `STEADY_S` its
-speed does not change by more than the fraction `CONSTANT`.
+For at least twice `STEADY_S` s, the speed stays below the fraction `REACHED` of its command. In the
+last `STEADY_S` s of this time, the speed changes by less than the fraction `CONSTANT`.
 """
 
 SAME = 1.5
-"""Ratio of response times up to which they count as equal."""
+"""Ratio of two response times up to which the report calls them equal."""
 
 
 class WheelResponse(Struct, frozen=True):
-    """How the wheels of a log follow their commands."""
+    """The response time and the highest speed of the wheels of a log."""
 
     seconds: float
     """Response time that fits best, s."""
@@ -64,16 +67,16 @@ class WheelResponse(Struct, frozen=True):
     present: float
     """Configured response time, s."""
     false_fault: bool
-    """Whether the daemon would take the sound wheels of this log for faulty."""
+    """Whether the daemon would take the healthy wheels of this log for faulty."""
     fastest: float
-    """Highest speed that the wheels reach, rad/s; infinite if no command was higher."""
+    """Highest speed that the wheels reach, rad/s; infinite if the log shows no such limit."""
 
     def settings(self) -> dict[str, float]:
         """Return the settings of `[feedback]` that must change."""
         return {"response_time": self.proposed} if self.false_fault else {}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time, and one about a speed that is a limit."""
+        """Return a sentence about the response time and, if it is finite, one about `fastest`."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (
@@ -96,7 +99,10 @@ class WheelResponse(Struct, frozen=True):
 def response(
     driven: Sequence[Run], drive: DriveConfig, feedback: FeedbackConfig
 ) -> WheelResponse | None:
-    """Return how the wheels follow, or None if the log has no commands that they follow."""
+    """Return the response of the wheels, or None if the log has no commands that they follow.
+
+    `driven` has the runs of the log.
+    """
     parts: list[tuple[Floats, Floats, Floats]] = []
     room = MOST_ROWS
     for run in driven:
@@ -127,9 +133,10 @@ def response(
 
 
 def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
-    """Return the steps (s), the commanded and the measured speeds of both sides, rad/s.
+    """Return the time steps, s, the commanded speeds and the measured speeds, rad/s.
 
-    A step of NaN has no command, or follows a gap. The speeds have the shape (samples, 2).
+    The speeds have the shape (samples, 2), with the left side first. The time step of a sample is
+    NaN if no command applies to the sample, or if a gap precedes it.
     """
     kinematics = Kinematics(drive)
     ahead = kinematics.wheel_speeds(Twist(1.0, 0.0))
@@ -145,7 +152,10 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
-    """Return the expected speeds for each of `TRIED`, shape (samples, 2, times)."""
+    """Return the speeds, rad/s, that the model expects for each response time in `TRIED`.
+
+    The arguments are the results of `_commanded`. The shape is (samples, 2, response times).
+    """
     expected = np.empty((*wanted.shape, len(TRIED)))
     last = np.zeros((2, len(TRIED)))
     for number, step in enumerate(steps):
@@ -160,7 +170,10 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest evidence of a fault, s, that the daemon sees with this response time."""
+    """Return the longest time, s, for which a wheel looks faulty with this response time.
+
+    `parts` has the results of `_commanded`. `fault_time` is the setting of this name, s.
+    """
     longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
@@ -178,7 +191,10 @@ def _evidence(
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
-    """Return the speed at which wheels stay though their commands are higher, rad/s, or inf."""
+    """Return the highest constant speed of a wheel whose command is higher, rad/s, or infinity.
+
+    `parts` has the results of `_commanded`.
+    """
     found: list[float] = []
     for steps, wanted, seen in parts:
         for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):

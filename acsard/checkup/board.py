@@ -4,7 +4,8 @@ Each step of the check is an experiment. It sends lines for some time, all repli
 recording, `replies`, and the step judges the recording. Speeds belong to motors, not to wheels: the
 check has to find out which wheel a motor turns. Three events end any experiment at once, with zeros
 and then silence: a motor runs away, the MCU falls silent while a motor turns, or the board
-restarts. The wire and the operator are the two parts outside the check.
+restarts. The serial line (`Wire`) and the person (`Operator`) are interfaces that the caller
+implements.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Wire(Protocol):
     """A serial line."""
 
     def open(self, baud_rate: int) -> None:
-        """Open the line, or continue at another rate. Raises a `MendableError`."""
+        """Open the line, or change the rate of the open line. Raises `MendableError` on failure."""
 
     def close(self) -> None:
         """Send the last bytes and close the line."""
@@ -43,7 +44,7 @@ class Wire(Protocol):
         """Return the monotonic time, ns."""
 
     def send(self, data: bytes) -> None:
-        """Send bytes now. Raises `WireLostError`."""
+        """Send bytes now. Raises `WireLostError` if the line is lost."""
 
     def late_ns(self) -> int:
         """Return how long the board has waited for a processor since the last call, ns.
@@ -52,9 +53,9 @@ class Wire(Protocol):
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Return the pieces received until `until_ns`, each with its time, ns.
+        """Receive until the monotonic time `until_ns`, and return each piece with its time, ns.
 
-        Raises `WireLostError`.
+        Raises `WireLostError` if the line is lost.
         """
 
 
@@ -62,20 +63,20 @@ class Operator(Protocol):
     """The operator at the robot."""
 
     def doing(self, text: str) -> None:
-        """Show the present activity until the next one."""
+        """Show this text about the present activity of the check until the next call."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Return one of the answers, or None if no person watches the robot."""
 
 
 LEAST_S = 0.001
-"""Shortest time for which a line is sent, s."""
+"""Shortest rest of a time span for which `drive` still sends a line, s."""
 
 BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
 """Interval at which the lateness of this computer is measured while listening, ns."""
 
 FAREWELL = 5
-"""Number of times that the last zeros are sent, in each form."""
+"""Number of times that zeros are sent at the end of the check, with and without the comma."""
 
 
 KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
@@ -95,12 +96,13 @@ class Board:
         self.longest_reply_s = longest_reply
         """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """Whether the motors were seen at rest. From then on, a runaway ends the check."""
+        """Whether all motors have been seen at rest. Only then does a runaway end the check."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
+        """Whether lines end with a comma."""
         self.latched = False
-        """Whether zeros in the form that is not `comma` left the last motor turning."""
+        """Whether the last motor kept turning after zeros whose end was the opposite of `comma`."""
         self.sealed = self.sampled = False
         """Whether lines carry the checksum, and whether they ask for the sample fields."""
         self.identity: dict[str, str] = {}
@@ -117,8 +119,10 @@ class Board:
         self.others: list[bytes] = []
         """Lines that are not good replies."""
         self.inputs: dict[int, bool] = {}
-        """Whether each input was pressed in the last status line that had it: 0 is the emergency
-        stop, and the bumpers follow from 1."""
+        """Whether each input was pressed, in the last status line that reported the input.
+
+        Key 0 is the emergency stop. The bumpers have the keys from 1 on.
+        """
         self.heard = Heard()
         """Everything that was received since the port was opened."""
         self.sent_lines = 0
@@ -128,12 +132,12 @@ class Board:
         self.fled = False
         """Whether zeros fail to stop a motor, or make it run away.
 
-        Then only silence, by the MCU's watchdog, may stop it.
+        Then the host must send nothing more, so that the MCU's watchdog can stop the motor.
         """
 
         self._commanded = ZERO
         self._unanswered_s = 0.0
-        """Time for which `drive` has had no reply, s. Pauses of this host do not count."""
+        """Time for which `drive` has received no reply, s, without the pauses of this host."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -211,7 +215,10 @@ class Board:
     # Sending
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
-        """Return the line for these speeds, rad/s. A `comma` of None is the form in force."""
+        """Return the line for these speeds, rad/s.
+
+        `comma` says whether the line ends with a comma. None means the form `self.comma`.
+        """
         line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
             return line
@@ -219,7 +226,7 @@ class Board:
         return seal(line, self._sequence, ASK_SAMPLE if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
-        """Send one command now."""
+        """Send one line with these speeds, rad/s. `comma` has the same meaning as in `line`."""
         turned, self._commanded = any(self._commanded), motors
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1
@@ -236,7 +243,7 @@ class Board:
         self.restarts.sent(ZERO, self.now_s)
 
     def wakes(self, seconds: float) -> bool:
-        """Send zeros until the board answers. Return False if it does not within `seconds`."""
+        """Send zeros until the board answers. Return False if no reply arrives within `seconds`."""
         before, end_s = len(self.replies), self.now_s + seconds
         while len(self.replies) == before:
             if self.now_s >= end_s:
@@ -246,15 +253,22 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send zeros once and listen for their answer, for at least one period."""
+        """Send one line of zeros, and listen for its answer for `wait_s` s, at least one period.
+
+        `comma` has the same meaning as in `line`.
+        """
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """Send this many lines one by one, and return the first reply to each with its delay, s."""
-        # Replies to earlier lines must not count for these.
+        """Send this many lines of zeros, and return the first reply to each with its delay, s.
+
+        After each line the host waits `wait_s` s, at least 1.5 periods. `comma` has the same
+        meaning as in `line`.
+        """
+        # Replies to earlier lines must not be taken for replies to these lines.
         self.listen(max(motion.GLANCE_S / 4, wait_s))
         got: list[tuple[float, Reply]] = []
         for _ in range(lines):
@@ -264,8 +278,9 @@ class Board:
         return got
 
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
-        """Command these speeds for `seconds`, line after line, and return the replies of that time.
+        """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies of that time.
 
+        The time between two lines is `period_s`; 0 means `self.period_s`.
         Ends the check if the MCU falls silent meanwhile, because a runaway would not be seen.
         """
         period_s = period_s or self.period_s
@@ -285,7 +300,7 @@ class Board:
         return got
 
     def let_go(self, silent_s: float) -> None:
-        """Send zeros once, then nothing for `silent_s`.
+        """Send zeros once, then nothing for `silent_s` s.
 
         In the silence, the watchdog cuts a motor that zeros do not stop.
         """
@@ -295,9 +310,9 @@ class Board:
     # Receiving
 
     def listen(self, seconds: float) -> list[Reply]:
-        """Return the replies of the next `seconds`.
+        """Receive for `seconds`, and return the replies of that time.
 
-        Raises if a motor runs away or the board restarts.
+        Raises `StoppedError` if a motor runs away, and `RestartedError` if the board restarts.
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
@@ -314,7 +329,7 @@ class Board:
                 return got
 
     def _hear(self, until_ns: int) -> list[Reply]:
-        """Receive until `until_ns` and return the good replies."""
+        """Receive until the monotonic time `until_ns`, and return the good replies."""
         got = []
         for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
@@ -361,7 +376,7 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Time since the last reply, s; 0 if there was none or if the board must not be asked."""
+        """Time since the last reply, s; 0 if there was none, or if nothing more may be sent."""
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
@@ -390,8 +405,8 @@ class Board:
     def rest(self) -> None:
         """Stop all motors and wait until they stand. Ends the check if they do not.
 
-        If the last motor kept its speed and zeros in the other form stop it, that form is in force
-        from then on.
+        If the last motor kept its speed, and zeros with the other form of the comma stop it, the
+        check uses that form from then on.
         """
         began_s = self.now_s
         if self.settles(self.comma):

@@ -1,4 +1,4 @@
-"""The result of the check as text and as an object, and its changes to `acsard.toml`."""
+"""The result of the check as text and as an object, and the changes to `acsard.toml` from it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from acsard.core.config.settings import Config
 from acsard.core.config.writing import excerpt
 
 Changes = dict[str, object]
-"""New values by dotted key, in the order of the file."""
+"""New configuration values by dotted key, such as `mcu.port`."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
-"""Keys that only improve the link. They go if the wire has no room for the longer lines."""
+"""Keys that only improve the link. They are left out if the wire is too slow for longer lines.
+
+The first key is left out first.
+"""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
@@ -29,7 +32,10 @@ def answered(findings: Iterable[Finding]) -> bool:
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
-    """Return the keys to change, with the `port` if one is given and a board answered there."""
+    """Return the configuration values to change.
+
+    They include `port` as `mcu.port` unless it is "" or no board answered there.
+    """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
         wanted |= finding.keys
@@ -39,8 +45,8 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
         changed = applied(given, config)
         return changed is not None and not contradictions(changed)
 
-    # Longer or slower lines may leave no room for the control rate. Give up the least important
-    # first.
+    # Longer or slower lines may leave no room for the control rate. Leave out the least important
+    # keys first.
     for optional in ("", *OPTIONAL):
         if optional and attrgetter(optional)(config) in (0, "off"):
             differing.pop(optional, None)
@@ -51,7 +57,10 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
 
 def withheld(simulated: bool, config: Config) -> str:
-    """Return why findings about the simulator do not apply to this configuration, or ""."""
+    """Return why the findings do not apply to this configuration, or "" if they do.
+
+    `simulated` says whether the check tested the simulator. Its findings do not apply to a robot.
+    """
     if not simulated or config.mcu.simulated:
         return ""
     return (
@@ -75,8 +84,8 @@ def applied(given: Changes, config: Config) -> Config | None:
 class Report(Struct, frozen=True):
     """A check that has ended.
 
-    `written` is the file that the changes were written to, and `error` a failure that is not about
-    the board.
+    `toml` has the changes as lines of TOML. `written` is the file to which they were written, or
+    None. `error` is a failure that does not concern the board, or None.
     """
 
     port: str
@@ -101,7 +110,7 @@ def report(
     """Return the report of a check.
 
     A check has passed only if the board answered, every step was reached and judged, and none
-    failed.
+    failed. The report has None for an empty `written`, `error` or `withheld`.
     """
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)
@@ -112,7 +121,10 @@ def report(
 
 
 def summary(found: Report, where: str) -> str:
-    """Return the number of each verdict and of unjudged findings, and the lines for `where`."""
+    """Return a text with the numbers of verdicts and unjudged findings, and the lines for `where`.
+
+    `where` is the name of the configuration file.
+    """
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(found.findings):

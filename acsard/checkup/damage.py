@@ -16,7 +16,11 @@ WHOLE = {"over-long", "garbage before it"}
 
 
 def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
-    """Return every kind of damaged line with its name. Other motors than `motors` are at zero."""
+    """Return the damaged lines, each with the name of its kind of damage.
+
+    The lines command `SPEED` for `motors` and zero for the others. `comma` says whether they end
+    with a comma. `sealed` adds lines with a damaged checksum.
+    """
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
         for motor, letter in enumerate(LETTERS)
@@ -46,11 +50,11 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send every kind of damaged line to standing `motors`, and report whether one obeyed."""
+    """Send every kind of damaged line while `motors` stand, and report the kinds that moved one."""
     if not motors:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
-    board.drive(ZERO, GLANCE_S)  # a coarse encoder may show only now that they ran on
+    board.drive(ZERO, GLANCE_S)  # a coarse encoder may show only now that the motors ran on
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))
@@ -60,7 +64,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
 
 
 def _moves(board: Board, line: bytes) -> bool:
-    """Return whether a standing motor turns because of this line. It stands again afterwards."""
+    """Return whether this line makes a motor turn that stands. The function then stops it again."""
     for _ in range(3):  # a motor needs a moment to show that it obeyed
         board.wire.send(line)
         board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))

@@ -1,6 +1,6 @@
 """The microcontroller's dialect: baud rate, identification, form of lines, checked link and pace.
 
-The pace is how often the board answers, whether it reports by its own clock, and how soon. These
+The pace is how often and how soon the board answers, and whether it reports by its own clock. These
 steps send only zeros and questions. Later steps use the results.
 """
 
@@ -22,7 +22,7 @@ from acsard.core.link.session import IDENTITY
 
 
 def baud(board: Board) -> Finding:
-    """Find the baud rate at which the board answers. Ends the check if there is none."""
+    """Find the baud rate at which the board answers. Ends the check if it answers at no rate."""
     configured = board.mcu.baud_rate
     if board.baud_rate != configured:
         board.open(configured)  # the board restarted while another rate was being tried
@@ -40,7 +40,10 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros in both forms until three good replies have arrived."""
+    """Send zeros as plain and as checked lines until three good replies have arrived.
+
+    Returns False if they do not arrive within `seconds`.
+    """
     end_s = board.now_s + seconds
     while board.now_s < end_s:
         board.zeros()
@@ -74,7 +77,10 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Check the configured form of line. Returns None if the board answers it, or if unknown."""
+    """Check whether the board answers lines with the configured form of the comma at their end.
+
+    Returns None if it does, or if the check cannot find that out.
+    """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
     if _answers(board, board.comma):
@@ -88,9 +94,9 @@ def _answers(board: Board, comma: bool) -> list[Reply]:
 
 
 def comma(board: Board, dead: bool) -> Finding:
-    """Judge whether the last motor needs the other form of the comma at the end of the line.
+    """Return the finding about the comma at the end of the line, which the last motor may need.
 
-    `dead` says that no movement of the last motor was seen, or that it could not be judged.
+    `dead` is True if the last motor was not seen to move, or if its movement could not be measured.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
@@ -101,7 +107,10 @@ def comma(board: Board, dead: bool) -> Finding:
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
-    """Return the finding that the configured form is wrong; `board.comma` is the right one."""
+    """Return the finding that the configured form of the comma is wrong.
+
+    `board.comma` is the right form. `how` is the second part of the outcome's name.
+    """
     return outcomes.find(
         f"trailing comma: {how}",
         {"mcu.trailing_comma": board.comma},
@@ -113,7 +122,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Judge the form of the replies. The host can read every form that is named here."""
+    """Compare the form of the replies with the documented form. The host can read all of them."""
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
@@ -125,7 +134,10 @@ def replies(board: Board) -> Finding:
 
 
 def check(board: Board) -> Finding:
-    """Find out whether the board knows the checked link and the samples, and use what it knows."""
+    """Find out whether the board supports the checked link and the sample fields.
+
+    The later steps use both if the board supports them.
+    """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True
     if not any(reply.reading for reply in _answers(board, board.comma)):
@@ -179,7 +191,7 @@ def rate(board: Board) -> Finding:
 
 
 def trip(board: Board) -> Finding:
-    """Measure how soon a line is answered."""
+    """Measure how soon the board answers a line."""
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:

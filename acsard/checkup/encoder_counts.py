@@ -1,4 +1,4 @@
-"""Compares the sample fields with the speeds and finds the encoder counts per wheel turn."""
+"""Compares the counts in the sample fields with the speeds, to find the counts per wheel turn."""
 
 from __future__ import annotations
 
@@ -12,24 +12,33 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.motion import GLANCE_S, Reply, steps
 
 AGREES = 0.02
-"""Fraction by which the measured counts may differ from the stated ones."""
+"""Largest relative difference between the measured and the stated counts per turn."""
 
 COARSE = 0.015
-"""Mean jump of a motor's angle from line to line, rad, from which on its encoder is coarse: the
-daemon then needs the counts."""
+"""Mean jump of a motor's angle from line to line, rad. An encoder with this jump or more is coarse.
+
+The daemon must know the counts per turn of a coarse encoder.
+"""
 
 LONGEST_S = 0.05
-"""Time between lines above which the motors' own accelerations look like such jumps, s."""
+"""Longest time between two lines, s, for which jumps can show a coarse encoder.
+
+In a longer time, the motors' own accelerations look like such jumps.
+"""
 
 LEAST_ANGLES = 20
-"""Lines with a motor that turns, from which on the speeds show what they are."""
+"""Smallest number of speeds of turning motors that can show a coarse encoder."""
 
 MOST_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""
 
 
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Return the counts per turn by the reported speeds, None if the motors turned too little."""
+    """Return the encoder counts per wheel turn, measured against the reported speeds.
+
+    The result is negative if the counts run against the speeds, and None if the motors turned too
+    little.
+    """
     counts = angle = 0.0
     for step in steps(replies):
         for motor in motors if step.counts and step.mcu_s <= GLANCE_S else ():
@@ -42,9 +51,10 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
 
 def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Return roughly the counts per turn of coarse encoders, by the speeds in lines without counts.
+    """Estimate the counts per turn of coarse encoders from speeds, for lines without counts.
 
-    Return None if the speeds do not jump from line to line by a count of a coarse encoder.
+    Return None if the speeds do not jump from line to line by a count of a coarse encoder, or if
+    there are too few of them.
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
     # The time of a single line may be wrong if this computer is late.
@@ -65,7 +75,11 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Judge `mcu.encoder_counts` by the identification, or by motors that turned as commanded."""
+    """Return the finding that compares `mcu.encoder_counts` with the board.
+
+    The board states its counts per turn in its identification, and they are measured with `motors`,
+    which turned as commanded.
+    """
     if not board.sampled:
         about = coarse(board.replies, motors)
         if about is None or board.mcu.encoder_counts:

@@ -14,7 +14,7 @@ from acsard.core.values import WHEELS, AcsardError
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
 REST = "the rest"
-"""Name of the row that lists the steps which an early end left out."""
+"""Name of the row that lists the steps that were not run because the check ended early."""
 
 
 class Finding(Struct, frozen=True):
@@ -54,7 +54,7 @@ def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
 
 
 def words(wheel: str) -> str:
-    """Return a wheel's name in words."""
+    """Return a wheel's name with spaces: "front right" for "front_right"."""
     return wheel.replace("_", " ")
 
 

@@ -17,7 +17,7 @@ PRESS_S = 20.0
 """Time that the operator has to press an input and to release it, s."""
 
 NEWS_S = 0.5
-"""Time in which a board reports each of its inputs, s."""
+"""Time within which a board has reported each of its inputs at least once, s."""
 
 
 class Input(Struct, frozen=True):
@@ -31,7 +31,8 @@ class Input(Struct, frozen=True):
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     """Let the operator press each input that the configuration names or the board reports.
 
-    Bumpers without places in the configuration have the numbers of the board.
+    The configuration names the bumpers by their places. If it names none, the bumpers have the
+    numbers that the board gives them.
     """
     board.ask(NEWS_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
@@ -79,5 +80,5 @@ def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]
         instead = f" but of the {' and the '.join(others)}" if others else ""
         return f"{asked.name}: no press was reported{instead}"
     if others:
-        return f"{asked.name}: the {' and the '.join(others)} was reported with it"
+        return f"{asked.name}: the board also reported the {' and the '.join(others)}"
     return "" if not now else f"{asked.name}: no release was reported"

@@ -1,8 +1,9 @@
 """Measures the lateness of this computer, and decides which findings it spoils.
 
-An overloaded computer asks late and receives late, and so finds faults that the board does not
-have. If the board is itself a program on this computer, its waiting time counts as well. A step
-that ran at such a time is repeated (`procedure.py`), and its finding is never blamed on the board.
+An overloaded computer sends and receives late, and so finds faults that the board does not have. If
+the board is itself a program on this computer, the time for which it waits for a processor is
+lateness as well. A step during which this computer was too late is repeated (`procedure.py`), and
+its finding is never blamed on the board.
 """
 
 from __future__ import annotations
@@ -14,13 +15,16 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.outcomes import Unsure
 
 LEAST_S = 0.005
-"""Lateness below which nothing is recorded, s: every computer has as much now and then."""
+"""Smallest delay that is recorded, s. Every computer has smaller ones now and then."""
 
 SPOILS_S = motion.PERIOD_S
-"""Lateness from which on a fault may be this computer's, s: a whole line was late."""
+"""Smallest delay of this computer that can cause a bad finding, s: a whole line was late."""
 
 PAUSE_S = motion.WATCHDOG_LEAST_S
-"""Lateness, s, from which even a good result is doubtful: the watchdog may have cut motors."""
+"""Smallest delay of this computer that makes even a good finding doubtful, s.
+
+The watchdog may have cut the motors in that time.
+"""
 
 
 LATE = "late: not judged"
@@ -28,13 +32,13 @@ LATE = "late: not judged"
 
 
 class Lateness:
-    """Delays of this computer and their times, in s."""
+    """How late this computer woke up: each delay in s, with the time at which it ended, s."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[float, float]] = []
 
     def look(self, late_s: float, now_s: float) -> None:
-        """Record a delay that ends now."""
+        """Record a delay of `late_s` that ends at the monotonic time `now_s`, both in s."""
         if late_s >= LEAST_S:
             self._seen.append((now_s, late_s))
 
@@ -44,16 +48,17 @@ class Lateness:
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
-    """Return whether a computer that was this late may have caused the finding.
+    """Return whether a computer that was late by up to `late_s` s may have caused the finding.
 
-    It may have been late twice within a measurement: where that began and where it ended.
+    The computer may have been late both at the start and at the end of a measurement, so half of
+    the finding's margin is enough.
     """
     least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
     return late_s >= max(least_s, found.margin_s / 2)
 
 
 def finding(name: str, late_s: float) -> Finding:
-    """Return the finding that a step was not judged."""
+    """Return the finding that the step `name` was not judged, because this computer was late."""
     return outcomes.find(LATE, name=name, late=late_s * 1000)
 
 
@@ -63,6 +68,6 @@ def judged(found: Finding) -> bool:
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:
-    """Return the names that no finding judges. The last finding of each name counts."""
+    """Return the names of the subjects whose last finding says that they were not judged."""
     last = {found.name: found for found in findings}
     return [name for name, found in last.items() if not judged(found)]

@@ -1,8 +1,9 @@
 """Counts lost and damaged lines, and finds long silences of the board and the direction of a loss.
 
-A line that arrives damaged was damaged on the way back. An unanswered line may have been lost in
-either direction, and the motors show the direction. Single lines turn standing motors for a moment,
-again and again. A line that the motors obeyed has arrived, so its answer was the one that got lost.
+A reply that arrives damaged was damaged on its way from the board. An unanswered line may have been
+lost in either direction, and the motors show the direction: the check sends single lines that turn
+standing motors for a moment. If the motors obeyed an unanswered line, the line arrived, so its
+answer was lost.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ MOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""
 
 FEW = 2
-"""Number of lost lines from which on the loss is not a coincidence."""
+"""Smallest number of lost lines that is not taken for a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
 """Number of lines that show a loss of 2 %, and shortest and longest duration of the count, s.
@@ -39,7 +40,10 @@ SILENT = 2.0
 
 
 class Count(Struct, frozen=True):
-    """Counts of lines. The `damaged` ones, which arrived damaged, are among the `lost` ones."""
+    """Numbers of all lines and of the lost ones.
+
+    `lost` includes the `damaged` lines, which arrived damaged.
+    """
 
     lines: int
     lost: int
@@ -52,10 +56,10 @@ class Count(Struct, frozen=True):
 
 
 def finding(board: Board) -> Finding:
-    """Send zeros at the host's rate, judge the replies, and set `board.lost`.
+    """Send zeros at the host's rate, count the replies, and set `board.lost`.
 
     Ends the check if plain lines arrive damaged: lines to the board may then be damaged too, and
-    could tell a motor any speed. The loss cannot be determined if the board's pace is unknown.
+    could command any speed. The loss cannot be determined if the board's pace is unknown.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
@@ -135,7 +139,8 @@ PULSE_S = 0.08
 """Time for which a single line turns the motors, s: long enough to see, below the watchdog's."""
 
 TOLD, PULSES_S = 8, 20.0
-"""Number of unanswered pulses that shows the direction, and longest time to wait for them, s."""
+"""Number of unanswered pulses that shows the direction of the loss, and longest time to wait for
+them, s."""
 
 SPREAD, STRIDE = 12, 5
 """Number of different pauses between pulses, and the stride by which they are ordered.
@@ -147,11 +152,15 @@ OBEYED = 0.5
 """Fraction of the usual angle of a pulse above which the motors obeyed it."""
 
 SEEN, GRAINS = 0.02, 4
-"""Smallest usable angle of a pulse, in rad and in smallest steps of the encoders."""
+"""Smallest usable angle of a pulse, in rad and in steps of the encoders; the larger one applies."""
 
 
 class Ways(Struct, frozen=True):
-    """Numbers of pulses: `sent`, lost on the way `there`, and obeyed without an answer (`back`)."""
+    """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
+
+    `sent` is the number of all pulses. `there` were lost on the way to the board. `back` were
+    obeyed, but their answers were lost.
+    """
 
     sent: int
     there: int
@@ -180,7 +189,10 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
-    """Send pulses to standing motors and count the losses; None if the motors cannot tell."""
+    """Send pulses to standing motors and count the losses.
+
+    Return None if the movement of `motors` does not show which pulses arrived.
+    """
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
     # A board that reports by its own clock answers no line, so nothing has shown any loss yet.
     end_s = board.now_s + (10.0 if board.own_clock else PULSES_S)
@@ -188,7 +200,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
     unanswered: list[float] = []
     count = 0
     while len(unanswered) < TOLD and board.now_s < end_s:
-        # An answer to an earlier line must not count for this one.
+        # An answer to an earlier line must not be taken for the answer to this one.
         board.listen(motion.GLANCE_S / 4)
         since_s, coasting = board.now_s, board.replies[-1].motors
         answered = bool(board.drive(on, PULSE_S, PULSE_S))
@@ -214,13 +226,13 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether none of the board's own reports since then is missing."""
+    """Return whether none of the board's own reports since `since_s` is missing."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 
 
 def _grain(board: Board, motors: Sequence[int]) -> float:
-    """Return the smallest angle that these encoders showed between two replies, rad."""
+    """Return the smallest angle above 0 that these encoders showed between two replies, rad."""
     course = motion.steps(board.replies)
     shown = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
     return min((angle for angle in shown if angle), default=0.0)

@@ -1,7 +1,7 @@
 """Evaluates the motors' movement in a recording: pure functions of replies and their times.
 
-The module also has the speeds and times that several steps share, in rad/s and s. A limit that only
-one step uses is defined there.
+The module also has the speeds, rad/s, and times, s, that several steps of the check share. A limit
+that only one step uses is defined in the module of that step.
 """
 
 from __future__ import annotations
@@ -18,40 +18,51 @@ from acsard.core.config.wire_time import FIELD
 from acsard.core.link.checksum import Reading
 from acsard.core.link.codec import Motors
 
-# Bounds within which a measured time agrees with the contract's `WATCHDOG_S`.
+# Bounds, s, of a measured watchdog time that agrees with the firmware's contract, `WATCHDOG_S`.
 WATCHDOG_LEAST_S = 0.1  # a pause of this host that is longer may already have stopped the motors
 WATCHDOG_MOST_S = 0.5
 
 # Speeds, rad/s
 SPEED = 3.0  # the fastest speed that is commanded: half a turn per second
 RUNAWAY = 2 * SPEED  # a faster motor ends the check
-MOVES = SPEED / 4  # an encoder that shows at least this part of a command moves
-STANDING = SPEED / 10  # a slower motor stands
-# A motor that shows this in a short probe moves; a heavy wheel has hardly begun to turn by then.
+MOVES = SPEED / 4  # a motor at this speed or above counts as moving
+STANDING = SPEED / 10  # a motor below this speed counts as standing
+# A motor that reaches this speed in a short probe counts as moving. The limit is low, because a
+# heavy wheel has hardly begun to turn by then.
 PROBE_MOVES = SPEED / 40
 
 # Times, s
-PERIOD_S = 0.02  # between two lines, if the wire can carry that
+PERIOD_S = 0.02  # interval between two lines, unless the wire needs longer for a line
 GLANCE_S = 0.2  # enough for a few replies, and for some counts of a coarse encoder
-MOTOR_S = 2.0  # by then a lifted wheel has its speed or has lost it, unless its speed still changes
+# A lifted wheel reaches the commanded speed, or comes to rest, within this time. A wheel whose
+# speed still changes then gets more time.
+MOTOR_S = 2.0
 # Longest wait for a speed that still changes: a heavy wheel, or a hub motor that coasts.
 PATIENCE_S = 3 * MOTOR_S
 BOOT_S = 3.0  # a restarted board answers by then; many bootloaders wait two seconds
-CUT_S = WATCHDOG_MOST_S + GLANCE_S  # after such a silence every correct watchdog has cut the motors
-STOOD_S = WATCHDOG_MOST_S + MOTOR_S  # the motors stand by then, or the MCU has no watchdog
+CUT_S = WATCHDOG_MOST_S + GLANCE_S  # a silence after which every correct watchdog has cut motors
+# A silence after which the motors stand, unless the MCU has no watchdog.
+STOOD_S = WATCHDOG_MOST_S + MOTOR_S
 
 
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
 TREND_S = 0.5
-"""Time over which speeds are compared with those just before, s."""
+"""Shortest length of the two intervals whose mean speeds `trend` compares, s."""
 
 FALLS = 0.97
-"""Ratio to the earlier speed below which a speed falls; it rises above the inverse."""
+"""Ratio of a motor's speed to its speed just before. Below it, the motor slows down.
+
+Above the inverse of this ratio, the motor speeds up.
+"""
 
 
 class Reply(Struct, frozen=True):
-    """A good line of the MCU that was complete at `at_s`."""
+    """A good line of the MCU with the speeds of its motors, rad/s.
+
+    `at_s` is the monotonic time at which the line was complete, s. `reading` has the sample fields,
+    or is None if the line has none.
+    """
 
     at_s: float
     motors: Motors
@@ -60,10 +71,11 @@ class Reply(Struct, frozen=True):
 
 
 class Step(Struct, frozen=True):
-    """The interval between two replies: its duration in s and the speeds in rad/s.
+    """The interval between two replies.
 
-    If the MCU reports them, it also has the duration on the MCU's clock, and by how many counts
-    each encoder moved, wrapped to the shorter way.
+    `seconds` is its duration on this computer's clock. `speeds` are the speeds in the later reply,
+    rad/s. If both replies have the sample fields, `mcu_s` is the duration on the MCU's clock, s,
+    and `counts` is the number of counts by which each encoder moved, -32768 to 32767.
     """
 
     seconds: float
@@ -73,24 +85,24 @@ class Step(Struct, frozen=True):
 
 
 def each(value: Callable[[int], float]) -> Motors:
-    """Return a value for each motor, by its number."""
+    """Return `value(motor)` for the motors 0 to 3."""
     a, b, c, d = (value(motor) for motor in range(4))
     return a, b, c, d
 
 
 def moving(speeds: Motors, least: float = MOVES) -> list[int]:
-    """Return the motors, or encoders, that move."""
+    """Return the motors that turn at `least` rad/s or faster, in either direction."""
     return [motor for motor in range(4) if abs(speeds[motor]) >= least]
 
 
 def since(replies: Sequence[Reply], since_s: float, until_s: float = math.inf) -> Sequence[Reply]:
-    """Return the replies from the first time to the second."""
+    """Return the replies that arrived from `since_s` to `until_s`, s on the monotonic clock."""
     first = bisect_left(replies, since_s, key=lambda reply: reply.at_s)
     return replies[first : bisect_right(replies, until_s, key=lambda reply: reply.at_s)]
 
 
 def mean(replies: Sequence[Reply]) -> Motors:
-    """Return each encoder's mean speed over these replies, rad/s."""
+    """Return each encoder's mean speed over these replies, rad/s; 0 if there are none."""
     return each(lambda motor: fmean([reply.motors[motor] for reply in replies] or [0.0]))
 
 
@@ -108,7 +120,11 @@ def steps(replies: Sequence[Reply]) -> Iterator[Step]:
 
 
 def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
-    """Return the encoders' angles since then, rad, by the counts if `per_turn` is given."""
+    """Return the angle that each encoder turned since `since_s`, rad.
+
+    `per_turn` is the number of encoder counts per turn. If it is 0, or if a reply has no counts,
+    the angle is computed from the speeds.
+    """
 
     def angle(step: Step, motor: int) -> float:
         if per_turn and step.counts:
@@ -120,7 +136,10 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 
 
 def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
-    """Return the ratio of each motor's speed to that of a moment before; 1 if it stands."""
+    """Return the ratio of each motor's mean speed until `now_s` to its mean speed just before.
+
+    `gap_s` is the time between two replies, s. The ratio is 1 for a motor that stands.
+    """
     span_s = max(TREND_S, 4 * gap_s)
     before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
     now = mean(since(replies, now_s - span_s, now_s))
@@ -129,9 +148,11 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
 
 
 def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
-    """Return how long a steady motor turns for the angle by which its speed readings jump, s.
+    """Return the resolution of the speed readings as a time, s.
 
-    Whole encoder counts make the readings jump by one count per reply.
+    The readings jump, because the firmware counts whole encoder counts per reply. The result is the
+    time that a motor at `SPEED` needs for the angle of one jump. `steady` are replies from a time
+    at which `motors` turned at this speed. The result is 0 for fewer than five replies.
     """
     if len(steady) < 5:
         return 0.0
@@ -145,8 +166,9 @@ def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
     """Return a motor that certainly turns faster than `above` rad/s, and its speed, or None.
 
     One reading proves nothing, because it may be damaged or a single count of a coarse encoder. The
-    largest of the last few steps is therefore ignored. The short interval shows a sudden runaway
-    sooner; the longer one shows it with a coarse encoder.
+    largest of the last few steps is therefore ignored. The function examines a short and a longer
+    interval: the short one shows a sudden runaway sooner, and the longer one shows it with a coarse
+    encoder.
     """
     for span_s in (GLANCE_S / 2, GLANCE_S) if replies else ():
         near = since(replies, replies[-1].at_s - span_s)

@@ -336,15 +336,18 @@ FAIL serial line: lost | lost
 class Unsure(Finding, frozen=True):
     """A finding that may be caused by the lateness of this computer, whatever the board does.
 
-    `margin_s` is how far the measurement is beyond its bound. A smaller delay cannot have caused
-    the finding.
+    `margin_s` is how far the measurement is beyond its bound, s. A delay of less than half of
+    that cannot have caused the finding.
     """
 
     margin_s: float = 0.0
 
 
 class Outcome(Struct, frozen=True):
-    """One outcome. `figure`, `text` and `mend` are templates for the measured values."""
+    """One outcome. `figure`, `text` and `mend` are format strings for the measured values.
+
+    `unsure` says whether a late computer can cause this outcome.
+    """
 
     verdict: Verdict
     unsure: bool
@@ -387,5 +390,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """Return the finding as it is reported, without its margin."""
+    """Return the finding as a plain `Finding`, as the report has it, without the margin."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

@@ -43,7 +43,7 @@ STEPS = (
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines", "inputs",
 )  # fmt: skip
-"""Steps in their order. Those that an early end leaves out are listed in one row."""
+"""Names of the steps in their order. After an early end, one row lists the steps not reached."""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
@@ -61,13 +61,14 @@ Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""Repetitions of a step for which this computer was late, and of all such steps together.
+"""Largest number of repetitions due to a late computer: of one step, and of all steps together.
 
 The total is limited because a check must not take four minutes.
 """
 
 AGAIN, MOST = 1, 5
-"""Repetitions of a step in which the board restarts, and number of restarts that ends the check."""
+"""Largest number of repetitions of a step in which the board restarts, and number of restarts in
+all that ends the check."""
 
 
 def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
@@ -80,7 +81,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report a finding unless one of the same name was reported and judged already."""
+        """Report a finding unless one of the same name has been reported and judged before."""
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -152,7 +153,7 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor. The operator is asked only if this computer was in time."""
+        """Test one motor. The operator is asked only if this computer was punctual."""
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -172,7 +173,10 @@ class _Steps:
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Return the finding of a step, repeated while this computer is late, or not judged."""
+        """Run a step, again if this computer was late, and return its finding.
+
+        If the computer is late each time, the finding says that the step was not judged.
+        """
         board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
@@ -224,7 +228,11 @@ class _Steps:
                 board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
-        """Return the finding of a step, after a silent board had time to report a restart."""
+        """Run a step and return its finding.
+
+        After a bad finding, a board that is silent first gets time to answer, so that a restart is
+        noticed.
+        """
         try:
             finding = step()
         except StoppedError:
@@ -235,7 +243,10 @@ class _Steps:
         return finding
 
     def _await_return(self, silent_s: float) -> None:
-        """Send zeros to a board silent for `silent_s` until it answers or had time to boot."""
+        """Send zeros until the board answers or has had time to boot.
+
+        Do nothing unless the board has been silent for longer than `silent_s` s.
+        """
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):
             board.wakes(BOOT_S)

@@ -22,13 +22,19 @@ from acsard.core.link.session import IDENTITY
 from acsard.core.values import AcsardError
 
 ASKED_S = 1.0
-"""Time after the question within which an identification is its answer, s."""
+"""Longest delay of the answer to a request for the identification, s.
+
+An identification that arrives later is one that the board sent by itself.
+"""
 
 UNANSWERED = 5
-"""Number of unanswered lines in a row after which a text is more than a debug print."""
+"""Number of unanswered lines in a row after which a printed text shows a restart.
+
+After fewer lines, the text may be a debug print.
+"""
 
 AHEAD_S = 2.0
-"""Time by which the board's clock may advance more than ours between two replies, s.
+"""Time by which the board's clock may advance more than this host's between two replies, s.
 
 Lines that were delayed on their way cause such differences.
 """
@@ -37,7 +43,7 @@ CLOCK = 65536
 """Period of the board's clock, ms."""
 
 SILENT_S = 0.25
-"""Silence of this host that a watchdog may take for the host's end, s."""
+"""Silence of this host after which the board's watchdog may restart the board, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
 """Outcome for each cause except "unknown" that the reference firmware names after booting."""
@@ -54,9 +60,9 @@ class Restart(Struct, frozen=True):
     sign: str
     """The observation that revealed the restart, in words."""
     turned: Motors = ZERO
-    """Speeds that the motors were told around the last reply before it, rad/s."""
+    """Speeds that were commanded around the time of the last reply before the restart, rad/s."""
     silent_s: float = 0.0
-    """Longest time since that reply for which this host had sent nothing, s."""
+    """Longest time without a line from this host since the last reply before the restart, s."""
     cause: str = ""
     """Cause of the restart as the board names it, or ""."""
 
@@ -80,7 +86,7 @@ class Restarts:
         """Last speeds that were not all zero, rad/s."""
         self._sent_s: float | None = None
         self._silent_s = 0.0
-        """Longest time between two of our lines since the last reply, s."""
+        """Longest time between two lines of this host since the last reply, s."""
         self._unanswered = 0
         self._replied_s: float | None = None
         """Time of the last reply, s, or None before the first one.
@@ -88,21 +94,25 @@ class Restarts:
         Text that the board prints because opening the port reset it is not a restart.
         """
         self._clock: tuple[int, float] | None = None
-        """Clock of the last reply that contained it, ms, and the time when that arrived, s."""
+        """Board's clock in the last reply that had it, ms, and the time of that arrival, s."""
 
     def asked(self, at_s: float) -> None:
-        """Note that the identification was asked for."""
+        """Record that this host requested the identification at `at_s`."""
         self._asked_s = at_s
 
     def sent(self, motors: Motors, at_s: float) -> None:
-        """Note that a line with these speeds was sent."""
+        """Record that this host sent a line with these speeds, rad/s, at `at_s`."""
         self._unanswered += 1
         self._silent_s, self._sent_s = self._silence_s(at_s), at_s
         if any(motors):
             self._turned, self._turned_s = motors, at_s
 
     def look(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
-        """Return the restart that a line shows, or None. `reply` is its decoded form, or None."""
+        """Return the restart that a received line shows, or None.
+
+        `at_s` is the time of its arrival. `reply` is the decoded line, or None if the line is not a
+        good reply.
+        """
         sign = ""
         if reply is not None:
             sign = self._clock_sign(reply)
@@ -141,7 +151,7 @@ class Restarts:
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of a restart that the reference firmware names in these lines, or ""."""
+    """Return the cause of a restart that the reference firmware reports in these lines, or ""."""
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 
@@ -170,7 +180,7 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether each restart came after a silence of this host. One alone proves nothing."""
+    """Return whether each restart came after a silence of this host. One restart proves nothing."""
     return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
 
 

@@ -5,9 +5,9 @@ with a half-broken cable.
 
 There is one experiment: motors at speed, then silence (or damaged lines) for some time, then zeros.
 The watchdog's time is how far the motors ran on, minus how far they run after an ordinary stop. The
-speeds and counts in the replies show the distance. Firmware that answers only when asked, with
-momentary speeds, does not show it. It is asked after silences of different lengths whether the
-motors were still turning.
+speeds and counts in the replies show these distances. Firmware that answers only when asked, with
+momentary speeds, does not show them. The check asks such firmware after silences of different
+lengths whether the motors were still turning.
 """
 
 from __future__ import annotations
@@ -30,23 +30,25 @@ FEEDING = ("a wrong letter", "neither p nor n", "cut short")
 """Kinds of damaged lines that may feed a watchdog."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Fractions of full speed above which motors have not slowed down, and below which they stand."""
+"""Fractions of full speed: above the first, motors have not slowed down; below the second, they
+stand."""
 
 UNKNOWN = math.inf
 
 Between = tuple[float, float]
-"""Time for which the motors ran on after the last line, s: lower and upper bound."""
+"""Lower and upper bound of the time for which the motors ran on after the last line, s."""
 
 
 class Run(Struct, frozen=True):
     """The motors' behaviour after the last line that turned them, or after a plain stop.
 
-    Distances are in s at full speed, and speeds are fractions of full speed.
+    A distance is given as the time that the motor needs for it at full speed, s. Speeds are
+    fractions of full speed. `silent_s` is the length of the silence, s.
     """
 
     silent_s: float
     ran_s: float
-    """Distance of the motor that ran on the longest, including its run-out, s at full speed."""
+    """Distance until standstill of the motor that ran on farthest, s at full speed."""
     slow_s: float
     """Time until the motors had nearly stopped, s."""
     first: float
@@ -56,16 +58,19 @@ class Run(Struct, frozen=True):
     momentary speed if it measures by its own clock.
     """
     second: float
-    """Speed in the reply after that, as a fraction.
+    """Speed in the second reply after the silence, as a fraction.
 
-    A quick motor has obeyed the first zero by then.
+    By then a quick motor has obeyed the first zero.
     """
     grain_s: float
-    """Resolution, s: the time in which a motor turns by one jump of its readings."""
+    """Resolution, s: the time that a motor needs for the angle of one jump of its readings."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure the watchdog with motors that turn as commanded. They stand again afterwards."""
+    """Measure the watchdog's time with `motors`, which turn as commanded, and return the finding.
+
+    The motors stand again afterwards.
+    """
     if not motors:
         return outcomes.find("watchdog: untested")
     stop = run(board, motors, 0.0)
@@ -77,7 +82,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     broken = cycle(line for what, line in lines if what in FEEDING)
     fed = run(board, motors, max(motion.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= 0.75 * fed.silent_s:
-        # A watchdog that was not fed had cut them by then, so that they travel less.
+        # The broken lines fed the watchdog. Otherwise it would have cut the motors earlier, and
+        # their distance would be smaller.
         beyond_s = fed.ran_s - stop.ran_s - most_s
         return outcomes.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
@@ -88,7 +94,7 @@ def _judged(least_s: float, most_s: float) -> Finding:
         return outcomes.find("watchdog: none", seconds=least_s)
     middle_s, half_s = (least_s + most_s) / 2, (most_s - least_s) / 2
     figure = f"{middle_s * 1000:.0f} ms" + (f" ± {half_s * 1000:.0f}" if half_s >= 0.005 else "")
-    # The measurement is no more accurate than this.
+    # The measurement is not more accurate than 0.01 s.
     least_s, most_s = round(least_s, 2), round(most_s, 2)
     if least_s > motion.WATCHDOG_MOST_S:
         outcome = "late"
@@ -103,7 +109,11 @@ def _judged(least_s: float, most_s: float) -> Finding:
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
-    """Return how long these motors run on in a silence. `stop` is their ordinary stop."""
+    """Return the bounds of how long these motors run on in a silence.
+
+    `stop` is their behaviour in an ordinary stop. If the motors never stop in the silence, the
+    upper bound is `UNKNOWN`.
+    """
     least_s = 0.0
     for length_s in (motion.CUT_S + stop.slow_s, motion.STOOD_S + stop.slow_s):
         found = run(board, motors, length_s)
@@ -121,7 +131,11 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Narrow the bounds between a silence that the motors turn through and one that they do not."""
+    """Narrow the bounds `between` by bisection, and return the new ones.
+
+    The motors still turn at the end of a silence of the lower bound, s, and no longer at the end of
+    a silence of the upper bound. `stop` is their behaviour in an ordinary stop.
+    """
     least_s, most_s = between
     for _ in range(8):  # each question halves the interval, unless this computer pauses
         if most_s - least_s <= max(0.03, 0.1 * most_s):
@@ -131,14 +145,19 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
             least_s = max(least_s, answer.silent_s)
         else:
             most_s = min(most_s, answer.silent_s)
-    # The deciding reply describes a moment after the silence, as that of the ordinary stop does.
+    # The deciding reply describes a moment after the silence. The reply that shows the end of the
+    # ordinary stop also comes later than the stop.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
     most_s -= stop.slow_s - board.period_s - motion.PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)
 
 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
-    """Bring the motors to speed, be silent or send `instead` for `length_s` s, and stop them."""
+    """Bring the motors to speed, send nothing for `length_s` s, and stop them.
+
+    A length of 0 is an ordinary stop. If there are lines in `instead`, they are sent during the
+    silence. Ends the check if the motors together do not reach half of the speed.
+    """
     began_s = board.now_s
     full = run_up(board, command(motors))
     if max(abs(full[motor]) for motor in motors) < motion.SPEED / 2:
@@ -170,14 +189,14 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
 
 
 def command(motors: Sequence[int]) -> Motors:
-    """Return the command that turns all of these motors."""
+    """Return the command that turns all of these motors at `motion.SPEED`."""
     return motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
     """Return the counts per turn that can be used for distances.
 
-    Returns 0 if the counts stand, or if they can wrap round during the longest silence.
+    Returns 0 if the counts do not change, or if they can wrap round during the longest silence.
     """
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
     wraps = per_turn * motion.RUNAWAY / math.tau * motion.STOOD_S >= FIELD / 2

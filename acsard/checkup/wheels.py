@@ -1,7 +1,7 @@
-"""Turns one motor at a time forth and back, asks the operator which wheel turned, and judges both.
+"""Turns one motor at a time forward and backward, and asks the operator which wheel turned.
 
-The judgement finds motor, encoder and wheel of each channel. Its functions are plain functions of
-the measurements.
+From both it finds out whether the motor, the encoder and the wheel of each channel belong together.
+`Channel`, `encoder_finding` and `wheel_map` compute that from the measurements, without any I/O.
 """
 
 from __future__ import annotations
@@ -21,16 +21,20 @@ from acsard.core.link.codec import LETTERS, Motors
 from acsard.core.values import WHEELS
 
 TOLERANCE = 0.25
-"""Largest relative error of an encoder's speed that still belongs to the motor."""
+"""Largest relative error of an encoder's speed that is not a failure."""
 
 OFF = 0.05
-"""Largest relative error of the speed on a sound robot."""
+"""Largest relative error of an encoder's speed on a sound robot. A larger one is a warning."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
 
 class Channel(Struct, frozen=True):
-    """Behaviour of one motor: each encoder's speed while told forth (p) and back (n), rad/s."""
+    """Behaviour of one motor, as all four encoders and the operator saw it.
+
+    `forth` and `back` are the speeds of the four encoders, rad/s, while the motor was commanded
+    forward (letter p) and backward (letter n).
+    """
 
     motor: int
     forth: Motors
@@ -38,27 +42,30 @@ class Channel(Struct, frozen=True):
     wheel: str | None = None
     """Wheel that the operator saw turn, "" for none, or None if no person watched."""
     forward: bool = True
-    """Whether the operator saw the wheel turn forward first."""
+    """Whether the wheel turned forward first, as the operator saw it."""
     probed: bool = False
-    """Whether its own encoder did not follow a short probe, so that it was not turned further."""
-    unsure: float = 0.0
-    """Fraction by which the speeds may err because of a coarse encoder."""
-    judged: bool = True
-    """Whether this computer was in time.
+    """Whether the motor was turned only for a short probe, which its own encoder did not follow.
 
-    If not, nothing here is certain to be the motor's behaviour.
+    Then `forth` has the speeds of the probe, and `back` is zero.
+    """
+    unsure: float = 0.0
+    """Relative error of the speeds that a coarse encoder may cause."""
+    judged: bool = True
+    """Whether this computer was punctual during the measurement.
+
+    If it was not, the other fields may not show the motor's behaviour.
     """
 
     @property
     def moved(self) -> list[int]:
-        """Encoders that moved."""
+        """Numbers of the encoders that moved."""
         if not self.probed:
             return moving(self.forth) or moving(self.back)
         return moving(self.forth, max(PROBE_MOVES, max(map(abs, self.forth)) / 4))
 
     @property
     def kind(self) -> Kind:
-        """Judgement that the encoders allow."""
+        """Result for this motor by the encoders alone, without the operator's observation."""
         if not self.judged:
             return "late"
         moved, own = self.moved, self.motor
@@ -78,18 +85,18 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Fraction by which its own encoder's speed is off the command, in the worse direction."""
+        """Relative error of the motor's own encoder against the command, in the worse direction."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
 
 def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
-    """Judge motor and encoder of one channel."""
+    """Return the finding about the motor and the encoder of one channel."""
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
-    # Lateness that would explain the error: the motor would have seemed to stand meanwhile, in half
-    # of the measurements.
+    # A computer that was late by this much would explain the error: in half of the measurements the
+    # motor would have seemed to stand for that time.
     beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
     return outcomes.find(
         f"motor: {channel.kind}{_whose(mcu, channel)}",
@@ -109,7 +116,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the part that is at fault, as far as the operator's observation shows it."""
+    """Return the end of the outcome's name: the faulty part, if the operator's answer shows it."""
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:
@@ -128,9 +135,10 @@ def _whose(mcu: McuConfig, channel: Channel) -> str:
 
 
 def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
-    """Judge `[mcu.wheels]` by the operator's observations.
+    """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
-    Channels that have to be repaired first keep their configured entry.
+    A channel that must be repaired first keeps its configured entry. So does a channel for which
+    the operator saw no wheel turn.
     """
     if any(channel.wheel is None for channel in found):
         return outcomes.find("wheel map: not seen")
@@ -152,16 +160,16 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
 
 
 NEAR = 0.8
-"""Fraction of `OFF` above which a speed is measured again.
+"""Fraction of `OFF`. A speed with a larger error is measured again.
 
-A first measurement is no more accurate.
+The first measurement is too inaccurate to decide such a case.
 """
 
 LOOK_S = 0.75 * motion.MOTOR_S
-"""Time over which the speed is measured again, s."""
+"""Time over which the second measurement averages the speed, s."""
 
 LOOKS = 8
-"""Number of measurements that are averaged at most while an encoder is not steady."""
+"""Largest number of measurements that are averaged while an encoder is not steady."""
 
 ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -169,12 +177,12 @@ ANSWERS = {
 
 
 def one(motor: int, speed: float) -> Motors:
-    """Return the command that turns only this motor."""
+    """Return the command that turns only this motor, at `speed` rad/s."""
     return motion.each(lambda index: speed if index == motor else 0.0)
 
 
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
-    """Bring a motor to speed.
+    """Bring a motor to `speed`, rad/s, and measure it.
 
     Returns each encoder's speed, rad/s, and the fraction by which the measured speed may err
     because encoder counts are whole numbers.
@@ -199,7 +207,10 @@ def _look_s(board: Board) -> float:
 
 
 def run_up(board: Board, motors: Motors) -> Motors:
-    """Ramp up and hold until the encoders show a steady speed, which is returned in rad/s."""
+    """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
+
+    The speeds are held until the encoders show them steadily, or until the time for that is over.
+    """
     steps = max(1, int(motion.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
@@ -221,14 +232,17 @@ def run_up(board: Board, motors: Motors) -> Motors:
 
 
 def _patience_s(board: Board, told: list[int]) -> float:
-    """Return how long motors are held, s: longer while one of them still speeds up."""
+    """Return how long the commanded motors `told` are held, s: longer while one still speeds up."""
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
     return motion.PATIENCE_S if rises else motion.MOTOR_S
 
 
 def channel(board: Board, motor: int) -> Channel:
-    """Turn a motor forth and back, and return how the encoders moved."""
+    """Turn a motor forward and backward, and return how the encoders moved.
+
+    If the last motor seems dead, it is tried again with the other form of the comma.
+    """
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
         found = _with_other_comma(board, found)
@@ -236,7 +250,10 @@ def channel(board: Board, motor: int) -> Channel:
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
-    """Turn a motor as far as its own encoder follows, stop it, and return its movement."""
+    """Turn a motor forward, then backward, stop it, and return how the encoders moved.
+
+    A motor whose own encoder does not follow the probe is not turned any further.
+    """
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)
@@ -254,11 +271,13 @@ def _both_ways(board: Board, motor: int) -> Channel:
 def probe(board: Board, motor: int) -> Motors | None:
     """Turn a motor slowly and briefly.
 
-    Returns None if its own encoder follows; the motor then keeps turning. Otherwise returns the
-    speeds that the encoders showed, rad/s. The probe is so short that a motor without a working
-    encoder, which the firmware may drive to full speed, does not get far. A second try is for
-    coarse encoders: they may need more movement to show anything, and a single count backwards
-    proves nothing.
+    Returns None if the motor's own encoder follows; the motor then keeps turning. Otherwise returns
+    the speeds that the encoders showed, rad/s.
+
+    The firmware may drive a motor without a working encoder to full speed. The probe is so short
+    that the motor does not get far. A motor with a coarse encoder may need a second try, because
+    the encoder may need more movement to show anything, and a single count backwards proves
+    nothing.
     """
     began_s = board.now_s
     shown = _probe(board, motor, motion.SPEED / 2)
@@ -277,7 +296,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each angle, less the possible coasting, divided by the probe's time, rad/s."""
+        """Return each encoder's angle without possible coasting, divided by `GLANCE_S`, rad/s."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -299,7 +318,10 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Try the other form of the comma at the line's end on a last motor that does nothing."""
+    """Test the last motor, which does not move, again with the other form of the line's end.
+
+    Returns the new result if the motor moves. Otherwise returns `dead`, the result so far.
+    """
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
     if channel.probed or dead.motor not in moving(channel.forth):
@@ -312,7 +334,10 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
 
 
 def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
-    """Ask the operator which wheel turned. The wheels stand by now."""
+    """Ask the operator which wheel turned, and return the channel with the answer.
+
+    The wheels already stand. The channel is returned unchanged if no person watches.
+    """
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn? front right, front left, "
         "rear left, rear right, none; or show it again"

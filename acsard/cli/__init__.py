@@ -54,7 +54,8 @@ VERBS = {
     "completion": "print the script for completion with Tab in a shell",
     "man": "print the text of every --help as a man page",
 }
-"""The subcommands and their help texts, in the order of `acsard --help`. Each is a module here."""
+"""The subcommands and their help texts, in the order of `acsard --help`. Each is a module of
+this package."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording is damaged, 66 no such
@@ -125,8 +126,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
             raise
-        # The program that reads our output (head, less) has ended, or the disk is full, so a
-        # message could not be printed either.
+        # The program that reads this output (head, less) has ended, or the disk is full. A message
+        # could not be printed either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
     except KeyboardInterrupt:
@@ -137,7 +138,7 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """Rewrite a negative number without its exponent: argparse takes `-1e-3` for an option."""
+    """Rewrite a negative number without its exponent: argparse would take `-1e-3` for an option."""
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 

@@ -59,7 +59,8 @@ def main(args: argparse.Namespace) -> int:
     if port:
         require(port)
     _, config = load(args.config, {"control.rate": args.rate})
-    # However this process is ended, the daemon and the far end of the port must end with it.
+    # The daemon and the process at the far end of the port must end with this process, also if a
+    # signal ends it.
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     result = measure(bench_config(config, simulated=not port), port, args.seconds)

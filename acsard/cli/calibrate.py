@@ -104,7 +104,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     where, mine = load(args.config)
     if args.write:
         writable(args.config)
-    # A log has its file name in messages and reports.
+    # Messages and reports name a log by the name of its file.
     source = str(args.log) if args.log else "the drive"
     try:
         if args.log:
@@ -136,7 +136,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
 
 
 def _require_fitting(args: argparse.Namespace) -> None:
-    """Raise `UsageError` for an option that does not fit a recorded drive, or a guided one."""
+    """Raise `UsageError` for an option that does not fit the kind of drive, recorded or guided."""
     if not args.log and args.distance:
         raise UsageError(
             "--distance goes with --log: a guided drive asks for the distances that it needs"
@@ -176,8 +176,9 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--positions",
         metavar="KEY",
-        help="for --method positions: the key of the positions (PoseStamped or Odometry in JSON, "
-        "msgpack or CDR), as `acsard topics` lists it (sim/pose), or any full key",
+        help="for --method positions: the key that has the robot's positions (PoseStamped or "
+        "Odometry in JSON, msgpack or CDR): one that `acsard topics` lists, for example sim/pose, "
+        "or a full key",
     )
     parser.add_argument(
         "--positions-at",
@@ -202,7 +203,8 @@ def _guided(
 ) -> tuple[Calibration, Config]:
     """Drive the robot and return the calibration with the configuration that the robot runs with.
 
-    A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
+    A key press and Ctrl-C end the drive with zero commands. `where` is the path of the file with
+    `config`. `lines` is the prompt for --json-lines, or None. Raises `GuideError`, `LogError` and
     `RefusedError`.
     """
     require_one(args)
@@ -264,7 +266,7 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _differing(config: Config, mine: Config, where: str) -> str:
-    """Return why a result for `config` does not belong into the file `where`, or "" if it does.
+    """Return why a result for `config` must not be written into the file `where`, or "" if it may.
 
     Args:
         config: the configuration that the daemon runs with.

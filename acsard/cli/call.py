@@ -69,7 +69,10 @@ def _fields(service: Verb) -> tuple[str, ...]:
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Return why a service cannot go to several robots at once, and what to type instead."""
+    """Return the text that this service cannot be called on several robots at once.
+
+    The text also has the commands to type instead.
+    """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]
     more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
@@ -81,7 +84,7 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
 
 
 def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
-    """Stop these robots at once, print their answers, and return the exit code."""
+    """Stop all these robots at the same time, print their answers, and return the exit code."""
     # Send the stop to every named robot first. Finding out which robots are present would delay it.
     robot_discovery.stop(robot.session, ids, robot.caller)
     replies = of_each(robot, ids, lambda one: one.call("stop"))

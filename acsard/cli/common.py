@@ -28,7 +28,10 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add the options of a subcommand that asks a person and has a result for the configuration."""
+    """Add the options of a subcommand that asks a person and has a result for the configuration.
+
+    `result` names the result in the help text of `--write`.
+    """
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object")
     form.add_argument(
@@ -66,7 +69,7 @@ def count(text: str) -> int:
 def seconds(text: str) -> float:
     """Return a duration from 1 to 600 s: an argparse type.
 
-    All that is measured stays in memory to the end. At 100 Hz that is 60 MB in 600 s.
+    All measured values stay in memory until the end. At 100 Hz that is 60 MB in 600 s.
     """
     value = float(text)
     if not 1.0 <= value <= 600.0:
@@ -75,7 +78,10 @@ def seconds(text: str) -> float:
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
-    """Return an argparse type for a whole number up to `most`; `hint` ends its error."""
+    """Return an argparse type for a whole number from 1 to `most`.
+
+    The error message names the `units`, and ends with `hint`.
+    """
 
     def number(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:
@@ -87,9 +93,10 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
 
 
 def by_environment() -> dict[str, dict[str, object]]:
-    """Return the configuration keys that the environment sets.
+    """Return the configuration values that the environment sets.
 
-    `ACSARD_TLS` sets `bus.tls`: for example, systemd puts a service's credentials there.
+    `ACSARD_TLS` sets `bus.tls`. For example, it names the directory with the credentials of a
+    systemd service.
     """
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
@@ -97,7 +104,10 @@ def by_environment() -> dict[str, dict[str, object]]:
 def tables(
     options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
 ) -> dict[str, dict[str, object]]:
-    """Return the tables of `before` with these values by dotted key; None leaves a key as it is."""
+    """Return the tables of `before` with the values in `options`, which are by dotted key.
+
+    A value of None leaves the key as it is.
+    """
     given = {table: dict(values) for table, values in before.items()}
     for key, value in options.items():
         if value is not None:
@@ -126,8 +136,8 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 def recorded(config: Config) -> Config:
     """Fill in the recording directory from the environment if the configuration names none.
 
-    The units of the service set this variable. The path is made absolute, because a client that
-    reads it on the bus may run in another directory.
+    The units of the service set the environment variable `RECORD`. The path is made absolute,
+    because a client that reads it on the bus may run in another directory.
     """
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""

@@ -26,7 +26,7 @@ SHELLS = {
 """Where each shell looks for its completion script."""
 
 _NUMBERS = "acsard recording 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
-"""Shell command that lists the recordings by number. The shell offers local files as well."""
+"""Shell command that prints the numbers of the recordings. The shell offers local files as well."""
 
 _RECORDING: dict[str, str | dict[str, str]] = {
     "bash": "_acsard_recordings",

@@ -1,4 +1,4 @@
-"""Options, connection, key checks and explained silences that subcommands on the bus share."""
+"""Options, connections, key checks and explanations of silences for the subcommands on the bus."""
 
 from __future__ import annotations
 
@@ -46,14 +46,17 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 @contextmanager
 def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
-    """Connect to the one robot that the options name, to command as `source`."""
+    """Connect to the one robot that the options name. The client sends commands as `source`."""
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
         yield robot
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Return the robot's address by options or file; raise `UsageError` for several robots."""
+    """Return the robot's address from the options or the configuration file.
+
+    Raises `UsageError` for several robots.
+    """
     require_one(args)
     _, config = load(args.config)
     return address_of(config, args.connect, args.id, args.tls)
@@ -70,9 +73,9 @@ def require_one(args: argparse.Namespace) -> None:
 
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Connect as `connected` does; yield also the ids if `--id` names several robots.
+    """Connect as `connected` does, and yield the client and the ids of several robots.
 
-    The ids are `("*",)` for all robots and `()` for a single robot.
+    The ids are those in `--id`, `("*",)` for all robots and `()` for a single robot.
     """
     many = named(args.id or "")
     _, config = load(args.config)
@@ -105,8 +108,8 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot ask this key.
 
-    It refuses keys that do not answer queries, services, which a query would call, and wildcards,
-    because `get` prints one answer.
+    Some keys do not answer queries. A query to the key of a service would call the service. A
+    wildcard has several answers, but `get` prints one.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
@@ -138,9 +141,10 @@ def explained(
     them.
 
     Args:
-        look: explains why nothing has arrived for `after_s` s, in one line; "" prints nothing.
-        ceased: explains each later silence of `after_s` s, once for each.
-        after_s: silence before it is explained, s.
+        look: returns one line why nothing has arrived yet after `after_s` s, or "" for no line.
+        ceased: returns such a line for a later silence of `after_s` s. None explains only the first
+            silence.
+        after_s: length of a silence that is explained, s.
     """
     come, end = Event(), Event()
 
@@ -167,9 +171,10 @@ def explained(
 
 
 def silence_explained(robot: Client, key: str = "") -> AbstractContextManager[Callable[[], None]]:
-    """Explain why nothing arrives on a key, and each later silence.
+    """Explain on standard error why nothing arrives on a key, and later why messages ceased.
 
-    If `key` is "", only later silences are explained.
+    The context is a function that the caller calls for each message. If `key` is "", only a lost
+    connection is explained.
     """
     return explained(lambda: _none_yet(robot, key) if key else "", lambda: _ceased(robot))
 
@@ -185,7 +190,7 @@ def _none_yet(robot: Client, key: str) -> str:
 
 
 def _ceased(robot: Client) -> str:
-    """Return why messages ceased, or "" while the session is connected."""
+    """Return why messages ceased, or "" if the session is still connected."""
     try:
         if robot.session.info.links():
             return ""

@@ -97,14 +97,15 @@ class Quota:
     """The messages that may still be printed, counted for each robot."""
 
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
-        """Allow `most` messages of each robot, any number if it is None.
+        """Allow `most` messages of each robot, or any number if `most` is None.
 
-        `robots` are the ids that `used_up` waits for. If there are none, it waits for those seen.
+        `used_up` considers the robots with the ids `robots`. If there are none, it considers the
+        robots of which a message has been printed.
         """
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 
     def take(self, robot: str) -> bool:
-        """Return whether a message of this robot may be printed, and count it."""
+        """Return whether a message of this robot may be printed. If so, count the message."""
         count = self._counts.get(robot, 0)
         if count == self._most:
             return False
@@ -113,7 +114,7 @@ class Quota:
 
     @property
     def used_up(self) -> bool:
-        """True if each robot has had all of its messages."""
+        """True if all allowed messages of each robot have been printed."""
         return all(self._counts.get(one) == self._most for one in self._robots or self._counts)
 
 
@@ -128,7 +129,7 @@ def _print(
     """Print a line per message until Ctrl-C, the end of `quota`, or the end of `samples`.
 
     Args:
-        samples: the messages; the iterator ends after a silence of the timeout.
+        samples: the messages. The iterator ends if no message arrives for `timeout`.
         decoder: decodes messages for their short form; None prints JSON.
         quota: the messages that are printed. Messages beyond it are skipped.
         of_many: whether each line names its robot.
@@ -163,7 +164,11 @@ def _shortened(key: str) -> Decoder[Any]:
 
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
-    """Return a message as a printable line. A message that cannot be decoded is printed as JSON."""
+    """Return a message as a printable line, in short form with a `decoder`, else as JSON.
+
+    A message that cannot be decoded is printed as JSON, too. `whose` names the robot in the line;
+    "" names none.
+    """
     if decoder is not None:
         try:
             told = short(decoder.decode(encoding, payload))

@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
             return int(Exit.OK)
         rows = fleet.gather()
         if not rows:
-            # Over TLS our certificate may not be permitted to see any of the named robots.
+            # Over TLS the client's certificate may not be permitted to see any of the named robots.
             named = robot.where.tls and ids != (ALL,)
             silence = robot.like(ids[0]).whoami().silence if named else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
@@ -51,7 +51,7 @@ def main(args: argparse.Namespace) -> int:
             print(json_line(msgspec.json.encode(rows).decode()), flush=True)
             return int(Exit.OK)
         width = output_size().columns
-        # Flush now: nothing that delays the end of the session may hold back the table.
+        # Flush now, so that a session that closes slowly does not hold back the table.
         print("\n".join(table(rows, width)), flush=True)
     for told in filter(None, (fleet.seen, fleet.more)):
         print(f"acsard: {told}", file=sys.stderr)

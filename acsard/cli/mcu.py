@@ -81,7 +81,11 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
 ) -> int:
-    """Check the board with `config`, and compare the findings with the file's configuration."""
+    """Check the board with `config`, and compare the findings with the configuration file.
+
+    `configured` is the configuration in the file, without the options of the command line, and
+    `where` is the path of the file.
+    """
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
@@ -107,7 +111,7 @@ def _checked(
         try:
             change(Path(where), found_changes)
             written = where
-        except MendableError as error:  # print the findings of a whole minute before the error
+        except MendableError as error:  # print the findings of the long check before the error
             trouble = error
     found = report(port, findings, found_changes, written, str(trouble or ""), why)
     prompt.result(msgspec.json.encode(found).decode() if args.json else summary(found, where))
@@ -150,7 +154,7 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
 
 
 def _wire(config: Config) -> Wire:
-    """Return the port, or the simulator in virtual time, with which no check has to wait."""
+    """Return the serial port, or the simulator in virtual time, in which a check takes no time."""
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))
     return BlockingPort(config.mcu.port)

@@ -94,7 +94,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shown.set_defaults(main=main_show)
     replay = actions.add_parser(
         "replay",
-        help="run the recorded inputs through the robot again and compare the results",
+        help="decide again on the recorded inputs, without a robot, and compare the results",
         description="Run the recorded inputs through the robot again, and compare every line, "
         "pose, mode, reason and event with the recorded ones. With --config, show what another "
         "configuration would have changed. A part that a damaged place makes unreadable is not "
@@ -149,7 +149,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         _times(action, argparse.SUPPRESS)
     for action in (shown, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
-    # For `replay` and `export`, --config is the configuration that they try.
+    # These do not get --config: `replay` and `export` have an option of that name with another
+    # meaning, the configuration that they try.
     for action in (shown, recover, report):
         _own_config(action, argparse.SUPPRESS)
 
@@ -258,7 +259,7 @@ def main_show(args: argparse.Namespace) -> int:
 
 
 def _is_being_recorded(recording: Recording) -> bool:
-    """Return whether a daemon still writes to this recording. Read it before."""
+    """Return whether a daemon still writes to this recording. The recording must be read before."""
     if recording.ending != UNFINISHED:
         return False
     with suppress(OSError):  # the daemon has just renamed or removed the file
@@ -314,8 +315,8 @@ def _tell(one: TimelineEntry, as_json: bool) -> None:
 def main_replay(args: argparse.Namespace) -> int:
     """Replay a recording and compare the result with the recorded one.
 
-    Returns 1 if they differ, except with --config, with which a difference is expected. Otherwise
-    returns 65 if a part was not compared, else 0.
+    Returns 1 if they differ, except with --config, because then a difference is expected.
+    Otherwise returns 65 if a part was not compared, else 0.
     """
     _refuse_times(args, "replay")
     recording = _recording(args)
@@ -367,7 +368,8 @@ def main_export(args: argparse.Namespace) -> int:
     parts, code = _files_to_write(args), Exit.OK
     other = None if args.config is None else load(args.config)[1]
     for recording, part in parts:
-        # The default is this directory, because that of the recordings belongs to the service.
+        # The default is the working directory, because the directory of the recordings belongs to
+        # the service.
         new = Path(args.new or recording.path.name.partition(".")[0] + SUFFIX[kind])
         with _written(new), _progress(recording) as tell:
             done = export(recording, new, kind, other, part, tell, args.force)
@@ -403,7 +405,7 @@ def main_report(args: argparse.Namespace) -> int:
 
 
 def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
-    """Refuse --from and --to, which are options of the list and of other subcommands."""
+    """Raise `UsageError` for --from and --to, which this subcommand does not take."""
     if args.begin is not None or args.end is not None:
         raise UsageError(f"{subcommand} takes a whole recording: leave out --from and --to")
 
@@ -445,7 +447,7 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
 
 
 def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Search all recordings, and say on standard error which ones have the time."""
+    """Search all recordings, and print on standard error which ones cover the given times."""
     first, last = _range(args)
     where, files = _files(args)
     try:
@@ -530,7 +532,7 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def _written(new: Path) -> Iterator[None]:
-    """Turn the error of a file that cannot be written into one with an exit code."""
+    """Raise an `ExitError` with the path if the file `new` cannot be written."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Prints messages as lines of JSON, calls several robots at once and prints a line for each."""
+"""Prints messages as lines of JSON, and calls a service of several robots at the same time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def of_robot(whose: str, line: str) -> str:
 
 
 def json_line(encoding: str, payload: bytes) -> str:
-    """Return a payload as a line of JSON, `{"undecodable": ...}` if it cannot be decoded."""
+    """Return a payload as a line of JSON, or `{"undecodable": ...}` if it cannot be decoded."""
     try:
         form = detect(encoding, payload)
         if form == "cdr":
@@ -67,7 +67,7 @@ def print_each(
     Args:
         replies: the replies of the robots.
         robot: the client whose connection was used.
-        ids: the robots that the operator named, perhaps as "*".
+        ids: the robots that the operator named; "*" names all of them.
         silence: the line of a robot without an answer; `{error}` stands for the reason.
         as_json: whether to print JSON.
 

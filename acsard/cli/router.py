@@ -25,8 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
     )
-    # The subcommand starts itself with this option: the child is the router and ends with its
-    # standard input.
+    # The subcommand starts a child of itself with this option. The child is the router, and ends
+    # when its standard input is closed.
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
 
@@ -44,11 +44,11 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Run one router process after the other, until a signal or an exit code that is final."""
+    """Keep a router process running until a signal, or until it ends with a final exit code."""
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)
     try:
         return await keeper
     except asyncio.CancelledError:
-        return 0  # a signal asked us to end; the router process has been released
+        return 0  # a signal ended this process; the router process has been released

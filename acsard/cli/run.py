@@ -71,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
-    """Return the configuration keys of the command line; None for one that is not given."""
+    """Return the configuration values of the command line; None for an option that is not given."""
     return {
         "mcu.port": args.port,
         "mcu.baud_rate": args.baud_rate,
@@ -136,7 +136,11 @@ def main(args: argparse.Namespace) -> int:
 
 
 def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
-    """Return the configuration file at `where`, read as a restart with these options would do."""
+    """Return the `SettingsFile` at `where`, which reads the file as a restart would.
+
+    `config` is the configuration of this start. `given` are the options of the command line by
+    dotted key, which override the file.
+    """
     overrides = tables(given, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
     return SettingsFile(file, lambda text: recorded(parse(text, overrides)), config)
@@ -145,8 +149,8 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
 def page(config: Config, where: str) -> list[str] | None:
     """Return the arguments of `acsard web`, or None if the page is not to be started.
 
-    The page is started if `web.page` is set, standard output is a terminal, and the extra `web` is
-    installed.
+    The page is started if `web.page` is set, standard output is a terminal, this is not a systemd
+    service, and the extra `web` is installed.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
     there = find_spec("aiohttp") and find_spec("segno")
@@ -172,7 +176,7 @@ def _bus(config: Config) -> str:
 
 
 def reach(args: argparse.Namespace) -> str:
-    """Return the options that other tools need to find this daemon, as text for the banner."""
+    """Return the options with which other tools find this daemon, as text for the banner."""
     listens = args.listen and reachable(args.listen)
     given = (("--config", args.config), ("--connect", listens), ("--id", args.id))
     return "".join([f" {option} {shlex.quote(value)}" for option, value in given if value])

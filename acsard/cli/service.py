@@ -76,7 +76,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
 
 def main_status(args: argparse.Namespace) -> int:
-    """Print the state of files and units. Return 0 if the daemon's unit is active."""
+    """Print the state of the service's files and units. Return 0 if the daemon's unit is active."""
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
     print(state or "systemd does not answer on this machine")

@@ -91,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def pairs(words: Sequence[str]) -> dict[str, Plain]:
-    """Return the settings from the words KEY VALUE KEY VALUE ...
+    """Return the settings in the words KEY VALUE KEY VALUE ...
 
     A value is read as TOML; a bare word is a string. Raises `UsageError` if a value is missing.
     """
@@ -130,7 +130,7 @@ def _until(settings: dict[str, Plain]) -> str:
 def _set_all(
     robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, keep: bool, as_json: bool
 ) -> int:
-    """Change the settings of all these robots, print each robot's answer, return the exit code."""
+    """Change the settings of all these robots, print their answers, and return the exit code."""
 
     def change_one(one: Client) -> ServiceReply:
         reply = one.set(settings, keep=keep)
@@ -143,7 +143,7 @@ def _set_all(
 
 
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:
-    """Return the file that --write is to change. Raises `UsageError` before anything is set."""
+    """Return the file that --write changes. Raises `UsageError` if --write cannot be used."""
     if not settings:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
     if any(key.startswith("commands.sources.") for key in settings):

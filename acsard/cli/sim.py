@@ -57,7 +57,7 @@ def _with_names() -> list[str]:
 
 
 def fault(text: str) -> NamedFault:
-    """Return the fault of this name, with motors or numbers: an argparse type."""
+    """Parse the name of a fault with its motors or numbers: an argparse type."""
     try:
         return named(text)
     except ValueError as error:

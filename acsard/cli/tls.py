@@ -214,8 +214,8 @@ def _certified(names: list[str]) -> str:
 def _admit_service(directory: Path) -> None:
     """Let the installed service's TLS gateway use these certificates.
 
-    It writes a systemd drop-in with the permitted networks and the certificates, and does nothing
-    without an installed service.
+    This writes a systemd drop-in with the permitted networks and the certificates. It does nothing
+    if the service is not installed.
     """
     step = service.admitting(directory)
     if step is None:
@@ -226,7 +226,8 @@ def _admit_service(directory: Path) -> None:
 
 
 def _name(text: str) -> str:
-    # `access` has the same rule: the name becomes a part of keys, and a directory name here.
+    # The setting `access` has the same rule. The name becomes a part of bus keys, and here also the
+    # name of a directory.
     if not NAME.fullmatch(text) or text in (".", ".."):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a name for a certificate: 1 to 64 letters, digits, spaces and "

@@ -136,7 +136,7 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
 
 
 def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
-    """Make a token and print its link once; messages name the configuration `where`."""
+    """Make a token and print its link once. `where` is the configuration's path, for messages."""
     import segno
 
     from acsard.web.listen import invitations, require_certificate
@@ -172,7 +172,7 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
 
 
 def _list(vault: Vault) -> int:
-    # The server, which runs for months, needs no tables: they would cost it 5 MB.
+    # Import this late: the server runs for months without tables, which would take 5 MB.
     from acsard.terminal.output import show, table
 
     tokens, now_s = vault.all(), time.time()

@@ -7,15 +7,15 @@
         print(robot.pose())
 
 `connect` is for scripts and `connect_async` for asyncio programs. Both offer the same methods and
-typed messages (`acsard.core.messages.schema`). Commands are signed, numbered and stamped, and each
-drive begins with zeros. The daemon's rules about stale commands and about zeros before motion are
-therefore satisfied without further code. A drive that the robot does not follow raises an error. A
-drive that returns has ended with the robot at rest.
+typed messages (`acsard.core.messages.schema`). The client signs, numbers and stamps its commands,
+and sends zeros before each drive. So a program needs no code of its own for the daemon's rules
+about stale commands and about zeros before motion. `drive` raises an error if the robot does not
+follow it. When `drive` returns, the robot is at rest.
 
-Arguments that you leave out come from the file that ACSARD_CONFIG names, as for the command line
-(`bus.listen`, `robot.id`, `bus.tls`). Without that variable they mean the robot `acsar` on this
-machine. A file in the current directory is ignored, so that a program means the same robot wherever
-it runs.
+Arguments that you leave out come from the configuration file that the environment variable
+ACSARD_CONFIG names (`bus.listen`, `robot.id`, `bus.tls`), as on the command line. Without that
+variable, the client connects to the robot `acsar` on this machine. It ignores a file in the current
+directory, so that a program reaches the same robot wherever it is started.
 
 Errors are `AcsardError`s, and most are also the matching built-in exception. Their text says what
 to do:

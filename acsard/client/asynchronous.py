@@ -28,9 +28,9 @@ async def connect_async(
     source: str = "app",
     tls: str | None = None,
 ) -> AsyncIterator[AsyncClient]:
-    """Connect as `connect` does, for asyncio programs.
+    """Connect to a daemon, with the arguments of `connect`, from an asyncio program.
 
-    Opening and closing do not block the event loop.
+    Opening and closing the connection do not block the event loop.
     """
     where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
@@ -41,7 +41,10 @@ async def connect_async(
 
 
 class AsyncClient:
-    """Client with the methods of `Client` for asyncio programs; create it with `connect_async`."""
+    """A client for asyncio programs, with methods like those of `Client`.
+
+    Create it with `connect_async`.
+    """
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -51,7 +54,7 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive as `Client.drive` does. A cancelled drive sends a zero at once."""
+        """Drive as `Client.drive` does. If the drive is cancelled, it sends a zero at once."""
         try:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:

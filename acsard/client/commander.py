@@ -1,9 +1,10 @@
-"""Commands the robot as one sender: which command is sent, when, and why it has no effect.
+"""The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
 This module is pure. Every program that commands the robot uses these time limits. `Commander` is
-for a program that forwards the wishes of a person. It sends each wish at most once and repeats
-nothing, so the robot stops when the person, the panel or the network falls silent. The newest wish
-replaces the one that waits. A zero is never too old to be sent, and the last command is a zero.
+for a program that forwards the commands of a person (`Wish`). It sends each of them at most once
+and repeats none, so the robot stops when the person, the panel or the network falls silent. A new
+command replaces one that has not been sent yet. A zero is never too old to be sent, and the last
+command is a zero.
 """
 
 from __future__ import annotations
@@ -15,87 +16,110 @@ from acsard.core.messages.signature import Signature
 from acsard.core.values import NS_PER_S, REST, Twist
 
 SEND_PERIOD_S = 0.05
-"""Pause between two commands, s: 20 Hz, so five commands within the default timeout."""
+"""Pause between two commands, s. At 20 Hz, five commands fall into the default timeout."""
 
 SPACING_S = 0.003
-"""Smallest pause between two commands on one connection, s. The daemon accepts 1000 a second."""
+"""Shortest pause between two commands on one connection, s.
+
+The daemon accepts 1000 commands per second.
+"""
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Duration and period of the zeros at the beginning, s. A daemon to which the sender is new
-checks for 0.25 s that the commands are not late. More zeros let it decide sooner despite the
-jitter of a busy machine.
+"""Duration and period of the zeros at the beginning of a drive, s.
+
+The daemon checks for 0.25 s whether the commands of a new sender are late. With more zeros it
+decides sooner, despite the jitter of a busy machine.
 """
 
 OPENED_S = 4.0
-"""Time after which zeros must count, s. The delay of a sender that is new to the daemon is checked
-for up to 2 s, if its source has so long a timeout. It also gives another driver time to leave."""
+"""Time within which the daemon must accept the zeros at the beginning of a drive, s.
+
+If the source has a long timeout, the daemon checks the delay of a new sender for up to 2 s. The
+rest of the time lets another sender finish its drive.
+"""
 
 ZEROS = 3
-"""Number of zeros at the end, in case the network loses one."""
+"""Number of zeros that a sender sends at the end, in case the network loses one."""
 
 GRACE_S = 0.5
-"""Longest time, s, for which commands may have no effect before the operator is told or the drive
-ends. The first 0.25 s of a new sender never count, and a sender that was only delayed counts again
-sooner.
+"""Longest time for which commands may have no effect, s. Then the operator is informed, or the
+drive ends.
+
+It is longer than the first 0.25 s of a new sender, in which its commands never have an effect, and
+longer than a short delay of a known sender.
 """
 
 SILENCE_NS = 3 * NS_PER_S // 10
-"""Silence after which the robot has begun to brake; the default timeout of a source is 0.25 s."""
+"""Time without a command after which the robot has begun to brake, ns. The default timeout of a
+source is 0.25 s."""
 
 GATHER_NS = NS_PER_S // 25
-"""Time within which a held-back burst arrives; a panel at 20 Hz does not send twice in it. Only the
-first command after a silence waits this long."""
+"""Time within which all commands of a delayed burst arrive, ns.
+
+A panel that sends at 20 Hz sends at most one command in this time. Only the first command after a
+silence waits this long.
+"""
 
 STALE_NS = NS_PER_S // 10
-"""Age above which a speed is dropped, because it no longer shows the operator's intention."""
+"""Age above which a speed is not sent, ns: it no longer shows the operator's intention."""
 
 DRIVES_NS = NS_PER_S // 2
-"""Time after the last wish for a speed for which a sender counts as driving."""
+"""Time for which a sender counts as driving after its last nonzero command, ns."""
 
 LONGEST_S = 10.0
-"""Longest possible timeout of a source, s. The robot follows no speed that is older."""
+"""Longest timeout that a source may have, s. The robot follows no command that is older."""
 
 NEVER = ("inactive", "stopped", "fault", "shutdown")
-"""Modes in which no command counts."""
+"""Modes in which no command moves the robot."""
 
 
 class Wish(Struct, frozen=True):
-    """A command, and its time on the sender's clock, ns; None for a sender without a clock."""
+    """A command to forward: the twist that a person requests.
+
+    `stamp_ns` is its time on the sender's clock, ns, or None for a sender without a clock.
+    """
 
     twist: Twist
     stamp_ns: int | None = None
     steady: bool = False
-    """Whether that clock is never adjusted."""
+    """Whether the clock of `stamp_ns` is never adjusted."""
 
 
 class Commander:
-    """The commands of one sender; only the newest one waits.
+    """Decides which commands of one sender are sent, and when. Only the newest one can wait.
 
-    With `leads`, a zero is sent first after each silence, for a sender that sends no zeros of its
-    own. With `gathers`, a burst after a silence is dropped, because a congested link or a stalled
-    process held it back. It is for a sender without stamps, whose delay the daemon cannot judge.
+    Args:
+        leads: whether to send a zero before the first command after each silence. It is for a
+            sender that sends no zeros of its own.
+        gathers: whether to drop a burst of commands after a silence, because a congested link or a
+            stalled process has delayed it. It is for a sender without stamps, because the daemon
+            cannot measure the delay of such a sender.
     """
 
     def __init__(self, *, leads: bool = False, gathers: bool = False) -> None:
         self.replaced = self.stale = 0
-        """Counters of wishes that were not sent: replaced by a newer one, or too late."""
+        """Numbers of commands that were not sent: replaced by a newer one, or too old."""
         self._leads, self._gather_ns = leads, GATHER_NS if gathers else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)
-        """The newest wish, whether it still waits or not."""
+        """The newest command, whether it has been sent or not."""
         self._came_ns = 0
         self._heard_ns: int | None = None
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of wishes since the silence, until one is sent."""
+        """Number of commands that arrived shortly after the last silence; 0 once one is sent."""
         self._moved_ns: int | None = None
-        """Time at which a speed was sent; None after a zero."""
+        """Monotonic time at which a nonzero command was last sent, ns; None after a zero."""
         self._asked_ns: int | None = None
-        """Time at which a speed was last requested; None after a zero."""
+        """Monotonic time at which a nonzero command last arrived, ns; None after a zero."""
 
     def take(self, wish: Wish, now_ns: int) -> int | None:
-        """Take a wish; return the silence before it if it was longer than `SILENCE_NS`, ns."""
+        """Store a command that has arrived, in place of one that still waits to be sent.
+
+        Returns the time since the previous command, ns, if it is longer than `SILENCE_NS`. Returns
+        None otherwise, and for the first command.
+        """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > SILENCE_NS
         if begins:
@@ -111,13 +135,13 @@ class Commander:
         return silence if begins else None
 
     def due_ns(self) -> int | None:
-        """Return the time from which `send` has a command, or None if it has none."""
+        """Return the monotonic time from which `send` has a command, ns, or None without one."""
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
 
     def send(self, now_ns: int) -> Wish | None:
-        """Return the command to send now, or None."""
+        """Return the command to send now, or None if there is none."""
         if self._lead:
             self._lead = False
             return self._zero(now_ns)
@@ -133,23 +157,24 @@ class Commander:
         return wish
 
     def end(self, now_ns: int, timeout_s: float = LONGEST_S) -> Wish | None:
-        """Release the robot; return a zero if it may still follow a speed of this sender.
+        """Discard the command that waits, and end the drive of this sender.
 
-        `timeout_s` is the timeout of the sender's source. A zero later than that would only stop
-        the next driver.
+        Returns a zero to send if the robot may still follow a speed of this sender, else None.
+        `timeout_s` is the timeout of the sender's source, s. After that time a zero would only stop
+        the next sender that drives.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
         self._lead = False
-        # The command may have taken 0.1 s to arrive, and the robot follows it from then on.
+        # The last command may have taken 0.1 s to the daemon. The timeout begins on its arrival.
         if moved_ns is None or now_ns - moved_ns > timeout_s * NS_PER_S + NS_PER_S // 10:
             return None
         return self._zero(now_ns)
 
     def _zero(self, now_ns: int) -> Wish:
-        """Return a zero stamped by the sender's clock.
+        """Return a zero with the present time on the sender's clock as its stamp.
 
-        A stamp of another clock would look like a clock change.
+        To the daemon, a stamp of another clock would look as if the sender's clock had been set.
         """
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None:
@@ -157,12 +182,12 @@ class Commander:
         return Wish(REST, stamp_ns, self._last.steady)
 
     def drives(self, now_ns: int) -> bool:
-        """Return whether the sender asks for a speed."""
+        """Return whether the sender has requested a speed within the last `DRIVES_NS`."""
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVES_NS
 
 
 class Sender:
-    """The identity of one sender, and the number and the newest stamp of its commands."""
+    """Signs the commands of one sender with its id, and numbers them."""
 
     def __init__(self, sender_id: str) -> None:
         self._id, self._sequence, self._newest_ns = sender_id, 0, 0
@@ -170,9 +195,14 @@ class Sender:
     def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
         """Return the signature of the next command.
 
-        `zero` says that the command is a zero. Its stamp is never older than an earlier stamp of
-        this sender, because the daemon refuses an older command after a newer one. A sender that
-        drives as two sources has one clock, but its commands may overtake each other.
+        The daemon refuses a command with an older stamp after one with a newer stamp. The commands
+        of a sender that drives as two sources may overtake each other. So a zero gets at least the
+        newest stamp of this sender.
+
+        Args:
+            stamp_ns: the time of the command on the sender's clock, ns, or None without a clock.
+            steady: whether this clock is never adjusted.
+            zero: whether the command is a zero.
         """
         self._sequence += 1
         if stamp_ns is not None:
@@ -182,7 +212,10 @@ class Sender:
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:
-    """Return why the robot does not follow the commands of `sender` as `source`; "" if it does."""
+    """Return why the robot does not follow the commands of `sender` as `source`; "" if it does.
+
+    `state` is the newest state of the robot, and `sender` the public name of the sender.
+    """
     if state.mode in NEVER:
         return state.reason
     ours = next((one for one in state.sources if one.name == source), None)
@@ -195,7 +228,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         return no_command(source)
     if state.source != source:
         return ours.waits_for or state.reason
-    # The robot is `ready`: the zeros of this client arrive, but they do not count.
+    # The robot is `ready`: the zeros of this client arrive, but do not let it drive yet.
     if state.mode != "driving":
         return state.reason
     if state.sender in ("", sender):
@@ -212,7 +245,7 @@ def no_command(source: str) -> str:
 
 
 def heard(state: RobotState, source: str) -> bool:
-    """Return whether any command of this source arrives, even if it is late."""
+    """Return whether commands of this source arrive at the daemon, even if they are late."""
     return any(one.name == source and one.waits_for != "a command" for one in state.sources)
 
 

@@ -1,7 +1,8 @@
-"""One drive of `acsard.client`: the commands that are sent, and the check that the robot follows.
+"""One drive of `acsard.client`: sends the commands, and checks that the robot follows them.
 
-The daemon does not answer commands; it reports in `state` why a command does not count. A drive
-therefore follows `state`, and ends with the daemon's own reason if the robot does not follow it.
+The daemon does not answer commands. It reports in `state` why the robot does not follow a command.
+A drive therefore subscribes to `state`. If the robot does not follow, the drive ends with an error
+that has the daemon's reason.
 """
 
 from __future__ import annotations
@@ -28,13 +29,14 @@ from acsard.client.follower import QUIET_S, Followed, Watch
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2
-"""Time after an action, s, by which a state from before the action has arrived."""
+"""Time, s. A state that arrives later than this after an action was made after the action."""
 
 STANDS = 0.01, 0.02
-"""Speeds, m/s and rad/s, below which the robot counts as standing."""
+"""Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""The robot is still slowing down if its speed falls below this share within this time, s."""
+"""A share and a time, s. The robot is still slowing down if its speed falls below this share of its
+lowest speed so far within this time."""
 
 
 class UnheardError(NotDrivenError):
@@ -42,20 +44,23 @@ class UnheardError(NotDrivenError):
 
 
 class Driven(Followed, Protocol):
-    """Interface of a client as a drive uses it."""
+    """The interface that a drive needs of a client."""
 
     source: str
     sender: str
-    """Public name of this client, which each of its commands carries."""
+    """Public name of this client, by which the daemon identifies its commands."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
-        """Send one command."""
+        """Send one command: `linear` m/s, `angular` rad/s (left is +)."""
 
 
 def drive(
     robot: Driven, linear: float, angular: float, seconds: float
 ) -> Generator[float, None, None]:
-    """Drive for `seconds` and then until the robot stands; yield each pause between steps, s.
+    """Drive for `seconds`, then send zeros until the robot stands.
+
+    The generator yields the time, s, that the caller must wait before the next step. `linear` is in
+    m/s and `angular` in rad/s (left is +).
 
     Raises:
         NotDrivenError: The robot does not follow; the text is the daemon's reason.
@@ -70,8 +75,8 @@ def drive(
         )
     checks = _Drive(robot)
     try:
-        # Send the zeros before each drive: since the last one, the robot may have been stopped and
-        # cleared, or restarted.
+        # Send zeros before each drive, not only the first: since the last drive, the robot may have
+        # been stopped and cleared, or restarted.
         yield from _opening(robot, checks)
         end, grace = time.monotonic() + seconds, min(GRACE_S, seconds / 2)
         while (left := end - time.monotonic()) > 0:
@@ -106,7 +111,10 @@ def _opening(robot: Driven, checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(robot: Driven, checks: _Drive) -> Iterator[float]:
-    """Send zeros until the robot stands, or becomes no slower because something else moves it."""
+    """Send zeros until the robot stands, or until it no longer slows down.
+
+    It does not slow down if something else moves it.
+    """
     begun = since = time.monotonic()
     watch, slowest = checks.watch, math.inf
     while since + SLOWS_S > (now := time.monotonic()) or watch.age(now) > QUIET_S:
@@ -119,7 +127,7 @@ def _stopping(robot: Driven, checks: _Drive) -> Iterator[float]:
             continue
         linear, angular = watch.state.linear, watch.state.angular
         if linear is None or angular is None:
-            # Without feedback, it is unknown whether the robot stands.
+            # Without feedback from the board, it is unknown whether the robot stands.
             continue
         speed = max(abs(linear) / STANDS[0], abs(angular) / STANDS[1])
         if speed < 1.0:
@@ -129,23 +137,29 @@ def _stopping(robot: Driven, checks: _Drive) -> Iterator[float]:
 
 
 class _Drive:
-    """The daemon's verdict on the commands of this client, by its `state`."""
+    """Checks by the daemon's `state` whether the robot follows the commands of this client."""
 
     def __init__(self, robot: Driven) -> None:
         self._robot = robot
         now = self._fine = time.monotonic()
         self.watch = Watch(robot, now)
         self.objection: str | None = None
-        """Why the robot does not follow, by the last state; "" if it does, None without a state."""
+        """Why the robot does not follow, according to the last state.
+
+        It is "" if the robot follows, and None before the first state.
+        """
 
     @property
     def hopeless(self) -> bool:
-        """True if waiting cannot help."""
+        """True if the daemon will keep refusing the commands, so that waiting cannot help."""
         state = self.watch.state
         return state is not None and hopeless(state, self._robot.source)
 
     def look(self) -> None:
-        """Take the states that have arrived; raise `NoAnswerError` after a long silence."""
+        """Process the states that have arrived.
+
+        Raises `NoAnswerError` if the daemon has been silent for too long.
+        """
         now, watch = time.monotonic(), self.watch
         try:
             news = watch.look(now)

@@ -1,7 +1,7 @@
 """Follows many robots: their liveliness tokens, their newest states and their versions.
 
-Zenoh's threads store the newest state of each robot, and the reader decodes it. Only `ask` may
-wait for the bus.
+Zenoh's threads store the newest state of each robot undecoded. The thread that reads the rows
+decodes it. Of the methods that this thread calls repeatedly, only `ask` may wait for the bus.
 """
 
 from __future__ import annotations
@@ -30,31 +30,34 @@ names."""
 
 
 class Row(Struct, frozen=True):
-    """The known facts of one robot."""
+    """The facts that are known about one robot."""
 
     robot_id: str
     here: bool | None
-    """Whether the liveliness token of its daemon is present; None if it was never seen."""
+    """Whether the liveliness token of its daemon is present; None if the token was never seen."""
     state: RobotState | None
     age: float
-    """Age of `state` in s; inf if the only state is an answer that a storage may have sent."""
+    """Age of `state`, s; inf if its only source is an answer that a storage may have sent."""
     version: str
     silent: bool = False
-    """Whether the robot counts as silent."""
+    """Whether the robot counts as silent, as `Follower.silent` defines it."""
 
 
 class _Known:
-    """The known facts of one robot. Zenoh's threads replace each value as a whole."""
+    """The facts that are known about one robot. Zenoh's threads replace each value as a whole."""
 
     def __init__(self) -> None:
         self.here: bool | None = None
         self.version = ""
         self.newest = Mailbox[tuple[zenoh.Sample, float]](1)
-        """The newest published state and its arrival time, until it is decoded."""
+        """The newest published state, undecoded, and its arrival time, s."""
         self.begin()
 
     def begin(self) -> None:
-        """Query the robot at once, because it appeared or the search for it begins."""
+        """Reset the times so that the robot is queried at once.
+
+        This is for a robot that has appeared, or that is followed from now on.
+        """
         self.since = self.info_due = time.monotonic()
         self.follower = Follower(self.since, FLEET_ASK_S)
         self.follower.due = self.since
@@ -66,18 +69,19 @@ class Fleet:
     def __init__(
         self, robot: Client, ids: Sequence[str], most: int = MOST, forget_s: float = math.inf
     ) -> None:
-        """Subscribe; this may wait for the bus. Raises `ZError`.
+        """Subscribe to the states and tokens; this may wait for the bus. Raises `ZError`.
 
         Args:
             robot: A client of any robot on the same bus.
             ids: The named robots, which are never dropped, or "*".
             most: Maximum number of robots.
-            forget_s: Silence after which a robot is dropped unless its token is present, s.
+            forget_s: Time without a state, s, after which a robot that was not named is dropped
+                unless its token is present.
         """
         self._robot, self._ids, self._most, self._forget_s = robot, ids, most, forget_s
         self._lock = Lock()
         self.left_out = False
-        """Whether there were more robots than `most`."""
+        """Whether a robot was left out because there were more than `most`."""
         self._known = {one: _Known() for one in ids if one != ALL}
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._declared: list[Any] = []
@@ -94,7 +98,7 @@ class Fleet:
             raise
 
     def rows(self) -> list[Row]:
-        """Return one row per robot."""
+        """Return one row per robot, and drop the robots that have been silent for too long."""
         now = time.monotonic()
         with self._lock:
             for name, one in list(self._known.items()):
@@ -105,7 +109,7 @@ class Fleet:
             return [self._row(name, one, now) for name, one in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the robot and the key of each query that is due, and plan the next ones."""
+        """Return the robot id and the key of each query that is due, and plan the next queries."""
         now, due = time.monotonic(), []
         with self._lock:
             for name, one in self._known.items():
@@ -118,7 +122,7 @@ class Fleet:
         return due
 
     def ask(self, due: Sequence[tuple[str, str]]) -> None:
-        """Send these queries; this may wait for the bus. Raises `ZError`."""
+        """Send the queries that `due` returned; this may wait for the bus. Raises `ZError`."""
         for name, key in due:
             self._robot.like(name).ask(key, self._answer if key == "state" else self._info)
 
@@ -141,7 +145,7 @@ class Fleet:
         return Row(name, one.here, state, age, one.version, silent)
 
     def _take(self, one: _Known) -> None:
-        """Decode the newest published state."""
+        """Decode the newest published state of a robot, and pass it to its follower."""
         for sample, at in one.newest.take():
             try:
                 one.follower.published(self._states.decode(*encoded(sample)), at)
@@ -163,7 +167,7 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        """Drop the unnamed robot that has been gone for the longest time."""
+        """Drop the robot that has been gone for the longest time, except the named robots."""
         gone = [(one.since, name) for name, one in self._known.items() if not one.here]
         for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
             del self._known[name]
@@ -173,7 +177,7 @@ class Fleet:
         if one is not None:
             appeared, one.here = not one.here, sample.kind == zenoh.SampleKind.PUT
             if not one.here:
-                # A restarted daemon may have another version.
+                # Query the version again later, because the daemon may restart with another one.
                 one.since, one.version = time.monotonic(), ""
             elif appeared:
                 one.begin()

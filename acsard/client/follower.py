@@ -3,9 +3,9 @@
 `Follower` is pure, and `Watch` binds it to the bus. Every program that follows `state` uses these
 time limits, so a silent robot is reported equally soon by all of them.
 
-A router's storage also answers queries, for a dead robot with its last state. A state that arrives
-unqueried never comes from a storage, so it always proves that the daemon runs. An answer proves it
-only if it is newer than the state before it.
+The storage of a router also answers queries. For a robot that is off, it returns the robot's last
+state. A published state never comes from a storage, so it always proves that the daemon runs. An
+answer to a query proves this only if it is newer than a state that was received before.
 """
 
 from __future__ import annotations
@@ -22,56 +22,60 @@ from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 ASK_S = 0.3
-"""Time without a state, s, after which it is queried. The robot may publish it seldom."""
+"""Time without a published state, s, after which `state` is queried. A robot may publish its state
+seldom."""
 
 QUIET_S = 0.5
-"""Age, s, above which a state is too old to act on."""
+"""Age of a state, s, above which a program must not act on it."""
 
 SILENT_S = 1.0
-"""Age, s, above which the robot counts as silent: the operator is told, and a drive ends."""
+"""Age of the last state, s, above which the robot counts as silent. Then a drive ends, and other
+programs inform the operator."""
 
 FIRST_S = 2.0
-"""Time, s, within which the first message on a key arrives from a robot that is well."""
+"""Time, s, within which the first message on a key arrives if the robot works normally."""
 
 FLEET_ASK_S = 2.0
-"""Value of `ASK_S` for a program that follows many robots, whose queries add up."""
+"""Value of `ASK_S` for a program that follows many robots, because it sends many queries."""
 
 STATE = "state"
 
 ANSWERS = 16
-"""Replies that wait at most. A query has one from the daemon and one from each storage."""
+"""Maximum number of replies that wait to be processed. A query gets one reply from the daemon and
+one from each storage."""
 
 STEADY = ("lines", "lines_sent", "commands")
 """Counters that decrease only when the daemon restarts."""
 
 
 class Follower:
-    """The newest state of one robot. All times are in s of one clock that never goes back."""
+    """The newest state of one robot. All times are in s on the same monotonic clock."""
 
     def __init__(self, now: float, ask_s: float = ASK_S) -> None:
         self.state: RobotState | None = None
         """The newest state. Until `heard` is true, it may come from a storage."""
         self.heard = False
-        """Whether the daemon has proven that it runs."""
+        """Whether a state has proved that the daemon runs."""
         self.last_seen = now
-        """Time of the last state that proved it, or of the start."""
+        """Time of the last state that proved that the daemon runs, or of the start."""
         self.due = now + ask_s
-        """Time of the next query, unless a state arrives before it."""
+        """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0
         """Number of messages in succession that could not be decoded."""
         self._ask_s = ask_s
         self._answer: RobotState | None = None
 
     def published(self, state: RobotState, now: float) -> None:
-        """Take a state that the daemon published."""
+        """Store a state that the daemon published."""
         self.state, self.last_seen, self.heard = state, now, True
         self.due, self.unreadable = now + self._ask_s, 0
 
     def answered(self, state: RobotState, now: float) -> bool:
-        """Take the answer to a query, and return whether it is news.
+        """Process the answer to a query, and return whether it proves that the daemon runs.
 
-        It is news if it is newer than the held state, or than the answer before it. The second
-        case covers a robot whose clock was set back since the held state arrived.
+        It does if its stamp is newer than that of the stored state or that of the previous answer.
+        The comparison with the previous answer is for a robot whose clock was set back after the
+        stored state.
         """
         held, before, self._answer = self.state, self._answer, state
         known = [one for one in (held, before) if one is not None]
@@ -92,13 +96,16 @@ class Follower:
         return True
 
     def age(self, now: float) -> float:
-        """Return the time since the last sign of life of the daemon, or since the start, s."""
+        """Return the time since the last state that proves that the daemon runs, s.
+
+        Before the first one it is the time since the start.
+        """
         return max(0.0, now - self.last_seen)
 
     @property
     def patience_s(self) -> float:
         """The age above which the robot counts as silent, s."""
-        # A robot that publishes seldom is only heard by its answers, each `ask_s` after the other.
+        # From a robot that publishes seldom only answers arrive, at intervals of `ask_s`.
         return (SILENT_S if self.heard else FIRST_S) + self._ask_s - ASK_S
 
     def silent(self, now: float) -> bool:
@@ -107,29 +114,32 @@ class Follower:
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
-    """Return whether another daemon answers than before, because a counter decreased."""
+    """Return whether the daemon has restarted between two states, because a counter decreased."""
     return before is not None and any(
         state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY
     )
 
 
 class Followed(Protocol):
-    """Interface of a client as a watch uses it."""
+    """The interface that a `Watch` needs of a client."""
 
     def subscribe(self, name: str) -> Subscription:
         """Subscribe to a key."""
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key, and call `take` with the reply, if one comes."""
+        """Query a key, and call `take` with the reply if one arrives."""
 
 
 class Watch(Follower):
-    """The newest state of the robot of a client. One thread uses it."""
+    """Follows the state of the robot of a client. Only one thread may use it."""
 
     def __init__(
         self, robot: Followed, now: float, wake: Callable[[], object] | None = None
     ) -> None:
-        """Subscribe; `wake` is called on a thread of Zenoh when a state arrives."""
+        """Subscribe to the state of the robot of the client `robot`.
+
+        `now` is the present time, s. `wake` is called on a thread of Zenoh when a state arrives.
+        """
         super().__init__(now)
         self._robot, self._decoder = robot, Decoder(RobotState)
         self._states = robot.subscribe(STATE)
@@ -139,9 +149,9 @@ class Watch(Follower):
         """Replies to queries. A thread of Zenoh puts them here and does nothing else."""
 
     def look(self, now: float) -> list[RobotState]:
-        """Take the states that have arrived, query a late one, and return the new ones.
+        """Process the states that have arrived, and return the new ones.
 
-        Raises `ZError` after the session was closed.
+        If no state has arrived for some time, query it. Raises `ZError` if the session was closed.
         """
         news = []
         for _ in range(QUEUED):  # bounded, so that a flood cannot hold the caller
@@ -169,7 +179,10 @@ class Watch(Follower):
             return None
 
     def objection(self, source: str, sender: str, now: float) -> str:
-        """Return why commands have no effect; "" if they have one, or before the first state."""
+        """Return why the commands of `sender` as `source` have no effect.
+
+        Returns "" if the robot follows them, and before the first state.
+        """
         if self.silent(now):
             return "nothing received from the daemon: does it run?"
         return "" if self.state is None else objection(self.state, source, sender)

@@ -1,7 +1,8 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
-Each sender has a `Commander`, which keeps its newest wish only. A sender that leaves is released:
-its last zero goes out even if the bus was blocked for long.
+Each sender has a `Commander`, which keeps only its newest command. For a sender that ends, the
+program must call `release`. The last zero of this sender is then sent even if the bus has been
+blocked for a long time.
 """
 
 from __future__ import annotations
@@ -16,26 +17,32 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 Put = Callable[[Wish], object]
-"""Sends one command on the bus; it may block."""
+"""Function that sends one command on the bus. It may block."""
 
 
 class Outbox:
     """The senders that command the robot, and the thread that sends their commands."""
 
     def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
-        """Start the thread; it calls `dropped` for each speed that became too old to be sent."""
+        """Start the thread.
+
+        The thread calls `dropped` for each command that has become too old to be sent.
+        """
         self._dropped = dropped
         self._senders: dict[Commander, Put] = {}
         self._zeros: list[tuple[Put, Wish]] = []
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Holds the exception that ended the thread, after which nothing is sent any more."""
+        """Gets the exception that ended the thread. After it, no command is sent any more."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
-        """Take a wish, and return what `Commander.take` returns."""
+        """Queue a command of the sender `commander`, to be sent by `put` on the thread.
+
+        Returns the result of `Commander.take`: the silence before the command, ns, if it was long.
+        """
         with self._news:
             silence = commander.take(wish, clock.mono_ns())
             self._senders[commander] = put
@@ -43,9 +50,9 @@ class Outbox:
         return silence
 
     def release(self, commander: Commander, timeout_s: float = LONGEST_S) -> None:
-        """Forget a sender; send a zero first if the robot may still follow it.
+        """Remove a sender; queue a zero for it if the robot may still follow its last command.
 
-        `timeout_s` is the timeout of the sender's source.
+        `timeout_s` is the timeout of the sender's source, s.
         """
         with self._news:
             put = self._senders.pop(commander, None)
@@ -55,14 +62,14 @@ class Outbox:
             self._news.notify_all()
 
     def flush(self, seconds: float) -> None:
-        """Wait until nothing waits to be sent, at most `seconds`."""
+        """Wait until all commands are sent, but at most for `seconds`."""
         with self._news:
             self._news.wait_for(
                 lambda: not (self._busy or self._zeros or self._times()), timeout=seconds
             )
 
     def end(self, seconds: float) -> None:
-        """Send the commands that are due, and end the thread within `seconds`."""
+        """Let the thread send the commands that are due and end; wait at most `seconds` for it."""
         with self._news:
             self._ended = True
             self._news.notify_all()
@@ -76,7 +83,7 @@ class Outbox:
             self.dead.set_exception(error)
 
     def _round(self) -> bool:
-        """Send what is due; return whether to go on."""
+        """Wait for commands that are due and send them; return False when the thread must end."""
         with self._news:
             self._busy = False
             self._news.notify_all()
@@ -89,7 +96,7 @@ class Outbox:
         for put, zero in zeros:
             put(zero)
         for commander, put in due:
-            # The bus may have blocked the previous command, so judge the age by the present time.
+            # The bus may have blocked the previous command, so compute the age at the present time.
             with self._news:
                 stale = commander.stale
                 wish = commander.send(clock.mono_ns())

@@ -51,7 +51,7 @@ from acsard.host.own_identity import new_secret, own_name, sender_id
 REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
-"""Text that Zenoh returns if a queryable received the query and did not reply in time."""
+"""Text of Zenoh's error reply if the other side received the query and did not answer in time."""
 
 
 @contextmanager
@@ -65,8 +65,9 @@ def connect(
     """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`).
 
     `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449". An
-    argument that is None comes from the file that the environment variable ACSARD_CONFIG names.
-    Without such a file it is "tcp/127.0.0.1:7448", "acsar" or no certificate.
+    argument that is None comes from the file that the environment variable ACSARD_CONFIG names. The
+    variable ACSARD_TLS replaces the certificate directory of that file. Without these variables,
+    `endpoint` is "tcp/127.0.0.1:7448", `robot_id` is "acsar", and there is no certificate.
     """
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
@@ -81,15 +82,16 @@ def close(session: zenoh.Session) -> None:
     try:
         session.close()
     except zenoh.ZError:
-        # The other side is stuck, and this client leaves in any case.
+        # The other side is stuck. Ignore that, because this client ends the session anyway.
         pass
 
 
 class _Puts:
-    """Spacing of the commands on one connection.
+    """Keeps a minimum pause between the commands on one connection.
 
-    The daemon accepts 1000 commands a second per connection and key. A zero directly after another
-    command, even of another client object on the connection, would be dropped.
+    The daemon accepts 1000 commands a second per connection and key, and drops others. So it would
+    drop a zero that is sent directly after another command. That command may be from another
+    `Client` on the same connection.
     """
 
     def __init__(self) -> None:
@@ -102,7 +104,7 @@ class _Puts:
             at_s = max(self._next_s, time.monotonic())
             self._next_s = at_s + SPACING_S
         time.sleep(max(0.0, at_s - time.monotonic()))
-        # A busy machine may wake this thread late, and the next command must keep its distance.
+        # A busy machine may wake this thread late. The next command must still keep the pause.
         self._next_s = max(self._next_s, time.monotonic() + SPACING_S)
 
 
@@ -125,10 +127,12 @@ class Client:
         self._puts = _Puts()
         self.certificate = shown_at(endpoint, tls)
         """Common name of the certificate that this client presents, "" without one."""
-        # `like` can make another sender of commands on this connection, but not another caller.
+        # The secret identifies this program as a caller of services. Clients made by `like` share
+        # it, although they may send commands under another name.
         self._secret = new_secret()
         self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
-        # The wall clock may be set during a drive, and the daemon would take the step for a delay.
+        # Compute stamps from the steady clock. If the wall clock were set during a drive, the
+        # daemon would mistake its step for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
 
     def _sign_as(self, name: str) -> None:
@@ -139,16 +143,17 @@ class Client:
 
     @property
     def caller(self) -> str:
-        """The sender id of each call: `name` with a secret.
+        """The sender id that this client attaches to service calls and queries: `name/SECRET`.
 
-        The daemon's log shows its public name.
+        The daemon's log shows the public name that is derived from it.
         """
         return sender_id(self.name, self._secret)
 
     def like(self, robot_id: str, name: str = "") -> Client:
-        """Return a client of another robot on the same connection, or another sender to this one.
+        """Return another client on the same connection, as another sender of commands.
 
-        `name` is the sender's name; by default it is that of this process.
+        `robot_id` is the id of its robot, which may be the same one. `name` is the name of the
+        sender; "" means the host name and the process id.
         """
         other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
         other.name, other._secret, other._puts = self.name, self._secret, self._puts
@@ -157,11 +162,11 @@ class Client:
         return other
 
     def key(self, name: str) -> str:
-        """Return the full key of a name in the topic table, such as "odom"."""
+        """Return the full key on the bus for a key of the topic table, such as "odom"."""
         return full_key(self.where.robot_id, name)
 
     def command_key(self, source: str) -> str:
-        """Return the key, below the robot's id, on which this client commands as `source`.
+        """Return the key, below the robot's id, on which this client puts commands as `source`.
 
         Over TLS each certificate has a key of its own.
         """
@@ -170,9 +175,9 @@ class Client:
     def send(self, linear: float, angular: float = 0.0, *, stamp_ns: int | None = None) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
-        Repeat it to keep moving. The first call sends a zero instead, because the daemon requires
-        one before it drives. `stamp_ns` is for a program that forwards commands: the time of the
-        command by the clock of its origin, ns.
+        Repeat the call to keep the robot moving. The first call sends a zero instead, because the
+        daemon requires a zero before it follows a sender. `stamp_ns` is for a program that forwards
+        commands: the time at which the command was made, by the clock of its origin, ns.
         """
         if self._opened:
             self._put(linear, angular, stamp_ns)
@@ -183,9 +188,10 @@ class Client:
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for `seconds` (above 0), then slow down, and return when the robot stands.
 
-        Speeds above its `[limits]` are not an error: the robot drives at the limits.
-        `get("config")` returns them, and `get("cmd_vel_out")` the applied speed. Raises
-        `NotDrivenError` with the daemon's reason as soon as the robot does not follow.
+        `linear` is in m/s and `angular` in rad/s (left is +). Speeds above the robot's `[limits]`
+        are not an error: the robot drives at its limits. `get("config")` returns the limits, and
+        `get("cmd_vel_out")` the applied speed. Raises `NotDrivenError` with the daemon's reason as
+        soon as the robot does not follow.
         """
         try:
             with closing(drive(self, linear, angular, seconds)) as steps:
@@ -197,27 +203,28 @@ class Client:
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, such as "stop", with the fields of its payload.
 
-        `clear` releases the stop or fault that `state` shows now, and `activate` switches on a
-        robot that `state` shows as switched off now. Pass the `latch` of the state that a person
-        has looked at as `latch=state.latch`, and the daemon refuses if a stop or a `deactivate`
-        has come since.
+        `clear` releases the stop or fault that `state` shows at the time of the call. `activate`
+        switches on a robot that `state` shows as switched off at that time. If a person decides by
+        an earlier state, pass `latch=state.latch` of that state. The daemon then refuses the call
+        if there was a stop or a `deactivate` in between.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 
     def set(self, settings: Mapping[str, Plain], *, keep: bool = False) -> schema.ServiceReply:
-        """Change settings until the next start, for example `{"rates.state": 5.0}`; all or none.
+        """Change settings until the next start of the daemon, for example `{"rates.state": 5.0}`.
 
-        A lowered speed, acceleration or jerk of `limits` survives the next start. With `keep` the
-        daemon also writes the settings into its configuration file. The reply then names the file,
-        or says why the settings are refused or not written.
+        The daemon changes all of the settings or none. A lowered speed, acceleration or jerk of
+        `limits` survives the next start. With `keep`, the daemon also writes the settings into its
+        configuration file. The reply then names the file, or says why the settings are refused or
+        not written.
         """
         fields: dict[str, object] = {"settings": settings}
         return self.request("set", fields | {"keep": True} if keep else fields)
 
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
-        """Call any service with this payload, and return its reply."""
+        """Call any service with `fields` as its payload, and return its reply."""
         payload = msgspec.json.encode(fields) if fields else None
         return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
 
@@ -226,11 +233,11 @@ class Client:
         return decoder(name).decode(*self.reply(name))
 
     def reply(self, name: str) -> tuple[str, bytes]:
-        """Return the last value of a key undecoded: its encoding and its payload."""
+        """Return the last value of a key without decoding it: its encoding and its payload."""
         return self._ask(name)
 
     def whoami(self) -> Identity:
-        """Return this client's identity as the daemon sees it. An unknown role is ""."""
+        """Return this client's identity as the daemon sees it. The role is "" if it is unknown."""
         return identity(
             self.ask, self.where.tls, self.sender, self.where.robot_id, self.where.endpoint
         )
@@ -254,9 +261,9 @@ class Client:
         yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
-        """Call back for each sample of a key, on a thread of Zenoh.
+        """Call `callback` with each sample of a key, on a thread of Zenoh.
 
-        `undeclare` the result to end it.
+        To end this, call `undeclare` on the returned subscriber.
         """
         try:
             return self.session.declare_subscriber(self.key(name), callback)
@@ -264,11 +271,14 @@ class Client:
             raise _no_key(name) from None
 
     def subscribe(self, name: str) -> Subscription:
-        """Return the raw samples of a key, for a loop that must not block."""
+        """Subscribe to a key; return its raw samples as a queue for a loop that must not block."""
         return Subscription(self._queue(name), self.key(name))
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key, and call back with its last value on a thread of Zenoh, if a reply comes."""
+        """Query a key without waiting for the reply.
+
+        If a reply arrives, `take` is called with it on a thread of Zenoh.
+        """
         self.session.get(
             self.key(name),
             lambda reply: take(reply.ok) if reply.ok is not None else None,
@@ -287,9 +297,9 @@ class Client:
     def put(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
     ) -> None:
-        """Send one command with a signature, for a program that forwards another sender's.
+        """Send a command with this signature, for a program that forwards other senders' commands.
 
-        `source` is the client's own by default.
+        `source` is the command source; "" means the source of this client.
         """
         self._puts.wait()
         self._publish(twist, signature, source or self.source)
@@ -318,7 +328,10 @@ class Client:
         self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
-        """Return the first reply. A stranger may send any number of further ones."""
+        """Return the encoding and the payload of the first reply to a query.
+
+        Other replies are ignored, because any client on the bus may send any number of them.
+        """
         end_s = time.monotonic() + REPLY_TIMEOUT_S
         while True:
             reply = self._first(name, payload)
@@ -332,8 +345,8 @@ class Client:
                     f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
                     "the network is stuck; try again, or run `acsard doctor` on the robot"
                 )
-            # Repeat only queries. The effect of a service call may have been overruled by another
-            # client since.
+            # Repeat a query, but not a service call: since the first attempt, another client may
+            # have called a service with the opposite effect.
             if said != BUSY or name in VERBS or time.monotonic() > end_s:
                 raise ReplyError(f"{name}: {said}")
             time.sleep(0.03)
@@ -351,7 +364,7 @@ class Client:
         return next(iter(replies), None)
 
     def _unanswered(self, name: str) -> MendableError:
-        """Return an error that explains the missing reply, with its cause if that is known."""
+        """Return an error that says that there is no reply, with the cause if it is known."""
         key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
@@ -373,9 +386,10 @@ class Client:
         )
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """Return the documented error that stands for `error`.
+        """Return the error to raise for a drive or a state that failed with `error`.
 
-        If no command arrives, the text also names the role of this client's certificate.
+        The result is one of the errors that `acsard.client` documents. If no command arrives at the
+        daemon, its text also names the role of this client's certificate.
         """
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))
@@ -388,7 +402,7 @@ class Client:
             return error
         if us.role and not has(us.role, COMMAND_ROLE):
             return NotPermittedError(us.words())
-        # The role may explain why no command arrives. It has no part in a fault or a stop.
+        # The role may explain why no command arrives, but it does not explain a fault or a stop.
         unexplained = str(error) == no_command(self.source)
         return NotDrivenError(f"{error}; {us.words()}" if unexplained else str(error))
 
@@ -399,9 +413,9 @@ def _no_key(name: str) -> UsageError:
 
 @lru_cache(maxsize=64)
 def decoder(name: str) -> Decoder[Any]:
-    """Return the decoder of a key's type.
+    """Return the decoder for the messages of a key.
 
-    Keys without a type (config, schema/…) become dictionaries.
+    Messages of keys without a message type (config, schema/…) are decoded to dictionaries.
     """
     topic = by_key(name)
     cls = None if topic is None else schema.MESSAGES.get(topic.type)

@@ -1,7 +1,8 @@
 """Formats texts and values for people; pure.
 
-A text from a stranger passes `printable`, `lines` or `json_line` before a terminal gets it. Counts,
-durations and signed figures look the same in every message, because this module formats them all.
+Untrusted text must pass `printable`, `lines` or `json_line` before it is written to a terminal.
+This module formats the counts, durations and signed numbers of all messages, so that they look the
+same everywhere.
 """
 
 from __future__ import annotations
@@ -13,17 +14,24 @@ from itertools import accumulate
 
 
 def printable(text: str) -> str:
-    """Return the text on one line, without control characters that a terminal would obey."""
+    """Return the text on one line, without control characters that a terminal would obey.
+
+    White space becomes a space, and any other unprintable character becomes U+FFFD.
+    """
     return "".join(" " if c.isspace() else c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lines(text: str) -> str:
-    """Make a text of several lines printable, and keep its line breaks."""
+    """Return a text of several lines with each line made `printable`. The line breaks stay."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def printable_bytes(data: bytes, most: int, last: bool = False) -> str:
-    r"""Return the first or `last` bytes in `most` characters. An unprintable byte is `\x00`."""
+    r"""Return bytes as a text of at most `most` characters, plus "…" if some bytes are left out.
+
+    The text shows the first bytes, or the last ones if `last` is true. An unprintable byte is
+    written as an escape such as `\x00`.
+    """
     shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
     ends = accumulate(map(len, shown))
     kept = [text for text, end in zip(shown, ends, strict=True) if end <= most]
@@ -51,15 +59,15 @@ def many(count: int, one: str, more: str = "") -> str:
 
 
 def listed(items: Sequence[str], most: int, joint: str = ", ") -> str:
-    """Join texts; say how many are left out if there are more than `most`."""
+    """Join the first `most` texts with `joint`, and append how many more there are, if any."""
     more = [f"and {len(items) - most} more"] if len(items) > most else []
     return joint.join([*items[:most], *more])
 
 
 def signed(value: float | None, decimals: int, width: int) -> str:
-    """Format a number with its sign, right-aligned: "-" for None and NaN.
+    """Format a number with its sign, right-aligned in `width` characters.
 
-    A number that is too long for `width` is written with an exponent.
+    None and NaN become "-". A number that is too long for `width` is written with an exponent.
     """
     if value is None or math.isnan(value):
         return "-".rjust(width)
@@ -71,7 +79,7 @@ _UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
 def lasting(seconds: float) -> str:
-    """Format a duration in its two largest units; below a minute, in s with one decimal."""
+    """Format a duration in its two largest units. Below a minute, it is in s with one decimal."""
     if seconds < 59.95:
         return f"{round(seconds, 1):g} s"
     parts: list[tuple[int, str]] = []
@@ -93,7 +101,8 @@ _ROUGH = (
 def rough(seconds: float | None, finest: float = 1.0) -> str:
     """Format a duration or an age with two digits or more, in at most 7 characters.
 
-    None and infinity are "never". `finest` is the size of the smallest unit, s.
+    None and infinity become "never". A negative value or one from 1e9 s on becomes "?". `finest` is
+    the size of the smallest unit to use, s.
     """
     if seconds is None or seconds == math.inf:
         return "never"

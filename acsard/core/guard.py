@@ -3,19 +3,20 @@
 The guard shares no code with `limits.py`, `codec.py` or `checksum.py`. It reads the finished bytes
 as the MCU will, and passes a line only if all of these hold:
 
-- The line is whole, within the hard limit, and its check is right. Only `link_check = "require"`
-  asks for a check on a line that moves a wheel.
-- No wheel is faster than in the last line sent, unless a fresh command, a live link and mode
-  `driving` agree (invariant 2).
-- With no link, all wheels are zero.
+- The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
+  correct if the line has one. With `link_check = "require"`, a line that moves a wheel must have a
+  checksum.
+- No wheel is faster than in the last line sent, unless there is a fresh command, the link is up and
+  the mode is `driving` (invariant 2).
+- Without a link, all wheel speeds are zero.
 
-Otherwise the guard replaces the line with the stop line. It hands the reason to the robot, which
+Otherwise the guard replaces the line with the stop line. It returns the reason, and the robot
 latches a fault.
 
 The guard also checks that the robot comes to rest. When the last fresh command is older than the
-longest ramp that the limits allow, only zero passes. After a stop, a fault or the end of the daemon
-the longest ramp at the stop deceleration counts. The guard remembers these times, so a recording
-keeps its `Memory` as well as the robot.
+longest ramp that the limits allow, only zero speeds pass. After a stop, a fault or a shutdown, this
+limit is the longest ramp at the stop deceleration. The guard remembers these times, so a recording
+stores the guard's `Memory` beside the state of the robot.
 """
 
 from __future__ import annotations
@@ -39,30 +40,33 @@ HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
 MARGIN_NS = 300_000_000
-"""Allowed beyond the longest ramp. The board stops by itself after a pause this long between two
-lines, so no ramp of the daemon is later than that."""
+"""Time allowed beyond the longest ramp, ns. The board stops by itself if it receives no line for
+this time, so the ramp of a moving robot cannot be later than that."""
 
 
 class Memory(Struct, frozen=True):
     """Everything that a guard remembers from one line to the next."""
 
     last: bytes = b""
-    """The line that left last, which an MCU with power is obeying. Empty at the start."""
+    """The last line written to the port. An MCU with power follows it. Empty at the start."""
     commanded_ns: int | None = None
-    """When a fresh command was last followed in mode `driving`, monotonic."""
+    """Monotonic time at which mode `driving` last had a fresh command, ns; None before that."""
     halted_ns: int | None = None
-    """When the mode became one of `HALTED`, monotonic. None in any other mode."""
+    """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
-    """Longest ramp to rest under any limits in force since the robot was last at rest."""
+    """Longest ramp to rest under all limits in force since the robot was last at rest, ns."""
     stop_ramp_ns: int = 0
-    """Longest ramp to rest at the stop decelerations, since the robot was last at rest."""
+    """Longest ramp at the stop decelerations under all limits since the last rest, ns."""
 
 
 class Guard:
-    """Passes a line on or replaces it with `stop`."""
+    """Checks each line before it is sent, and replaces a forbidden line with the stop line."""
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
-        """`stop` is the plain stop line: an MCU in any state obeys it."""
+        """Start with the memory of an earlier guard, or with an empty one if `memory` is None.
+
+        `stop` is the stop line without a checksum, which an MCU obeys in any state.
+        """
         self._stop = stop
         memory = memory or Memory()
         self._last = memory.last
@@ -71,7 +75,10 @@ class Guard:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Check by this configuration from now on. The memory stays."""
+        """Use this configuration for all later checks.
+
+        Until the robot is at rest, the longer of the old and the new ramps applies.
+        """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
@@ -80,18 +87,18 @@ class Guard:
 
     @property
     def memory(self) -> Memory:
-        """The memory that lets another guard continue."""
+        """The memory with which another guard can continue the checks of this one."""
         return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
     def left(self, line: bytes) -> None:
-        """Note that this line went out."""
+        """Record that this line was written to the port."""
         self._last = line
         self._note_limits()
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """Return the line that may leave, and the reason if it replaces the one of these outputs.
+        """Return the line to send, and the reason if it replaces the line of `outputs`.
 
-        The line is None if none is due. The reason is "" if the line is passed unchanged.
+        The line is None if `outputs` has none. The reason is "" if the line is unchanged.
         """
         if outputs.mode == "driving":
             if self._commanded(outputs):
@@ -108,7 +115,7 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _note_limits(self) -> None:
-        """Let a robot in motion end its ramp by the limits under which it began to move."""
+        """Update the longest ramps. A moving robot may still brake by earlier, lower limits."""
         if _wheels(self._last) == _ZERO:
             self._longest = self._ramps
         else:
@@ -152,9 +159,10 @@ class Guard:
         return abs(outputs.now.mono_ns - arrived) <= timeout
 
     def _sealed(self, line: bytes) -> bool:
-        """Return whether the end of a line, from column 31 on, is that of the checked link.
+        """Return whether a line ends correctly for a link with checksums.
 
-        It is the comma of the dialect, `#`, two digits, perhaps `S` or `H`, and a right check.
+        From column 31 on, such a line has the trailing comma if the board uses one, `#`, two
+        hexadecimal digits, optionally `S` or `H`, and a correct checksum.
         """
         body, check = line[:-7], line[-7:]
         comma, mark = self._stop[31:-2], body[31:]
@@ -168,10 +176,11 @@ class Guard:
 
 
 def _ramp_ns(config: Config, *, stop: bool) -> int:
-    """Return how long the limits let the robot take from its highest speed to rest, in ns.
+    """Return the time that the robot needs at its limits from the highest speed to rest, ns.
 
-    No twist is faster than its own limit or than all wheels at theirs. Both axes reach rest
-    together, at the pace of the slower one. Jerk shapes speeding up only.
+    If `stop` is true, the stop decelerations apply. The highest speed of an axis is its own limit,
+    or its speed with all wheels at `limits.wheel_speed` if that is lower. Both axes reach rest
+    together, so the slower one decides. The jerk limits only affect acceleration.
     """
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
@@ -186,10 +195,10 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
     return int(max(linear / by[0], angular / by[1]) * NS_PER_S)
 
 
-# The last line sent is decoded again with the next one.
+# Each check also decodes the last line sent, so a cache of a few lines halves the work.
 @lru_cache(4)
 def _wheels(line: bytes) -> Wheels | None:
-    """Return the four speeds in 0.01 rad/s by fixed columns, None if the columns do not fit."""
+    """Return the four speeds of a line in 0.01 rad/s, or None if a column has another form."""
     match = _COLUMNS.match(line)
     if match is None:
         return None
@@ -201,9 +210,10 @@ def _wheels(line: bytes) -> Wheels | None:
 
 
 def _crc(data: bytes) -> int:
-    """Return the CRC-16/XMODEM by the shifts of avr-libc's notes.
+    """Return the CRC-16/XMODEM, computed with bit shifts as in the notes of avr-libc.
 
-    This does not use the library that sealed the line, so an error there is noticed here.
+    It shares no code with the module that computed the checksum of the line, so it reveals an error
+    in that module.
     """
     crc = 0
     for byte in data:

@@ -1,10 +1,10 @@
-"""`Robot.step(Inputs) -> Outputs` holds all parts of a robot, and alone knows their order.
+"""The robot as one pure object: `Robot.step(Inputs) -> Outputs` calls all its parts in order.
 
-A step folds the feedback into odometry, chooses one command, gates it by the mode, limits it,
-inverts the kinematics and reports. It is pure: time, bytes and commands come in, decisions go out.
-The memory of a robot is in `Robot` and its parts, and only a step changes it, except that the
-control loop adds to `counters`. The control loop carries the bytes, and `core/guard.py` checks each
-line that leaves.
+A step updates the odometry with the feedback, chooses one command, checks that the mode allows it,
+limits it, converts it to wheel speeds and reports. It does no I/O: its inputs are time, bytes and
+commands, and its outputs are decisions. The memory of a robot is in `Robot` and its parts. Only a
+step changes this memory, except that the control loop adds to `counters`. The control loop reads
+and writes the port, and `core/guard.py` checks each line before it is written.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ from acsard.core.values import (
 )
 
 MAX_DT = 0.05
-"""Longest time, s, by which one step may change the speed, or 1.5 periods if that is longer. After
-a stall the robot must not leap."""
+"""Longest time, s, for which one step may accelerate the robot, or 1.5 control periods if that is
+longer. The speed must not jump after a stall of the process."""
 
 UNHEARD_S = WATCHDOG_S - 0.05
-"""Time, s, without a line that left, after which the robot starts over from rest. The MCU stops by
-itself at `WATCHDOG_S`, by its own clock, which may be a little fast."""
+"""If no line was written to the port for this time, s, the robot starts again from rest. The MCU
+stops by itself after `WATCHDOG_S` on its own clock, which may run a little fast."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -70,18 +70,18 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 NS_PER_MS = 1_000_000
 
 MAX_TEXT = 200
-"""Longest text of a refusal that is kept, in characters: it may quote a stranger's message."""
+"""Number of characters that are kept of a refusal's text, which may quote any client's message."""
 
 
 class Robot:
     """One robot base with its link, pose, mode and commanders."""
 
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start in the mode of these latches and with the limits that they keep lowered."""
+        """Start in the mode that `latches` require, with the limits that they keep lowered."""
         self._file_limits = config.limits
         config, self._first_events = with_lowered(config, latches.lowered)
         self.config = config
-        """The configuration in force. A step that obeys `set` replaces it."""
+        """The configuration in force. A step that executes a `set` request replaces it."""
         longest_s = longest_reply(config.feedback.fault_time)
         self.session = McuSession(
             config.mcu, config.rate_hz, config.feedback.wheel_speed, longest_s
@@ -105,19 +105,28 @@ class Robot:
         self._choice = Choice()
         self._speeds = STILL
         self._made_of: tuple[int | None, Mode] = (None, self._life.mode)
-        """Arrival of the command, and the mode, that the last line was made of."""
+        """Arrival time of the command and the mode from which the last line was computed.
+
+        The time is monotonic, ns, and None without a command.
+        """
         self._made_ns = 0
-        """Monotonic time at which the last line was made."""
+        """Monotonic time at which the last line was computed, ns."""
         self._made = self._said = (self._limiter.state, 0)
-        """State of the limiter and its time, at the last line made and at the last line that left.
-        A line that did not leave does not count."""
+        """State of the limiter and its time, ns.
+
+        `_made` is the state at the last line computed, and `_said` the state at the last line
+        written to the port. If a line was not written, `_settle` resets `_made` to `_said`.
+        """
         self._status = ("", "", "", "")
         self._battery_level = ""
-        """The level of the battery in the step before, "" before its first report."""
+        """The level of the battery in the previous step, "" before its first report."""
         self.counters: Counter[str] = Counter()
-        """Totals since the start: `commands`, `commands_of_new_senders` of new senders whose delays
-        were not proved yet, and `command_<reason>` for each reason to refuse. The control loop adds
-        those of the port and the bus."""
+        """Counters since the start, by name.
+
+        `commands` counts accepted commands, and `command_<reason>` counts refused commands by
+        reason. `commands_of_new_senders` counts the commands of senders whose delay is still being
+        checked. Other counters count events. The control loop adds those of the port and the bus.
+        """
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
@@ -127,14 +136,20 @@ class Robot:
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
-        """The last request. A stop arrives twice: on a key of its own, and as a query."""
+        """Verb, client and time of the last request, so that a repetition is not logged again.
+
+        A stop arrives twice: on a key of its own, and as a query.
+        """
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return the values for `state` and `diagnostics`. Too slow for every step."""
+        """Return the values for `state` and `diagnostics`. This is too slow for every step.
+
+        `now_ns` is the present time on the monotonic clock.
+        """
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
@@ -166,7 +181,7 @@ class Robot:
 
     @property
     def latches(self) -> Latches:
-        """The latches in force. They are valid even after an exception in the middle of a step."""
+        """The latches in force. They are valid even if an exception has interrupted a step."""
         return self._life.latches
 
     @property
@@ -175,7 +190,7 @@ class Robot:
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
-        """Take everything that happened since the last step, and decide what happens now."""
+        """Process all inputs since the last step; return the line to send and all reports."""
         events = list(inputs.events)
         self._life.begin(inputs.now)
         if self._first_events:
@@ -193,13 +208,13 @@ class Robot:
         if self._bumpers.limiting:
             self._keep_away(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
-        # A newer command or mode than that of the last line may go at once.
+        # If the command or the mode is newer than the last line, a line may be sent at once.
         news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
         applied = self._limiter.twist
         link = self.session.link
-        # `value` itself would run Python code of the enum.
+        # Use `_value_`, because the property `value` of an enum runs Python code.
         reason = self._reason()
         if self._bumpers.limiting:
             reason = self._with_bumper(reason)
@@ -208,10 +223,10 @@ class Robot:
         level = battery.level if battery else ""
         another = status != self._status or level != self._battery_level
         self._status, self._battery_level = status, level
-        # Otherwise neither the mode nor the commander has changed.
+        # In all other steps neither the mode nor the commander can have changed.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
-        # Pass by position: with seventeen names a struct takes three times as long.
+        # Pass the arguments by position: seventeen keyword arguments take three times as long.
         return Outputs(
             inputs.now,
             due,
@@ -229,12 +244,12 @@ class Robot:
             self._life.latches,
         )
 
-    # The fate of the line before.
+    # The previous line: was it written to the port?
 
     def _settle(self, inputs: Inputs) -> None:
-        """Keep the effect of the last line if it left, and undo it if it did not."""
+        """Keep the effect of the last line if it was written to the port, else undo it."""
         if inputs.guard_trip:
-            # The guard has sent STOP in its place.
+            # The guard has replaced the line with STOP.
             self._limiter.cut()
             self._made = (self._limiter.state, self._made_ns)
         if not inputs.superseded:
@@ -261,7 +276,8 @@ class Robot:
             self._forget()
         self._port_trouble = inputs.port_trouble
         if session.restarted:
-            # No sender drives before the first link, so a zero sent during the start counts.
+            # No sender drives before the link is up for the first time, so accept a zero that was
+            # sent during the start.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
         if session.statuses or self._estop.state or self._bumpers.state or self._battery.status:
@@ -291,7 +307,10 @@ class Robot:
         self._odometry.checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
-        """Obey the inputs of the board, also a press that is over already."""
+        """React to the emergency stop, bumpers, driver fault and battery that the board reports.
+
+        A press that has already ended still stops the robot.
+        """
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
         events += estop.look(statuses, now.mono_ns)
         if estop.pressed_now:
@@ -305,7 +324,7 @@ class Robot:
             else:
                 self._arbiter.require_neutral(now.mono_ns)
         if estop.pressed_now or bumpers.pressed_now:
-            # The hardware has cut the motors, or the robot touches an obstacle: no ramp.
+            # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
             self._limiter.cut()
             self._speeds = STILL
             self._made = self._said = (self._limiter.state, self._made_ns)
@@ -328,10 +347,10 @@ class Robot:
         self._life.hold(*held, now.mono_ns)
 
     def _keep_away(self, now_ns: int) -> None:
-        """Follow the choice only away from the pressed bumpers.
+        """Reduce the chosen command to its motion away from the pressed bumpers.
 
-        After a command that leads elsewhere each sender must send a zero again. Otherwise the robot
-        would drive against the obstacle as soon as the bumper is released.
+        If nothing of the command leads away, each sender must send a zero again. Otherwise the
+        robot would drive against the obstacle as soon as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:
@@ -339,13 +358,13 @@ class Robot:
         away = self._bumpers.away(twist)
         if away is None:
             self._arbiter.require_neutral(now_ns)
-            # Without the commands so far nothing is left to follow.
+            # `require_neutral` has discarded all commands, so the new choice has no twist.
             self._choice = self._arbiter.choose(now_ns)
         elif away != twist:
             self._choice = replace(self._choice, twist=away)
 
     def _board(self, now_ns: int) -> dict[str, str]:
-        """Return the fields of the status lines as text, and the age of the last line."""
+        """Return the fields of the last status line and its age, s, as text; empty without one."""
         status_ns = self.session.status_ns
         if status_ns is None:
             return {}
@@ -353,9 +372,10 @@ class Robot:
         return shown(self.session.status) | {"age_s": f"{age_s:.1f}"}
 
     def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
-        """Fold a line that is possible, and return None for an impossible one.
+        """Update the odometry with a feedback line, and return the new estimate.
 
-        Several impossible lines in a row latch a fault.
+        Returns None if the reported values are physically impossible. Several impossible lines in a
+        row latch a fault.
         """
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
@@ -441,7 +461,8 @@ class Robot:
 
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
         """Change settings while the robot runs."""
-        # The last line made may not have left, and the wheels obey the last one that did.
+        # The last line computed may not have been written to the port. The wheels follow the last
+        # one that was, so both must be zero.
         said, made = self._said[0].twist, self._limiter.twist
         before, at_rest = self.config, self._speeds == STILL and said == made == REST
         try:
@@ -467,8 +488,8 @@ class Robot:
         now_ns = inputs.now.mono_ns
         heard: Sequence[Command | Refusal] = inputs.commands
         if inputs.refusals:
-            # A message that nobody could read cancels the zeros that came before it, and no later
-            # one. The refusals of messages that were lost have no time, so they come first.
+            # Process all in the order of arrival, because an unreadable message cancels only the
+            # zeros before it. The refusal of a lost message has no time, so it comes first.
             heard = sorted([*heard, *inputs.refusals], key=lambda one: one.arrived_ns)
         for one in heard:
             if isinstance(one, Refusal):
@@ -487,7 +508,7 @@ class Robot:
 
     def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
         events.append(refused(refusal))
-        # Every sender with a clock of its own begins in this state.
+        # Every sender with its own clock is unproven at first, so do not show this as a refusal.
         if refusal.reason == "unproven":
             self.counters["commands_of_new_senders"] += 1
             return

@@ -1,7 +1,7 @@
-"""Containers that limit curves, bands and paths as they arrive, without losing a peak; pure.
+"""Containers that thin out curves, bands and paths while data arrives; pure.
 
-Times are in s and never decrease. Each container holds a bounded number of entries. When it
-overflows, neighbouring entries are merged and the resolution is halved.
+Times are in s and never decrease. Each container holds a bounded number of entries. When it is
+full, it merges neighbouring entries and halves its resolution. A curve keeps every peak.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MOST_SPANS = 1500
 MOST_PLACES = 4000
 
 FIRST_STRIDE = 0.001
-"""First minimum distance of two kept places, m."""
+"""Minimum distance between two kept places at the start, m. It doubles when a path is full."""
 
 
 class Point(NamedTuple):
@@ -49,7 +49,7 @@ class Curve:
         """Width of a bin, s."""
 
     def add(self, t: float, value: float | None) -> None:
-        """Add the value at `t`; None, NaN and infinity interrupt the line."""
+        """Add the value at time `t`, s. None, NaN and infinity interrupt the curve."""
         bins = self._bins
         if value is None or not math.isfinite(value):
             if bins:
@@ -97,7 +97,7 @@ def _halved(bins: list[_Bin]) -> Iterator[_Bin]:
 
 
 class Span(NamedTuple):
-    """A time span with one state; `words` is the reason."""
+    """A time span, s, in which the state is `kind`; `words` is the reason of the state."""
 
     begin: float
     end: float
@@ -118,7 +118,7 @@ class Band:
         self._spans: list[Span] = []
 
     def add(self, t: float, kind: str, words: str = "") -> None:
-        """Record the state from `t` on; the kind "" means none."""
+        """Record that the state is `kind` from time `t` on; "" means that there is no state."""
         spans = self._spans
         if spans:
             last = spans[-1] = spans[-1]._replace(end=max(t, spans[-1].end))
@@ -164,7 +164,7 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A path, thinned so that each place of it is less than `stride` m from a kept one."""
+    """A path, thinned so that each of its places is less than `stride` m from a kept place."""
 
     def __init__(
         self,
@@ -175,8 +175,9 @@ class Track:
     ) -> None:
         """Create an empty path.
 
-        A place that is `lasts` s older than the newest one is dropped. The path restarts after a
-        step of more than `jump` m.
+        At most `most` places are kept: when there are more, `stride` is doubled. A place more than
+        `lasts` s older than the newest one is dropped. The path restarts at a place more than
+        `jump` m from the previous one.
         """
         self._most, self._lasts, self._jump = most, lasts, jump
         self._kept = deque[Place]()

@@ -38,7 +38,10 @@ class Instant(Struct, frozen=True, gc=False):
 
 
 class Twist(Struct, frozen=True, gc=False):
-    """Velocity of base_link in base_link: `linear` m/s along x, `angular` rad/s, left is +."""
+    """Velocity of base_link, expressed in base_link.
+
+    `linear` is along x in m/s. `angular` is about z in rad/s, and positive to the left.
+    """
 
     linear: float = 0.0
     angular: float = 0.0
@@ -81,7 +84,10 @@ class PoseCovariance(Struct, frozen=True, gc=False):
 
 
 class TwistVariances(Struct, frozen=True, gc=False):
-    """Variances of one report in base_link: along x and y in m2/s2, of the turn rate in rad2/s2."""
+    """Variances of the twist of one feedback line, expressed in base_link.
+
+    `linear` is along x and `lateral` along y, both in m2/s2. `angular` is in rad2/s2.
+    """
 
     linear: float
     lateral: float
@@ -89,23 +95,23 @@ class TwistVariances(Struct, frozen=True, gc=False):
 
 
 class Received(Struct, frozen=True):
-    """The bytes of one read of the serial port, and its time."""
+    """The bytes that one read of the serial port returned, and the time of the read."""
 
     at: Instant
     data: bytes
 
 
 class Command(Struct, frozen=True):
-    """A velocity that one commander wishes. Three attributes identify its origin:
+    """A velocity that one sender requests. Three attributes identify its origin:
 
-    - source: the name under which it commands, one of `commands.sources`: the `app` of `cmd/app`.
-    - sender: its public name, as far as the envelope tells. Two programs on one source are two
-      senders.
-    - clock: the origin of the stamp: the sender's own attachment, Zenoh on its behalf, or a
-      message's header.
+    - source: the command source, one of `commands.sources`, such as `app` for the key `cmd/app`.
+    - sender: the public name of the program that sent the command, as far as it is known. Two
+      programs that use the same source are two senders.
+    - clock: the clock that gave `stamp_ns`. The stamp comes from the sender's attachment, from
+      Zenoh or from the header of the message.
 
-    `arrived_ns` is the monotonic time of arrival and alone decides the age. `stamp_ns` is the time
-    of sending by `clock`, which is not synchronized with ours.
+    `arrived_ns` is the monotonic time of arrival, ns, and the age is computed from it alone.
+    `stamp_ns` is the time of sending by `clock`, which is not synchronized with the daemon's clock.
     """
 
     source: str
@@ -115,17 +121,26 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """Whether the requested speeds cancel out to zero, so that the stick is not released."""
+    """Whether the requested speeds are not zero, but cancel out to a zero twist.
+
+    Such a command does not count as the zero that a sender must send first.
+    """
     sequence: int | None = None
-    """Its number among the commands of its sender. A gap in the numbers means lost commands."""
+    """Number of this command, counted by its sender; None if it has none.
+
+    A gap in the numbers means that commands were lost.
+    """
     shared: bool = False
-    """Whether several programs may look like this sender: it used a bridge, or has only its key."""
+    """Whether several programs may have the same `sender`.
+
+    This is so for commands through a bridge, and for a sender of which only the key is known.
+    """
     ros: bool = False
-    """Whether it came from ROS, whose tools send no zero by themselves."""
+    """Whether the command came from ROS, whose tools send no zero by themselves."""
     stamp_replaced: bool = False
-    """Whether Zenoh replaced its timestamp because the sender's clock is ahead of ours."""
+    """Whether Zenoh replaced the stamp because the sender's clock is ahead of the daemon's."""
     steady: bool = False
-    """Whether the sender declares that nobody adjusts the clock of its stamp."""
+    """Whether the sender declares that the clock of its stamps is never adjusted."""
 
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
@@ -135,15 +150,18 @@ Plain = bool | int | float | str | list[float | str]
 
 
 class Request(Struct, frozen=True):
-    """A service call or a stop; `id` identifies the caller, 0 if nobody waits for an answer."""
+    """A service call or a stop. `id` identifies the caller; 0 means that no caller waits."""
 
     verb: Verb
     id: int = 0
     pose: Pose | None = None
     asked_ns: int | None = None
-    """Monotonic time of its arrival. A clear must not undo a stop that came after it."""
+    """Monotonic time at which the request arrived, ns; None means the time of the step.
+
+    It is needed because a `clear` must not undo a stop that arrived after it.
+    """
     by: str = ""
-    """Name of the client, as in `core/incoming/commands.py`."""
+    """Name of the client that sent the request, as in `core/incoming/commands.py`."""
     settings: dict[str, Plain] = {}
     """The settings that `set` changes, by key as in `core/config/live.py`."""
     latch: int | None = None
@@ -159,14 +177,18 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A command that does not count: `reason` names its counter, and `text` is for people."""
+    """A command that the daemon refuses.
+
+    `reason` is the end of the name of its counter, `command_<reason>`. `text` is for people.
+    `source` and `sender` are "" if they are unknown.
+    """
 
     reason: str
     text: str
     source: str = ""
     sender: str = ""
     arrived_ns: int = 0
-    """Monotonic time of its arrival. Unknown values are 0 here, and "" in `source` and `sender`."""
+    """Monotonic time at which the command arrived, ns; 0 if it is unknown."""
 
 
 EventName = Literal[
@@ -193,24 +215,25 @@ Level = Literal["info", "warning", "error"]
 class Event(Struct, frozen=True):
     """An event for the log.
 
-    `text` is for people. `event_throttle.py` writes at most a line per name and second.
+    `text` is for people. If many events have the same name, `event_throttle.py` combines those of
+    each second into one line.
     """
 
     name: EventName
     text: str
     level: Level = "info"
     by: str = ""
-    """Name of the client that asked, sent or commands, "" without one."""
+    """Name of the client that caused the event, "" if no client did."""
     kind: str = ""
-    """A detail by which repeated events are counted separately: a reason, a change."""
+    """A detail such as a reason or a change. Repeated events are counted separately for each."""
     count: int = 1
-    """Number of occurrences since the last line of this name."""
+    """Number of occurrences since the last log line with this name."""
     news: bool = True
-    """False for a repetition, which may wait for the next line."""
+    """False for an event that only repeats an earlier one. Its log line may be delayed."""
 
 
 class Estimate(Struct, frozen=True, gc=False):
-    """The result of one feedback line in the odometry. All its parts share the stamp `at`."""
+    """The estimate that the odometry makes of one feedback line. `at` is the time of all parts."""
 
     at: Instant
     pose: Pose
@@ -221,28 +244,44 @@ class Estimate(Struct, frozen=True, gc=False):
     """Wheel angles since the start, rad, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time at which the answered line left, None if that line is unknown."""
+    """Monotonic time, ns, at which the line that the feedback answers was written to the port.
+
+    None if it is unknown which line the feedback answers.
+    """
     heard_ns: int = 0
-    """Monotonic time at which the line was complete here."""
+    """Monotonic time, ns, at which the daemon had received the complete feedback line."""
 
 
 class Wait(Struct, frozen=True):
-    """The thing that a source waits for, with the details for `core/motion/arbiter_text.py`."""
+    """The condition that a source waits for before it drives the robot.
+
+    `core/motion/arbiter_text.py` puts it into words. The other fields hold details for this text.
+    """
 
     what: Literal[
         "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"
     ]
     source: str = ""
-    """The source that must send a zero, must prove its clock, sends only zeros, or has the
-    robot."""
+    """The source that `what` is about.
+
+    It must send a zero (`neutral`), must show that its delays are steady (`proof`), sends late
+    commands (`late`), sends only zeros (`zeros`), or holds the robot (`higher`, `equal`).
+    """
     seconds: float = 0.0
-    """Seconds without a speed after the zero of a shared identity, or seconds of a proof."""
+    """A duration, s, whose meaning depends on `what`.
+
+    `neutral`: a sender with a shared identity must send no speed for this time after its zero.
+    `proof`: the delays must be steady for this time. `late`: commands arrive later than this.
+    """
     senders: int = 0
-    """Number of senders that wait while another sender of the same source is followed."""
+    """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """Least duration of the wait, s, in coarse steps, so that it does not change with each step."""
+    """Time, s, for which the wait has lasted at least.
+
+    It is rounded down to one of a few values, so that it does not change with each step.
+    """
     kept: str = ""
-    """The source that sends speeds meanwhile and is kept waiting."""
+    """The source that sends speeds but must wait for `source`, which sends only zeros."""
     ros: bool = False
     """Whether the sender that must send a zero uses ROS."""
     shared: bool = False
@@ -250,7 +289,10 @@ class Wait(Struct, frozen=True):
 
 
 class SourceStatus(Struct, frozen=True):
-    """The state of one source; `age_s` since its last accepted command, None before the first."""
+    """The state of one source.
+
+    `age_s` is the time since its last accepted command, s, or None before the first one.
+    """
 
     name: str
     priority: int
@@ -262,16 +304,16 @@ class WheelsStatus(Struct, frozen=True):
     """Wheel faults, slip and slow wheels. Empty while the wheels agree and obey."""
 
     text: str = ""
-    """The trouble in words."""
+    """Description of the faults and the slip, "" if there are none."""
     left_out: tuple[str, ...] = ()
     """The names of the wheels that the pose ignores."""
     slipping: tuple[str, ...] = ()
     """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned shares by which the front wheel turns more than the rear one, left and right."""
+    """How much more the front wheel turns than the rear wheel, as a learned share: left, right."""
     slow: tuple[str, ...] = ()
-    """The wheels that turn the right way, but too slowly, each with its share of the expected
-    speed."""
+    """The wheels that turn too slowly in the commanded direction, each with its share of the
+    expected speed."""
 
 
 class RoutersStatus(Struct, frozen=True):
@@ -284,16 +326,16 @@ class RoutersStatus(Struct, frozen=True):
 
 
 class GyroSample(Struct, frozen=True, omit_defaults=True):
-    """A turn rate about base_link's z axis by a gyro.
+    """A turn rate about base_link's z axis, measured by a gyro.
 
-    `rate` is in rad/s, left is +. `variance` is in rad2/s2, 0 if the gyro does not report it.
-    `anew` marks the first sample of another gyro.
+    `rate` is in rad/s and positive to the left. `variance` is in rad2/s2, or 0 if the gyro does not
+    report it. `anew` is true for the first sample of another gyro than before.
     """
 
     at_ns: int
-    """Monotonic time of its arrival."""
+    """Monotonic time at which the sample arrived, ns."""
     stamp_ns: int | None
-    """Time of the measurement by the sender's clock, None if the sample has no stamp."""
+    """Time of the measurement by the sender's clock, ns; None if the sample has no stamp."""
     rate: float
     variance: float = 0.0
     anew: bool = False
@@ -303,14 +345,21 @@ GyroDoes = Literal[
     "off", "waiting for rest", "used", "silent", "disagrees",
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
-"""The state of the gyro. In `used` and `disagrees` (the wheels slip) it gives the heading."""
+"""The state of the gyro.
+
+The odometry takes the heading from the gyro only in the states `used` and `disagrees`. The latter
+means that the wheels slip.
+"""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
-"""The use of the track learned from a gyro. Unless `used`, the configured track is in use."""
+"""The use of the track that was learned from a gyro.
+
+With any value except `used`, the odometry uses the configured track.
+"""
 
 
 class GyroStatus(Struct, frozen=True):
-    """The state of the gyro, and the results about it; None where one is not known yet."""
+    """The state of the gyro and the values learned with it. A value not known yet is None."""
 
     does: GyroDoes = "off"
     bias: float | None = None
@@ -318,8 +367,9 @@ class GyroStatus(Struct, frozen=True):
     delay: float = 0.0
     """Delay of the gyro relative to the wheels, s."""
     track: float | None = None
+    """Learned effective track as a share of the configured one."""
     track_deviation: float = 0.0
-    """Learned effective track as a share of the configured one, and its relative deviation."""
+    """Relative standard deviation of `track`."""
     track_use: TrackUse = "shown"
 
 
@@ -330,11 +380,11 @@ the board no longer reports it, which counts as pressed."""
 
 BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
 """The level of the battery by the thresholds in `[battery]`; "ok" if none is set. `unknown` means
-that the board no longer reports the battery, or does not report what the thresholds compare."""
+that the board no longer reports the battery, or not the quantity (V or %) of the thresholds."""
 
 
 class BatteryStatus(Struct, frozen=True, gc=False):
-    """The battery as the board reports it. None stands for a value that it does not report now."""
+    """The battery as the board reports it. A value that the board does not report now is None."""
 
     level: BatteryLevel
     reported_ns: int | None = None
@@ -345,21 +395,22 @@ class BatteryStatus(Struct, frozen=True, gc=False):
     amps: float | None = None
     """Current, A. It is negative while the battery discharges."""
     mean: float | None = None
-    """The mean that the thresholds are compared with, V or %."""
+    """Mean voltage (V) or charge (%) with which the thresholds are compared."""
 
 
 class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
     number: int
-    """Identifies the latch: milliseconds since 1970, or more if the latch before has this number.
+    """Number that identifies the latch: the time in milliseconds since 1970.
 
-    It stays unique across restarts, and JavaScript represents it exactly.
+    It is larger if the previous latch already has that number. The number stays unique across
+    restarts, and JavaScript represents it exactly.
     """
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
-    """Client that asked for it, as in `Event.by`; empty for a fault."""
+    """Client that requested the latch, as in `Event.by`; empty for a fault."""
     why: str
     """Reason in words: "stopped by NAME", the fault's reason or "switched off by NAME"."""
     kept: bool = False
@@ -367,7 +418,10 @@ class Latch(Struct, frozen=True):
 
 
 class Latches(Struct, frozen=True):
-    """Everything that must survive every end of the process; it does not depend on the link."""
+    """The latches and lowered limits, which must survive every end of the process.
+
+    They do not depend on the link.
+    """
 
     stop: Latch | None = None
     fault: Latch | None = None
@@ -395,11 +449,11 @@ class Latches(Struct, frozen=True):
 
 
 class Inputs(Struct, frozen=True):
-    """Everything that one step may know.
+    """The complete input of one step.
 
-    With `tick` the line of the period leaves in this step. With `at_once` a line may leave if the
-    command is new. With neither, the step only uses feedback. `opened` counts the openings of the
-    port: a new number is a new session with the board.
+    If `tick` is true, the step makes the line of its control period. If `at_once` is true, it may
+    make a line at once for a new command or mode. If both are false, it makes no line. `opened`
+    counts how often the port was opened: a new number means a new session with the board.
     """
 
     now: Instant
@@ -415,19 +469,19 @@ class Inputs(Struct, frozen=True):
     refusals: tuple[Refusal, ...] = ()
     """The messages from the bus that were refused before they became a `Command`."""
     guard_trip: str = ""
-    """Why the guard replaced the previous line with STOP, which latches a fault."""
+    """Why the guard replaced the previous line with STOP, else "". The step latches a fault."""
     superseded: bool = False
-    """Whether the line of the step before did not leave and so had no effect."""
+    """Whether the line of the previous step was not written to the port, and so had no effect."""
     missed: int = 0
-    """Number of periods without a step since the step before."""
+    """Number of control periods without a step since the previous step."""
     events: tuple[Event, ...] = ()
-    """Events of the shell, to be logged together with those of the robot."""
+    """Events that other parts of the daemon report, to be logged with those of the robot."""
     at_once: bool = False
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """How much later than its step the last line left, ns. 0 if the process ran on without a
-    stall."""
+    """Time from the previous step to the writing of its line, ns; 0 if the process did not stall
+    in between."""
 
 
 class Outputs(Struct, frozen=True):
@@ -435,7 +489,7 @@ class Outputs(Struct, frozen=True):
 
     now: Instant
     due: bool
-    """Whether the step had a line to send, for its period or at once."""
+    """Whether the step was to make a line, for its period or at once."""
     line: bytes | None
     """The line for the board, None if none is due."""
     speeds: WheelSpeeds
@@ -447,16 +501,16 @@ class Outputs(Struct, frozen=True):
     """Why the robot moves or does not, in words."""
     link: str
     source: str
-    """The source whose command is followed, "" without one."""
+    """The source whose command the robot follows, "" without one."""
     command_ns: int | None
-    """Monotonic arrival of the command that is followed, None without one."""
+    """Monotonic arrival time of the command that the robot follows, ns; None without one."""
     status_changed: bool
-    """Whether `mode`, `reason`, `link`, `source` or the battery's level differs from the step
-    before."""
+    """Whether `mode`, `reason`, `link`, `source` or the battery's level has changed since the
+    previous step."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Whether the followed command or the mode has changed since the last line that was due."""
+    """Whether the command or the mode is newer than the last line that was computed."""
     latches: Latches = Latches()
     """The latches in force after the step; the same object until one of them changes."""
 
@@ -478,12 +532,12 @@ class Measured(Struct, frozen=True):
 
 
 class Recording(Struct, frozen=True):
-    """The state of the black box."""
+    """The state of the recorder."""
 
     where: str = ""
-    """The directory, "" if nothing is recorded."""
+    """The directory of the recordings, "" if recording is switched off."""
     trouble: str = ""
-    """Why recording fails at present, in words."""
+    """Why recording fails at present, in words; "" if it does not fail."""
     missing: int = 0
     """Number of steps that were not recorded."""
 
@@ -499,7 +553,10 @@ class Snapshot(Struct, frozen=True):
     refused: str
     """The last command that was refused and the reason, "" before the first one."""
     refused_age_s: float | None = None
-    """Seconds since a command was refused for any reason except a new sender, None before that."""
+    """Seconds since the last refused command, None before the first one.
+
+    A command that is refused only because its sender is new does not count.
+    """
     feedback_age_s: float | None = None  # since the last good line, None before it
     missed_last_minute: int = 0
     """Number of periods without a step in the last minute."""
@@ -509,7 +566,10 @@ class Snapshot(Struct, frozen=True):
     doubt: WheelsStatus = WheelsStatus()
     estop: EstopState = ""
     bumpers: tuple[bool, ...] | None = None
-    """Whether each bumper counts as pressed, in the order of the board, None if never reported."""
+    """Whether each bumper counts as pressed, in the order of the board.
+
+    None if the board has never reported its bumpers.
+    """
     bumper: str = ""
     """Why a bumper counts as pressed, in words; "" while none does."""
     battery: BatteryStatus | None = None
@@ -517,12 +577,18 @@ class Snapshot(Struct, frozen=True):
     board: dict[str, str] = {}
     """The fields of the board's last status line, by name, as text."""
     check: str = "plain"
-    """The check of the serial lines, in words."""
+    """The checksum that the serial lines have, in words; "plain" without one."""
     encoders: tuple[int, ...] = ()
-    """Counts per turn that the lines show, in `WHEELS` order; 0 if unknown."""
+    """Encoder counts per wheel turn, in `WHEELS` order.
+
+    0 means that they are unknown, or that the reported speeds are not whole counts of them.
+    """
     sender: str = ""
-    """The sender whose command is followed, "" without one."""
+    """The sender whose command the robot follows, "" without one."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
-    """Why the latches would not survive a restart, in words; None if nothing is kept."""
+    """Why the latches would not survive a restart, in words; "" if they would.
+
+    None if the daemon does not store its latches.
+    """

@@ -1,2 +1,4 @@
-"""Shell package with the control loop and the daemon around it. `daemon.py` reads from top to
-bottom."""
+"""The daemon: the control loop, and the bus, serial port and files around it.
+
+`daemon.py` runs all of them, from the start of the process to its end.
+"""

@@ -1,4 +1,4 @@
-"""Collects the inputs of `Robot.step`, calls it, and carries its outputs. It decides nothing.
+"""Collects the inputs of `Robot.step`, calls it, and delivers its outputs. It decides nothing.
 
 The control loop is synchronous, so that the daemon can call `step` from one task and the tests can
 call it in virtual time.
@@ -57,20 +57,22 @@ from acsard.daemon.settings_file import SettingsFile, keeps
 from acsard.recording.recorded_steps import BlackBox, count_superseded
 
 FEEDBACK = ("odom", "tf", "wheel_states")
-"""Keys that are published from the feedback lines."""
+"""Topics whose messages are made from the feedback lines of the board."""
 
 QUERIES_PER_STEP = 8
-"""Most queries that one step answers. The others wait, so that many of them cost no period."""
+"""Largest number of queries that one step answers. Further queries wait for the next step, so that
+a flood of queries does not cost a period."""
 
 LATE_NS = 1_000_000
-"""Time from the begin of a step until its line leaves, ns, from which on the robot is told of it.
-Most steps take less, and nobody knows the time of a sample better."""
+"""Shortest delay from the start of a step to the write of its line, ns, that is passed to the
+robot. Most delays are shorter and are passed as 0, because the sample times are not that accurate.
+"""
 
 BUS_STUCK = Event("bus_stuck", "the bus accepts no messages; driving goes on", "warning")
 
 
 class ControlLoop:
-    """One robot between its port and its bus."""
+    """The control loop of one robot, between its serial port and its bus."""
 
     def __init__(
         self,
@@ -91,18 +93,31 @@ class ControlLoop:
         settings_file: SettingsFile | None = None,
         late_watch: LateWatch | None = None,
     ) -> None:
-        """Make a robot with these latches, which `keeper` keeps over a restart.
+        """Create the robot.
 
-        `others` are the events of the daemon's other parts. Each step takes them and empties the
-        list. `beside` returns the present value of a key that another part publishes. `adopted` is
-        called with a configuration that is in force from now on. `recorder` is the black box.
-        `settings_file` is the configuration file.
-        `late_watch` names the causes of late periods.
+        Args:
+            config: the configuration with which the daemon has started.
+            info: the daemon's fixed data, which the key `info` returns.
+            port: the serial port.
+            bus: the bus.
+            start: time of the daemon's start.
+            log: writes an event to the log.
+            mono_ns: returns the monotonic time, ns.
+            certificate_ends: wall-clock time at which each certificate expires, ns since 1970, by
+                the name of the certificate. None or empty without TLS.
+            others: events of the daemon's other parts. Each step takes them and empties the list.
+            beside: returns the present value of a key that another part publishes, else None.
+            adopted: called with each configuration that comes into force after the start.
+            recorder: the black box, or None.
+            latches: the latches with which the robot starts.
+            keeper: keeps the latches over a restart. With None they are not kept.
+            settings_file: the configuration file, or None.
+            late_watch: names the causes of late periods, or None.
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends)
         self.shutting_down = False
-        """Set it to go down: the robot ramps to zero and stays there."""
+        """True from the start of the shutdown. The robot then ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
@@ -110,50 +125,57 @@ class ControlLoop:
         self._config, self._adopted, self._settings_file = config, adopted, settings_file
         self._recorder, self._handover = recorder, Handover(latches, keeper)
         self._started, self._speed = config.limits, SpeedLimiter(self.robot.config)
-        """The limits of the configuration file at the start, and the speed limit in force."""
+        """The limits at the start of the daemon, and the handler of the messages on the key
+        `speed_limit`."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """The last latches without a speed limit, with the objects that they were made of."""
+        """Cache of `_to_keep`: the latches and the two sets of limits of its last computation, and
+        the latches that it returned."""
         self._step_answers: tuple[Answer, ...] = ()
-        """The answers of this step."""
+        """The answers to requests from the present step."""
         self._answers: deque[tuple[int, Answer]] = deque()
-        """Answers that wait until the file has the latches, each with its monotonic time."""
+        """Answers that wait until the latch file has the latches. Each comes with the monotonic
+        time at which it was queued, ns."""
         self._got = NOTHING
-        """The input that this step took from the bus."""
+        """The input that the present step has taken from the bus."""
         stop = self.robot.session.codec.stop
         self._guard = Guard(stop, config)
         if recorder is not None and latches != Latches():
-            # A replay would otherwise start with a robot that nobody has stopped.
+            # Without this record, a replay would start with a robot that has no latches.
             recorder.begins(self.robot, self._guard)
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
         self._gateway, self._imu = GatewayFollower(), GyroFollower(config.mcu.simulated)
         self._routers = RouterFollower()
         self._turn_rates: list[GyroSample] = []
-        """Samples of a gyro since the last step."""
+        """Gyro samples that have arrived since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._trip, self._late_ns = False, "", 0
-        """The fate of the last line, for the next step: superseded, replaced by the guard, and how
-        much later than its step it left, ns."""
-        # The longest line of either direction: answers must not queue in the MCU either.
+        """Result of the last line, for the inputs of the next step. The values are: whether the
+        line was superseded, why the guard replaced it ("" if it did not), and how much later than
+        the start of its step it was written, ns (0 below `LATE_NS`)."""
+        # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
         self._stopwatch, self._late_watch = Stopwatch(), late_watch
 
     @property
     def at_rest(self) -> bool:
-        """True if the last step commanded zero, as it does without a link."""
+        """True if the last step commanded zero speed, as every step without a link does."""
         outputs = self.outputs
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
     def totals(self, now_ns: int) -> dict[str, float]:
-        """Return the run time, s, the distance, m, and all counters, for the last log line."""
+        """Return run time in s, distance in m and all counters, by name, for the last log line."""
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
         shot = self.robot.snapshot(now_ns)
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time of the extra step for a command that came too soon after the last line."""
+        """Monotonic time of the next step for a command that came too soon after a line, ns.
+
+        None if no command waits.
+        """
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
@@ -162,12 +184,17 @@ class ControlLoop:
         return self._pace.listens
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
-        """Take one step at `now`, at the end of a period or between two."""
+        """Run one control step at the time `now`.
+
+        `period` has the periods that have ended since the last step. It is `NO_PERIOD` for a step
+        between two periods.
+        """
         self._got = NOTHING
         try:
             return self._step(now, period)
         except Exception:
-            # A stop that this step took is lost otherwise: the bug may have come before it.
+            # Store the stops that this step has taken from the bus. The exception may have come
+            # before the robot processed them.
             self._handover.take_stops(self._to_keep(self.robot.latches), _stops(self._got), now)
             raise
 
@@ -178,8 +205,8 @@ class ControlLoop:
             self._stopwatch.period(now.mono_ns, late_ns, missed)
             if self._late_watch is not None:
                 self._late_watch.period(now.mono_ns, late_ns, missed)
-                # A line of the log has the text of its last event. In a late step that would be
-                # the number of periods, not the cause.
+                # The log joins events of one name to one line, with the text of the last event. In
+                # a late step that event has the number of periods and would hide the cause.
                 if not missed:
                     self._others += self._late_watch.news()
         commands, refusals, requests = self._from_bus(now)
@@ -187,9 +214,11 @@ class ControlLoop:
         requests, refused_sets = self._speed.requests(requests, now.mono_ns)
         self._others += self._handover.news()
         port, pace = self._port, self._pace
-        # Take the bytes first: `take` closes the port when the computer was suspended.
+        # Call `take` before reading `is_open`, because `take` closes the port after a suspend of
+        # the computer.
         received = port.take(now if missed else None)
-        # Pass by position: with seventeen names a struct takes three times as long.
+        # Pass the fields by position: creating a struct by seventeen names takes three times as
+        # long.
         inputs = Inputs(
             now,
             ended and pace.period_ended(missed),
@@ -219,16 +248,21 @@ class ControlLoop:
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
-        # Only now, after the log has the event.
+        # `adopted` may change the log, so call it after the log has this step's events.
         if self._config is not before and self._adopted:
             self._adopted(self._config)
         self._stopwatch.step(now.mono_ns, self._mono_ns())
-        # Last, because the sending thread needs the interpreter, which is free when the loop waits.
+        # Flush last, because the sending thread needs Python's interpreter lock, which is free only
+        # while this loop waits.
         self._bus.flush()
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Return the outputs and whether their line left, and record the step in any case."""
+        """Run the robot's step and send its line.
+
+        Return the outputs, and whether the line was written. The black box gets the step even if
+        this method raises.
+        """
         try:
             outputs = self.outputs = self.robot.step(inputs)
             self._step_answers = self._speed.settle(
@@ -247,10 +281,10 @@ class ControlLoop:
         return outputs, went is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
-        """Return the latches of the robot as the next start of the daemon needs them.
+        """Return the robot's latches as the latch file stores them for the next start.
 
-        The limits that a person has lowered are kept over a restart. A speed limit is not, because
-        the program that would lift it may be gone.
+        A limit that a `set` has lowered stays in force over a restart. A limit from a message on
+        the key `speed_limit` does not, because the program that would lift it may be gone.
         """
         now, file = self._speed.settings.limits, self._settings_file
         if file is not None:
@@ -262,22 +296,22 @@ class ControlLoop:
                 kept = self._kept = latches, now, limits, without
             latches = kept[3]
         last = self._handover.latches
-        # The file is written again for another object only.
+        # The keeper writes its file again if it gets another object, even with equal content.
         return last if latches == last else latches
 
     def finish(self, now: Instant) -> None:
-        """Keep the stops that arrived after the last step, and give the last answers."""
+        """Store the stops that arrived after the last step, and send the remaining answers."""
         self.keep_last_stops(now)
         self._handover.wait()
         self._answer(now, last=True)
         self._bus.flush()
 
     def keep_last_stops(self, now: Instant) -> None:
-        """Keep the stops that no step will serve, because they arrived after the last one."""
+        """Store the stops that arrived after the last step, because no step will process them."""
         self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
 
     def _adopt(self, config: Config) -> None:
-        """Use the configuration that the robot has used since this step."""
+        """Pass the robot's new configuration to the parts that depend on it."""
         self._config = config
         self._guard.use(config)
         self.report.use(config)
@@ -288,7 +322,7 @@ class ControlLoop:
     def _from_bus(
         self, now: Instant
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
-        # Before the first step there are no outputs to answer with.
+        # Ask for no queries before the first step, because there are no outputs to answer them.
         got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if got is NOTHING:
             return (), (), ()
@@ -343,7 +377,7 @@ class ControlLoop:
         return tuple(commands), tuple(refusals), tuple(requests)
 
     def _note(self, got: BusInput) -> None:
-        """Count and report the troubles of the bus itself."""
+        """Count and report losses and blockages of the bus, and changes of its connections."""
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
         if got.dropped:
@@ -355,7 +389,12 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query and return None, or return the request that the robot must decide."""
+        """Return the request of a query that the robot must decide, or answer the query.
+
+        A query without a request is answered. A `set` with `keep` goes to the configuration file
+        first. In these two cases the method returns None. A refusal of the query is added to
+        `refusals`.
+        """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
         except DecodeError as error:
@@ -374,7 +413,10 @@ class ControlLoop:
         return None
 
     def _keep(self, request: Request, now: Instant) -> None:
-        """Hand a `set` with `keep` to the configuration file, which says if it can be written."""
+        """Pass a `set` with `keep` to the configuration file, which checks that it can be changed.
+
+        Without a configuration file, refuse the request.
+        """
         if self._settings_file is None:
             text = "nothing is set: this daemon has no configuration file"
             self._answers.append((now.mono_ns, Answer(request.id, False, text)))
@@ -382,7 +424,10 @@ class ControlLoop:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return the requests whose settings can be written, and queue the answers to others."""
+        """Return each `set` with `keep` that the configuration file can store.
+
+        The answers to requests that were refused or have been written are queued.
+        """
         if self._settings_file is None:
             return ()
         results = self._settings_file.results(now.mono_ns, self._others)
@@ -390,7 +435,10 @@ class ControlLoop:
         return tuple([one for one in results if isinstance(one, Request)])
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Offer the line, and return it if it left. The next step tells the robot its fate."""
+        """Offer the line to the port. Return the line if the port wrote it, else None.
+
+        The next step passes the result to the robot. `tick` is true for the line of a period.
+        """
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
         if line is None:
@@ -406,7 +454,8 @@ class ControlLoop:
             return line
         self._superseded = True
         if offered == "superseded" and tick:
-            # A line that could not go at once is not counted: its period's line follows.
+            # Count the lines of periods only. After a superseded line between two periods, the line
+            # of the period follows.
             self.robot.counters["lines_superseded"] += 1
         return None
 
@@ -431,7 +480,10 @@ class ControlLoop:
             self._log(event)
 
     def _answer(self, now: Instant, *, last: bool = False) -> None:
-        """Give each answer that has the file or has waited for its time; `last` gives them all."""
+        """Send the answers whose latches are stored, and those that have waited for `ANSWER_NS`.
+
+        If `last` is true, send all answers.
+        """
         held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
         trouble = "" if held else self._handover.trouble
         while self._answers and (held or last or self._answers[0][0] < before_ns):
@@ -464,7 +516,7 @@ class ControlLoop:
 
 
 def _stops(got: BusInput) -> list[str]:
-    """Return the names of those that stop the robot with this input."""
+    """Return the names of the clients that stop the robot with this input."""
     puts = [one for one in got.arrivals if one.key == "stop" and one.put]
     calls = [query for query in got.queries if query.topic == "srv/stop"]
     names = [caller_name(put.via, put.attachment, put.sender) for put in puts]

@@ -1,9 +1,9 @@
-"""Runs the daemon from its start to its end; reads from top to bottom.
+"""Runs the daemon from its start to its end.
 
-The daemon enters the simulator, the bus, the port and the control loop in this order. Leaving them
-in reverse order is the shutdown: ramp to zero, STOP, close the port, close the bus. The first
-signal begins it, and a second one cuts the ramp short. A bug in any task ends the process in the
-same way.
+The daemon enters the contexts of the simulator, the bus, the port and the control loop, in this
+order. The shutdown leaves these contexts in reverse order: the robot ramps to zero, the port writes
+STOP and closes, and the bus closes. The first signal begins the shutdown, and a second one cuts the
+ramp short. An exception in any task leaves the contexts in the same order, but without the ramp.
 """
 
 from __future__ import annotations
@@ -43,11 +43,12 @@ from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
 EXIT_RAMP_S = 0.6
-"""Bound on the ramp to zero, s. After it the daemon sends STOP at any speed."""
+"""Time limit of the ramp to zero at the shutdown, s. After it the daemon sends STOP, even if the
+wheels still turn."""
 
 
 class Departure:
-    """The shutdown, begun by the first signal and hurried by the second."""
+    """The shutdown. The first signal begins it, and a second signal cuts its ramp short."""
 
     def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
         self._log, self._wake, self._manager = log, wake, manager
@@ -56,20 +57,23 @@ class Departure:
         self.hurried = False
 
     def __enter__(self) -> Self:
-        """Handle the signals that end the daemon; a closed terminal must stop the wheels too."""
+        """Handle the signals that end the daemon.
+
+        SIGHUP is one of them, because closing the terminal must stop the wheels too.
+        """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
-        """Return whether a signal has cancelled the start, which is no error."""
+        """Suppress the exception of a start that a signal has cancelled, which is not an error."""
         return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
-        """Note that the start is complete.
+        """Record that the start is complete.
 
-        Before this a signal cancels the start; now it begins the ramp.
+        A signal before this call cancels the start. A signal after it begins the ramp.
         """
         self._starting = None
 
@@ -84,22 +88,26 @@ class Departure:
         self._wake()
 
     def over(self, now_ns: int, at_rest: bool) -> bool:
-        """Return whether the ramp has ended, was cut short or has taken too long."""
+        """Return whether the ramp has ended, was cut short or has taken too long.
+
+        `now_ns` is the monotonic time. `at_rest` is true if the last step commanded zero speed.
+        """
         if self.begun_ns is None:
             return False
         return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
 
 
 SWITCH_INTERVAL_S = 0.0005
-"""Longest time that another Python thread may hold the interpreter, s. The default is 5 ms, which
-is half a control period."""
+"""Longest time that another Python thread may hold the interpreter lock, s. The default of Python
+is half a control period (5 ms)."""
 
 LATCHED_PERIOD_S = 5.0
-"""Interval at which latched messages are repeated for subscribers that cannot ask for history,
-s."""
+"""Interval at which the latched topic `tf_static` is published again, s. Some subscribers cannot
+query the last sample of a latched topic."""
 
 Announce = Callable[[str, str], None]
-"""A callback for the end of the start, with the serial device and its trouble, "" if it is open."""
+"""Callback for the end of the start. Its arguments are the path of the serial device, and the
+reason why the device is not open. The reason is "" for an open device."""
 
 
 async def run(
@@ -116,9 +124,11 @@ async def run(
         config: The configuration.
         log: The log.
         announce: Called once when everything runs.
-        gateway: Arguments of the `acsard gateway` process to run, None if it is a service.
+        gateway: Arguments of the `acsard gateway` process, which runs if `bus.outside` has
+            endpoints. None if the gateway is a service of its own.
         page: Arguments of the `acsard web` process to run, None for no page.
-        settings_file: The configuration file, to compare it with the settings in force.
+        settings_file: The configuration file, to compare it with the settings in force and to
+            change it. None for neither.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -128,8 +138,8 @@ async def run(
         stack.enter_context(departure)
         log_from_environment()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        # Ask before the first thread starts, because the threads of the bus must not inherit the
-        # priority.
+        # Ask for real-time priority before the first thread starts, because the threads of the bus
+        # must not have it.
         refused = real_time.ask() if config.control.real_time else ""
         if refused:
             log.info("real_time", text=refused)
@@ -164,7 +174,8 @@ async def run(
             None if simulated is None else simulated.current,
             lambda adopted: log.use(adopted.log),
             recorder,
-            # After the bus and the port: a second daemon must end before it touches the latches.
+            # Read the latches after the bus and the port are open. A second daemon for this robot
+            # then ends before it touches them.
             Latches() if keeper is None else await keeper.start(clock.now()),
             keeper,
             settings_file,
@@ -172,7 +183,8 @@ async def run(
         )
         control.report.description = urdf
         if (description := control.report.robot_description()) is not None:
-            # Only once: RViz and the controller manager load the robot again with each message.
+            # Publish it only once, because RViz and the controller manager load the robot again
+            # with each message.
             bus.publish(DESCRIPTION, description)
         if settings_file is not None:
             settings_file.start()
@@ -196,7 +208,10 @@ async def run(
 def _recorder(
     config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
 ) -> Recorder | None:
-    """Return the black box, or None if the configuration has none. It closes with the stack."""
+    """Return the black box, or None if the configuration has none. The stack closes it.
+
+    `log` queues an event. `wall_ns` is the wall-clock time of the start, ns since 1970.
+    """
     if not config.record.directory:
         return None
     recorder = Recorder(config, log, wall_ns)
@@ -205,9 +220,9 @@ def _recorder(
 
 
 def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
-    """The latch file of a real robot; with the built-in simulator nothing is kept.
+    """Return the latch file, or None for the built-in simulator, whose latches are not kept.
 
-    It closes with the stack, after the port: a slow disk must not delay the last STOP.
+    The stack closes the file after the port, because a slow disk must not delay the last STOP.
     """
     if config.mcu.simulated:
         return None
@@ -217,14 +232,14 @@ def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
 
 
 def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
-    """Return the port, not yet open."""
+    """Return the serial port, which is not open yet."""
     stop, period_ns = _stop_line(config), int(NS_PER_S / config.rate_hz)
     return SerialPort(path, config.mcu.baud_rate, stop, period_ns, wake, tell)
 
 
 @asynccontextmanager
 async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterator[None]:
-    """Run the helpers as tasks beside the block, and cancel them when it ends."""
+    """Run the coroutines as tasks during the block, and cancel them when the block ends."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(helper) for helper in helpers]
         yield
@@ -233,9 +248,10 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 
 
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
-    """Return when the certificates used by this process end, {} without any.
+    """Return when each certificate that this process uses expires, ns since 1970, by name.
 
-    Raises a `MendableError` if they cannot be used.
+    Returns {} if the process uses no certificate. `ours` is true if this daemon runs the TLS
+    gateway. Raises a `MendableError` if the certificates cannot be used.
     """
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
@@ -251,8 +267,13 @@ async def _control(
     wake: Wakeup,
     manager: Systemd,
 ) -> None:
-    """Run the control task: a step in every period, and one when feedback arrives."""
-    # Let the slow first round of the other tasks end before the first period.
+    """Run control steps until the shutdown is over.
+
+    Each period gets a step. The other events of `wakeup.py`, such as feedback, get steps of their
+    own.
+    """
+    # Let the other tasks run first. Their first round is slow, and must end before the first
+    # period.
     await asyncio.sleep(0)
     gc.collect()
     gc.freeze()  # the present objects live to the end, so later collections skip them

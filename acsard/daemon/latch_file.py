@@ -1,4 +1,4 @@
-"""The file that keeps stop, fault, `inactive` and lowered limits over every end of the process.
+"""The file that stores stop, fault, `inactive` and lowered limits for the next start of the daemon.
 
 A thread writes the file. The control loop only hands the newest latches to the thread, and never
 waits for the disk. After the thread has renamed the new file, a kill of the process loses nothing.
@@ -40,17 +40,18 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
-"""Time limit of one write, and of reading and writing at the start. A slower disk is said to hang.
-"""
+"""Time limit of one write, and of reading and writing at the start, s. The daemon reports that a
+slower disk hangs."""
 
 PACE_S = 0.05
-"""Pause after each write. A flood of stops, each a new latch, must not wear out an SD card."""
+"""Pause after each successful write, s. A flood of stops, each of which is a new latch, must not
+wear out an SD card."""
 
 RETRY_S = 1.0
-"""Pause between two attempts to write a file that could not be written."""
+"""Pause between two attempts to write a file that could not be written, s."""
 
 CLOSE_S = 0.3
-"""Time limit of the last write, when the daemon ends."""
+"""Longest time that the daemon waits at its end for the last write, s."""
 
 HANGS = f"the disk did not answer within {START_S:g} s"
 
@@ -95,7 +96,7 @@ class LatchFile:
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
         """Find the path of the file from the configuration and the environment of the process."""
         self.where = NO_PLACE
-        """Path of the file, for messages."""
+        """Path of the file for messages, or `NO_PLACE`."""
         self._path: Path | None = None
         self._robot = config.robot.id
         self._barred = ""
@@ -108,28 +109,31 @@ class LatchFile:
         self._lock = -1
         """Descriptor of the lock that keeps other daemons away from the latch file."""
         self._disk = threading.Lock()
-        """The thread that uses the disk holds this lock. The control loop never takes it."""
+        """Lock for the disk. The thread that uses the disk holds it. The control loop never takes
+        it."""
         self._abandoned = False
         """True if `start` has given up waiting for the first read of the file."""
         self._found: Latches | None = None
         """The latches that the file had at the start; None until the file has been read."""
         self._blind = False
-        """True if the robot has started without the file's content, and the file is not written."""
+        """True if the robot has started without the content of the file. The writing thread reads
+        the file before its first write, and then sets this to False."""
         self._missed = Latches()
-        """Latches of the file with which the robot did not start, because the read took too long.
-        """
+        """Latches that are in the file but not in the robot, because the start could not read the
+        file in time."""
         self._box = Mailbox[Latches](1)
-        """The newest latches that were handed over, until the thread takes them."""
+        """The newest latches that `keep` was given, until the thread takes them."""
         self._news = Mailbox[Event](EVENTS)
         self._held: Latches | None = None
-        """The latches in the file."""
+        """The latches that the file has now. None before the first write."""
         self._failed = ""
         self._handed: Latches | None = None
-        """The latches that `keep` took last."""
+        """The latches that the last call of `keep` was given."""
         self._busy_ns: int | None = None
-        """Monotonic time at which the present write began; None between two writes."""
+        """Monotonic time at which the present write began, ns; None between two writes."""
         self._hung = False
-        """True after the event that the disk hangs, until the event that it answers."""
+        """True if the last event about the speed of the disk said that it hangs. False if the event
+        said that it works again."""
         self._thread: threading.Thread | None = None
 
     # the start
@@ -168,7 +172,8 @@ class LatchFile:
             if self._abandoned:
                 return Latches()
             latches = self._found = self._read(now)
-            # The thread syncs the file, because a sync takes up to seconds on an SD card.
+            # The writing thread syncs the file later, because a sync takes up to seconds on an SD
+            # card.
             trouble = self._replace(latches)
             if trouble and not self._abandoned:
                 self._fail(trouble)
@@ -183,8 +188,8 @@ class LatchFile:
             return Latches()
         self._take_lock(path)
         try:
-            # Only an absent file means that there is no stop. A link whose target is absent counts
-            # as unreadable, because the disk of the target may not be mounted.
+            # Only an absent file means that there is no stop. A symbolic link whose target is
+            # absent counts as unreadable, because the disk of the target may not be mounted.
             os.lstat(path)
         except FileNotFoundError:
             return Latches()
@@ -218,24 +223,27 @@ class LatchFile:
             # This file system has no locks. The bus detects two daemons with the same id.
             return
         self._lock = lock
-        # A process that was killed while it wrote has left its temporary file.
+        # Remove the temporary files of processes that were killed while they wrote.
         for left in path.parent.glob(f".{path.name}.*"):
             with suppress(OSError):
                 left.unlink()
 
-    # the control loop's side
+    # The control loop calls the methods below.
 
     def keep(self, latches: Latches) -> None:
-        """Take the latches that are in force from now on."""
+        """Store these latches, which are in force from now on, without waiting for the disk.
+
+        The thread writes only the newest latches.
+        """
         self._handed = latches
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether a process that is killed now would start with these latches."""
+        """Return whether the file has these latches, so that they survive a kill of the process."""
         return self._held is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Wait until `holds` is true or writing fails, but at most `seconds`."""
+        """Wait until `holds(latches)` is true or writing fails, but at most `seconds`."""
         end_ns = clock.mono_ns() + seconds * NS_PER_S
         while not self.holds(latches) and not self._failed and clock.mono_ns() < end_ns:
             time.sleep(0.001)
@@ -261,7 +269,7 @@ class LatchFile:
 
     @property
     def _hangs(self) -> bool:
-        """Return whether the newest latches wait for a write that has taken too long."""
+        """Return whether the newest latches still wait for a write that has taken too long."""
         busy_ns = self._busy_ns
         if busy_ns is None or self._failed or self._held is self._handed:
             return False
@@ -272,12 +280,12 @@ class LatchFile:
         return Event("latch_file", f"a stop is kept again in {self.where}")
 
     def close(self) -> None:
-        """Wait a bounded time until the newest latches are written."""
+        """Wait until the newest latches are written, but at most `CLOSE_S`."""
         if self._thread is not None:
             self._box.close()
             self._thread.join(CLOSE_S)
 
-    # the thread's side
+    # The writing thread runs the methods below.
 
     def _work(self, now: Instant) -> None:
         latches = None if self._failed else self._sync_first()
@@ -294,7 +302,10 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches, report failure and recovery, and return why it failed or ""."""
+        """Write these latches, and report a failure or a recovery.
+
+        Return the reason of a failure, or "". `now` is the time of the daemon's start.
+        """
         self._busy_ns = clock.mono_ns()
         with self._disk:
             if self._blind:
@@ -308,7 +319,10 @@ class LatchFile:
         return trouble
 
     def _sync_first(self) -> Latches | None:
-        """Sync the file that `start` has written; return the latches to write again if it fails."""
+        """Sync the file that `start` has written.
+
+        If the sync fails, return the latches to write again, else None.
+        """
         self._busy_ns = clock.mono_ns()
         with self._disk:
             trouble = self._sync()
@@ -319,7 +333,7 @@ class LatchFile:
         return self._found
 
     def _read_late(self, now: Instant) -> None:
-        """Read the file that the start did not read, so that no latch in it is overwritten."""
+        """Read the file that the start could not read, so that no latch in it is overwritten."""
         self._blind = False
         if self._found is None:
             try:
@@ -330,11 +344,11 @@ class LatchFile:
         self._missed = replace_fields(self._found, stop=None)
 
     def _write(self, latches: Latches) -> str:
-        """Replace and sync the file; return the reason of a failure, or ""."""
+        """Replace and sync the file; return the reason of a failure, or "" on success."""
         return self._replace(latches) or self._sync()
 
     def _replace(self, latches: Latches) -> str:
-        """Replace the file without a sync; return the reason of a failure, or ""."""
+        """Replace the file without a sync; return the reason of a failure, or "" on success."""
         if self._path is None or self._barred:
             return self._barred
         try:
@@ -360,9 +374,10 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Return these latches and the missed ones, which come into force at the next start.
+        """Return these latches together with the missed ones.
 
-        A missed stop is not among them, because the robot has started stopped anyway.
+        The missed latches come into force at the next start. A missed stop is not among them,
+        because the robot has started stopped anyway.
         """
         missed = self._missed
         if latches.fault is not None:
@@ -390,7 +405,7 @@ class LatchFile:
 
 def _content(path: Path) -> bytes:
     """Return the bytes of a small regular file; raise `OSError` for anything else."""
-    # Without O_NONBLOCK a pipe of this name would block the start.
+    # Without O_NONBLOCK, opening a named pipe at this path would block the start.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:
         about = os.fstat(handle)

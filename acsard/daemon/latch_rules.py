@@ -17,16 +17,16 @@ from acsard.core.motion.lifecycle import number_after_restart
 from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latch, Latches
 
 FORMAT = 1
-"""Version of the content. A file with another number counts as unreadable."""
+"""Version of the format. A file with another version counts as unreadable."""
 
 MAX_BYTES = 65_536
 """Largest size of a file that is read. Three latches and all limits take about 1 kB."""
 
 MAX_TEXT = 500
-"""Largest number of characters of a name or a reason, which may come from a stranger."""
+"""Largest number of characters of a name or a reason, which any client may choose."""
 
 ANSWER_NS = NS_PER_S // 5
-"""Longest time for which the answer to a stop waits for the file.
+"""Longest time for which the answer to a stop waits for the latch file, ns.
 
 With a slow disk, a longer wait would make a client believe that the robot did not receive the stop.
 """
@@ -59,8 +59,8 @@ def decode(robot: str, data: bytes) -> Latches:
     """Return the latches in the content of a robot's latch file, each marked as kept.
 
     Every prefix of a valid file is refused, because a power cut may leave a part of a file. A file
-    with a missing or an unknown name is refused too, because a damaged name must not make a stop
-    disappear.
+    with a missing or an unknown field name is refused too, because a damaged name must not make a
+    stop disappear.
 
     Raises:
         LatchFileError: The content is damaged, of another version or of another robot.
@@ -100,14 +100,14 @@ def unwritable(where: str, reason: str) -> str:
 
 
 def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
-    """Return these latches with a stop. A stop that is latched already stays.
+    """Return these latches with a stop. If they have a stop already, return them unchanged.
 
     Args:
         latches: the latches to change.
         why: text of the stop.
         now: time of the stop.
         by: the client that asked for the stop, or `BY` for the daemon itself.
-        before: the number of the stop before this one, or -1.
+        before: the number of the last stop before this one, or -1 if there was none.
     """
     if latches.stop is not None:
         return latches
@@ -117,11 +117,11 @@ def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int 
 
 
 def doubted(latches: Latches, why: str, now: Instant) -> Latches:
-    """Return the latches of a start with a latch file that cannot be written.
+    """Return the latches with which the robot starts if the latch file cannot be written.
 
     The previous process may have set latches that the file lacks. So the robot starts stopped, and
-    each latch of the file takes a new number: a `clear` or `activate` that names its old number may
-    have been sent before the latches that are lost.
+    each latch of the file gets a new number. A `clear` or `activate` that names an old number has
+    no effect then, because its sender may not know of the lost latches.
 
     Args:
         latches: the latches in the file.
@@ -138,16 +138,19 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
 
 
 class LatchKeeper(Protocol):
-    """Keeps the latches over a restart. Only the method `wait` waits for the disk."""
+    """The storage that keeps the latches over a restart.
+
+    Only the method `wait` waits for the disk.
+    """
 
     def keep(self, latches: Latches) -> None:
-        """Take the latches that are in force from now on. Only the newest latches are written."""
+        """Store these latches, which are in force from now on. Only the newest ones are written."""
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether a process that is killed now would start with these latches."""
+        """Return whether these latches are stored, so that they survive a kill of the process."""
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Wait until `holds` is true, but at most `seconds`."""
+        """Wait until `holds(latches)` is true, but at most `seconds`."""
 
     def news(self) -> list[Event]:
         """Return the events since the last call."""
@@ -158,29 +161,29 @@ class LatchKeeper(Protocol):
 
 
 class Handover:
-    """Hands the latches of the control loop to their keeper, and says when they are kept.
+    """Hands the latches of the control loop to their keeper, and reports when they are stored.
 
-    The answer to a stop waits until the stop is kept, so that a stop which was answered survives a
-    kill of the process. The robot stops at once.
+    The robot stops at once, but the answer to a stop waits until the stop is stored. So a stop that
+    was answered survives a kill of the process.
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        """Begin with the latches that the keeper has read. Without a keeper nothing is kept."""
+        """Start with the latches that the keeper has read. With no keeper nothing is stored."""
         self.latches = latches
         self._keeper = keeper
 
     def take(self, latches: Latches) -> None:
-        """Hand these latches to the keeper if they have changed."""
+        """Hand these latches to the keeper if they are another object than the last ones."""
         if latches is not self.latches:
             self.latches = latches
             if self._keeper is not None:
                 self._keeper.keep(latches)
 
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
-        """Hand these latches to the keeper, with the stops that no control step has taken.
+        """Hand these latches to the keeper, with the stops that no control step has processed.
 
-        `by` names the clients that asked for these stops. The stop has a new number, so that a
-        clear of the stop before it does not release it.
+        `by` names the clients that asked for these stops; if it is empty, there was no such stop.
+        The stop has a new number, so that a `clear` of the stop before it does not release it.
         """
         if by:
             before = -1 if latches.stop is None else latches.stop.number
@@ -190,11 +193,14 @@ class Handover:
 
     @property
     def held(self) -> bool:
-        """Whether the daemon would restart with these latches if it were killed now."""
+        """Whether the latches are stored and survive a kill. Always true without a keeper."""
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:
-        """Wait at most `ANSWER_NS` until the latches are kept. Call this only at the end."""
+        """Wait until the latches are stored, but at most `ANSWER_NS`.
+
+        Call this only at the end of the daemon, because it blocks.
+        """
         if self._keeper is not None:
             self._keeper.wait(self.latches, ANSWER_NS / NS_PER_S)
 

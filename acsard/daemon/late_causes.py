@@ -1,13 +1,14 @@
 """Names the cause of a late control period from the kernel's counters; pure.
 
-`CAUSES` is the table of causes. A rule compares the counters from before the lateness with those
-after it, and returns a clause for a sentence, or "". A rule for a duration holds if the kernel's
-duration is at least `SHARE` of the lateness. Otherwise the small delays of normal load would count
-as causes. Several causes may hold at once, and a lateness without a known cause has none.
+`CAUSES` is the table of causes, and each cause has a rule. The rule compares the counters from
+before the lateness with those after it. It returns a clause for a sentence, or "" if its cause does
+not apply. If the counters show a duration, the cause applies only if the duration is at least
+`SHARE` of the lateness. Otherwise the small delays of normal load would count as causes. Several
+causes may apply to one lateness, or none.
 
-The kernel also says how the loop's thread spent the lateness: it ran, it was ready and waited for a
-processor, or it slept. A slow processor delays only a thread that runs or waits for one, and a disk
-delays only a thread that sleeps.
+The kernel also reports how the control loop's thread spent the lateness: it ran, it was ready and
+waited for a processor, or it slept. A slow processor delays only a thread that runs or waits for a
+processor. A disk delays only a thread that sleeps.
 """
 
 from __future__ import annotations
@@ -21,48 +22,53 @@ from acsard.core.values import NS_PER_S, Event
 from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
 
 SHARE = 0.5
-"""Share of a lateness that a cause must explain."""
+"""Smallest share of a lateness that a cause must explain, unless it has a share of its own."""
 
 SLEPT_SHARE = 0.3
-"""Share of a lateness that the loop's thread must sleep if a disk is the cause. Reading pages from
-a fast virtual disk took as much processor time as sleep."""
+"""Smallest share of a lateness for which the loop's thread must have slept if a disk is the cause.
+It is low, because reading pages from a fast virtual disk took as much processor time as sleep."""
 
 DISK_SHARE = 0.25
-"""Share of a lateness for which programs must wait for a disk. Of a thread that wrote to a disk all
-the time, the kernel counted 0.28 to 0.45 as waiting for the disk."""
+"""Smallest share of a lateness for which programs must have waited for a disk if a disk is the
+cause. It is low, because the kernel counted only 0.28 to 0.45 of the time as waiting while a thread
+wrote to a disk all the time."""
 
 LEAST_STOLEN_NS = 3 * NS_PER_S // 100
-"""Shortest steal time that counts, ns: three of the kernel's ticks. On a virtual machine, 24 of
-607 comparisons had one tick and one had two, although the program was late for another reason."""
+"""Shortest steal time that counts as a cause, ns: three of the kernel's ticks. In a test on a
+virtual machine, 24 of 607 comparisons had one tick of steal time and one had two, although the
+lateness had another cause."""
 
 SUSPENDED_NS = NS_PER_S // 10
-"""Shortest suspend, ns. The two clocks that tell it are not read at the same time."""
+"""Shortest time that counts as a suspend, ns. The difference of the two clocks can show a little
+time without a suspend, because they are not read at the same moment."""
 
 
 class Lateness(Struct, frozen=True, omit_defaults=True):
     """A late control period, and the kernel's counters from before and after it."""
 
     late_ns: int
-    """Time from the first missed period to the step, ns."""
+    """Time from the moment at which the first missed period was due to the late step, ns."""
     loop: Scheduled
-    """Time that the loop's thread ran and waited between the step before and the late step."""
+    """Time that the loop's thread ran, and time that it waited for a processor, between the period
+    before the lateness and the late step."""
     before: Reading
     after: Reading
     busiest: Program | None = None
-    """The process that used the processor most right after the lateness, None if none did."""
+    """The process that used the processor most, from a search at about the time of the lateness.
+    None without a search, or if no process used it much."""
 
     def explains(self, duration_ns: int, share: float = SHARE) -> bool:
-        """Return whether a duration is at least this share of the lateness."""
+        """Return whether a duration is at least the share `share` of the lateness."""
         return duration_ns >= share * self.late_ns
 
     @property
     def computed(self) -> bool:
-        """Whether the loop's thread ran or waited for a processor, instead of sleeping."""
+        """Whether the loop's thread ran or waited for a processor for `SHARE` of the lateness."""
         return self.explains(self.loop.ran_ns + self.loop.waited_ns)
 
     @property
     def slept(self) -> bool:
-        """Whether the loop's thread slept for a part of the lateness."""
+        """Whether the loop's thread slept for `SLEPT_SHARE` of the lateness."""
         return self.explains(self.late_ns - self.loop.ran_ns - self.loop.waited_ns, SLEPT_SHARE)
 
 
@@ -76,7 +82,10 @@ class Cause(Struct, frozen=True):
 
 
 def suspended(late: Lateness) -> str:
-    """Compare CLOCK_BOOTTIME, which goes on in a suspend, with CLOCK_MONOTONIC, which does not."""
+    """Return the clause for a suspend of the computer, or "".
+
+    CLOCK_BOOTTIME runs on during a suspend, and CLOCK_MONOTONIC does not.
+    """
     asleep_ns = late.after.asleep_ns - late.before.asleep_ns
     return (
         f"this computer was suspended for {_seconds(asleep_ns)}"
@@ -86,7 +95,11 @@ def suspended(late: Lateness) -> str:
 
 
 def undervoltage(late: Lateness) -> str:
-    """Read the alarm of the hwmon chip `rpi_volt` (in0_lcrit_alarm) and bit 0 of get_throttled."""
+    """Return the clause for a low supply voltage, or "".
+
+    The voltage is too low if the hwmon chip `rpi_volt` reports an alarm (in0_lcrit_alarm), or if
+    bit 0 of the Raspberry Pi's get_throttled is set.
+    """
     return low_voltage(late.after.conditions) if late.computed else ""
 
 
@@ -96,23 +109,28 @@ def low_voltage(now: Conditions) -> str:
 
 
 def heat(late: Lateness) -> str:
-    """Compare the processors' `thermal_throttle` counts, and read the states of cooling devices.
+    """Return the clause for a processor that heat slows down, or "".
 
-    On a Raspberry Pi the bits 1 to 3 of get_throttled count too.
+    The signs are a higher `thermal_throttle` count of a processor and an active cooling device. On
+    a Raspberry Pi the bits 1 to 3 of get_throttled are signs too.
     """
     hotter = late.after.conditions.throttled > late.before.conditions.throttled
     return hot(late.after.conditions, hotter) if late.computed else ""
 
 
 def hot(now: Conditions, hotter: bool = False) -> str:
-    """Return the clause for a processor that is slowed down by heat, or ""."""
+    """Return the clause for a processor that is slowed down by heat, or "".
+
+    `hotter` is true if a counter of slow-downs by heat has risen.
+    """
     return "the processor is too hot and runs slower" if now.hot or hotter else ""
 
 
 def governor(late: Lateness) -> str:
-    """Compare the limit of the clock (scaling_max_freq) with the full clock (cpuinfo_max_freq).
+    """Return the clause for a processor whose clock is limited, or "".
 
-    A governor that keeps the lowest clock sets the limit to scaling_min_freq.
+    The limit of the clock (scaling_max_freq) is compared with the full clock (cpuinfo_max_freq).
+    For a governor that keeps the lowest clock, the limit is scaling_min_freq.
     """
     return slow(late.after.conditions) if late.computed and not heat(late) else ""
 
@@ -129,7 +147,10 @@ def slow(now: Conditions) -> str:
 
 
 def cgroup_quota(late: Lateness) -> str:
-    """Compare the time without quota in `cpu.stat` of the cgroup (throttled_usec)."""
+    """Return the clause for a used-up processor quota of the daemon's cgroup, or "".
+
+    The kernel counts the time without quota in `cpu.stat` of the cgroup (throttled_usec).
+    """
     without_ns = late.after.quota_ns - late.before.quota_ns
     if not late.explains(without_ns):
         return ""
@@ -137,21 +158,27 @@ def cgroup_quota(late: Lateness) -> str:
 
 
 def stolen(late: Lateness) -> str:
-    """Compare the steal time of each processor in /proc/stat."""
+    """Return the clause for a processor that the host of a virtual machine took away, or "".
+
+    The kernel counts the steal time of each processor in /proc/stat.
+    """
     stolen_ns = most_stolen(late.before, late.after)
     if stolen_ns < LEAST_STOLEN_NS or not late.explains(stolen_ns):
         return ""
-    return f"the host of this virtual machine took its processor for {_seconds(stolen_ns)}"
+    return f"its host gave this virtual machine no processor for {_seconds(stolen_ns)}"
 
 
 def most_stolen(before: Reading, after: Reading) -> int:
-    """Return the most time that one processor lost to the host between two readings, ns."""
+    """Return the longest time that the host took one processor away between two readings, ns."""
     pairs = zip(before.steal_ns, after.steal_ns, strict=False)
     return max((new - old for old, new in pairs), default=0)
 
 
 def memory(late: Lateness) -> str:
-    """Compare the major page faults of the process in /proc/self/stat."""
+    """Return the clause for memory pages that had to be read from a disk, or "".
+
+    The kernel counts the major page faults of the process in /proc/self/stat.
+    """
     pages = late.after.major_faults - late.before.major_faults
     if not pages or not late.slept:
         return ""
@@ -159,12 +186,13 @@ def memory(late: Lateness) -> str:
 
 
 def disk(late: Lateness) -> str:
-    """Compare the times of waiting for a disk, of the loop's thread or else of all programs.
+    """Return the clause for a wait for a disk, or "".
 
-    The loop's own time is in /proc/self/stat (delayacct_blkio_ticks), if the kernel measures it.
-    The time of all programs is in /proc/pressure/io, or else iowait in /proc/stat. It counts only
-    if the loop's thread itself read from a disk or wrote to one (/proc/self/task/TID/io), because
-    other programs may wait for a disk at any time.
+    The kernel reports two times. The first is that of the loop's own thread, in /proc/self/stat
+    (delayacct_blkio_ticks), if the kernel measures it. The second is that of all programs, in
+    /proc/pressure/io, or else iowait in /proc/stat. The second counts only if the loop's thread
+    itself read from a disk or wrote to one (/proc/self/task/TID/io), because other programs may
+    wait for a disk at any time.
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
@@ -175,7 +203,10 @@ def disk(late: Lateness) -> str:
 
 
 def other_program(late: Lateness) -> str:
-    """Compare the time that the loop's thread was ready and had no processor (schedstat)."""
+    """Return the clause for other programs that used the processor, or "".
+
+    The kernel counts in schedstat how long the loop's thread was ready and had no processor.
+    """
     if cgroup_quota(late) or stolen(late) or not late.explains(late.loop.waited_ns):
         return ""
     for_s = _seconds(late.loop.waited_ns)
@@ -208,9 +239,9 @@ CAUSES = (
 
 
 def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
-    """Return the names of the causes of a lateness, and a clause with all of them and the advice.
+    """Return the names of the causes of a lateness, and a clause with all causes and the advice.
 
-    Return empty values if the kernel's counters show no cause.
+    Return `((), "")` if the kernel's counters show no cause.
     """
     found = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
     clauses = [f"{clause} ({cause.advice})" for cause, clause in found]
@@ -222,26 +253,32 @@ BECAUSE = ", because "
 
 
 def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
-    """Return the event with the causes of a lateness, of which `causes` has returned the clause."""
+    """Return the event for a lateness.
+
+    `clause` is the clause that `causes` has returned. `news` is false for a repetition
+    (`Event.news`).
+    """
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=news)
 
 
 def cause_in(text: str) -> str:
-    """Return the duration and the causes from the text of an event or a line of the log.
+    """Return the part with the duration and the causes of a text.
 
-    Return "" if the text has no cause. A line may begin with the number of missed periods.
+    The text comes from an event or from a line of the log, which may begin with the number of
+    missed periods. Return "" if the text has no cause.
     """
     begin, because, clause = text.partition(BECAUSE)
     return begin.rpartition(": ")[2] + because + clause if because else ""
 
 
 STOLEN_SHARE = 0.02
-"""Share of a second that a virtual machine's host may take from a processor without a warning."""
+"""Largest share of the time that the host of a virtual machine may take from a processor before
+`present` reports it."""
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
-    """Return the causes that make any program late now, each with its advice.
+    """Return the causes that delay every program on this computer now, each with its advice.
 
     Args:
         before: the counters at the beginning.
@@ -251,7 +288,7 @@ def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, 
     now = after.conditions
     stolen_ns = most_stolen(before, after)
     hotter = now.throttled > before.conditions.throttled
-    host = f"the host of this virtual machine took its processor for {_seconds(stolen_ns)}"
+    host = f"its host gave this virtual machine no processor for {_seconds(stolen_ns)}"
     clauses = {
         "undervoltage": low_voltage(now),
         "heat": hot(now, hotter),

@@ -1,11 +1,13 @@
 """Watches for late control periods, and reports their cause if the kernel shows one.
 
-The control loop reads one small file in each period, its thread's times in `schedstat`, and hands a
-late period to a thread of this module. Only that thread reads the kernel's other files: four times
-a second to know them from before a lateness, and again after one. `late_causes.py` compares them.
+In each period the control loop reads one small file, `schedstat`, with the processor times of its
+thread. It hands a late period to a thread of this module. Only that thread reads the kernel's other
+files, which takes longer. It reads them four times a second, so that it has a reading from before
+each lateness, and once more after a lateness. `late_causes.py` compares the two readings.
 
-The event has the name `missed_periods`, like the robot's own event, which has the number of periods
-and comes first. The robot's event cannot name the cause, because the cause is known only later.
+This module's event has the name `missed_periods`, like the robot's own event. The robot's event
+comes first and has the number of missed periods. It cannot name the cause, because the cause is
+known only later.
 """
 
 from __future__ import annotations
@@ -27,55 +29,58 @@ from acsard.host.kernel_counters import Kernel, Program, Reading, Scheduled, sch
 from acsard.host.mailbox import Mailbox
 
 OWN_TIMES = "/proc/thread-self/schedstat"
-"""File of the times of the thread that opens it."""
+"""File with the processor times of the thread that opens it."""
 
 EVERY_S = 0.25
-"""Time between two readings while no period is late, s. The counters of a reading that is too old
-would contain the delays of normal load."""
+"""Time between two readings while no period is late, s. A comparison with an older reading would
+include more delays of normal load."""
 
 HISTORY = 12
-"""Readings that are kept: those of 3 s. A lateness is compared with a reading from before it began,
-and the watch goes on reading during the lateness."""
+"""Number of readings that are kept, which cover 3 s. A lateness is compared with a reading from
+before it began, and the thread goes on reading during the lateness."""
 
 SETTLE_S = 0.03
-"""Time from a late period to the reading after it, s. The kernel counts some times only at its next
-ticks, which are 10 ms apart at most."""
+"""Time from a late period to the reading after it, s. The kernel updates some counters only at its
+next tick, and ticks are at most 10 ms apart."""
 
 PAUSE_NS = NS_PER_S
-"""Shortest time between two reports, ns. The log has at most a line a second of one name."""
+"""Shortest time between two reports, ns. The log has at most one line a second for events of one
+name."""
 
 CONDITIONS_NS = 10 * NS_PER_S
-"""Age from which on the processor's conditions are read again, ns. They need the firmware's answer
-on some computers. After a lateness they are read in any case."""
+"""Age at which the conditions of the processor, such as its voltage, are read again, ns. On some
+computers the firmware must answer. After a lateness they are read in any case."""
 
 LOOK_S = 0.2
-"""Time between the two looks at all processes, s."""
+"""Time between the two readings of all processes in one search for the busiest process, s."""
 
 LOOK_AGAIN_NS = 10 * NS_PER_S
 """Shortest time between two searches for the busiest process, ns. A search takes 20 us per process.
 """
 
 NEWS_NS = 60 * NS_PER_S
-"""Time after which the same cause is reported at once again, ns. Repetitions wait for the next line
-about missed periods, as `news=False` of an event says."""
+"""Time after which the same cause is logged at once again, ns. An earlier repetition waits for the
+next line about missed periods (`Event.news`)."""
 
 MOST = 16
-"""Late periods and events that wait. The newest ones win."""
+"""Largest number of late periods that wait for the thread, and of events that wait for the control
+loop. Newer ones displace the oldest."""
 
 
 class Late(Struct, frozen=True):
-    """A late period, as the control loop reports it."""
+    """A late period, as the control loop hands it to the thread."""
 
     now_ns: int
-    """Monotonic time of its step."""
+    """Monotonic time of the step of the late period, ns."""
     late_ns: int
     before: bytes
-    """Content of `OWN_TIMES` in the period before, and in this one."""
+    """Content of `OWN_TIMES` at the period before the late one, b"" if it is unknown."""
     after: bytes
+    """Content of `OWN_TIMES` at the late period, b"" if it is unknown."""
 
     @property
     def loop(self) -> Scheduled:
-        """The times of the loop's thread between both periods."""
+        """Time that the loop's thread ran and waited between the period before and the late one."""
         before, after = scheduled(self.before), scheduled(self.after)
         return Scheduled(after.ran_ns - before.ran_ns, after.waited_ns - before.waited_ns)
 
@@ -83,11 +88,11 @@ class Late(Struct, frozen=True):
 class LateWatch:
     """The watch of one control loop. The loop's thread creates it, and calls `period` and `news`.
 
-    It is a context manager, whose thread runs inside the context.
+    It is a context manager. Its own thread runs while the context is entered.
     """
 
     def __init__(self, kernel: Kernel | None = None) -> None:
-        """Use another `kernel` in tests."""
+        """Prepare the thread. Tests pass a `kernel` of their own; None means the real one."""
         self._kernel = kernel
         self._box = Mailbox[Late](MOST)
         self._news = Mailbox[Event](MOST, lambda: None)
@@ -96,12 +101,13 @@ class LateWatch:
         try:
             self._file = os.open(OWN_TIMES, os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
-            # This kernel does not measure them.
+            # This kernel does not measure the times of threads.
             self._file = -1
         self._readings: deque[tuple[int, Reading]] = deque(maxlen=HISTORY)
-        """The last readings, each with the monotonic time at which it was complete."""
+        """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
-        """Monotonic time of the last news about each combination of causes."""
+        """For each combination of causes, the monotonic time of its last event that was not a
+        repetition, ns."""
         self._busiest: Program | None = None
         self._searched_ns: int | None = None
 
@@ -109,7 +115,8 @@ class LateWatch:
         try:
             self._thread.start()
         except RuntimeError:
-            # This process cannot start another thread, so no cause is known. The robot drives.
+            # This process cannot start another thread. The robot drives, but no cause of a lateness
+            # is found.
             self._box.close()
         return self
 
@@ -122,9 +129,14 @@ class LateWatch:
     # The control loop's thread calls these methods.
 
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
-        """Take a period whose step began `late_ns` late, after `missed` periods without a step."""
+        """Process a period, and hand it to the thread if periods were missed.
+
+        The step of the period began `late_ns` ns late, at the monotonic time `now_ns`, after
+        `missed` periods without a step.
+        """
         before, times = self._times, b""
-        with suppress(OSError):  # a lateness without its times only has fewer causes
+        # Without these times, the thread still finds some of the causes.
+        with suppress(OSError):
             times = os.pread(self._file, 64, 0) if self._file >= 0 else b""
         self._times = times
         if missed:
@@ -180,7 +192,10 @@ class LateWatch:
         self._news.put(event_of(late, clause, news=news))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
-        """Return the busiest process, as of a search that may be `LOOK_AGAIN_NS` old."""
+        """Return the busiest process from the last search, or None if that search found none.
+
+        Search again if the last search is older than `LOOK_AGAIN_NS`.
+        """
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:
             self._busiest, self._searched_ns = kernel.busiest(LOOK_S), now_ns

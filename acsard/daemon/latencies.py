@@ -1,8 +1,8 @@
-"""Measures the daemon's own latencies, in fixed memory and without a clock of its own.
+"""Measures the daemon's own latencies, in fixed memory and without reading a clock.
 
-Each figure is a duration in us, published as median, 99th percentile and maximum, since the start
-and over the last minute. The messages `state` and `diagnostics` carry them. `Stopwatch` takes the
-times from the control loop.
+Each figure is a duration in us. The messages `state` and `diagnostics` publish its median, 99th
+percentile and maximum, since the start and over the last minute. The control loop passes the
+measured times to `Stopwatch`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ PER_DECADE = 20
 """Buckets per factor of ten. A percentile is accurate to 12 %."""
 
 DECADES = 7
-"""Range from 1 to 10^7 of the unit. Values outside it fall into the end buckets."""
+"""Number of factors of ten that the buckets cover: values from 1 to 10^7. Values outside this range
+fall into the first or the last bucket."""
 
 LAST = PER_DECADE * DECADES
-"""Index of the end bucket."""
+"""Index of the last bucket."""
 
 
 class Histogram:
-    """Percentiles of an endless stream in fixed memory, by logarithmic buckets."""
+    """A histogram with logarithmic buckets: percentiles of an endless stream in fixed memory."""
 
     def __init__(self) -> None:
         self._buckets = [0] * (LAST + 1)
@@ -35,7 +36,7 @@ class Histogram:
 
     def add(self, value: float) -> None:
         """Count a measurement."""
-        # A search in a table of the buckets' ends would fetch a dozen cold cache lines each time.
+        # Compute the index, because a search in a table would fetch a dozen cold cache lines.
         index = math.ceil(PER_DECADE * math.log10(value)) if value > 1.0 else 0
         self._buckets[index if index < LAST else LAST] += 1
         if value > self._max:
@@ -70,27 +71,28 @@ Name = Literal[
 ]
 """The figures, in the order in which a command passes them.
 
-- period_lateness: from the time at which a period was due to its step; of several missed periods,
-  the first one counts
-- step_time: from the start of a step to the end of its work
-- command_age: from a command's arrival to each line that carries it
-- command_to_wire: from a command's arrival to the moment when the port took the first line that
-  carries it; a command that first waited for its source's turn is not counted
-- feedback_to_bus: from the read of a feedback line's end to its messages in the queue of the bus;
-  before the read the line may have waited in the kernel while the loop stood still
-- mcu_round_trip: from the leaving of a line to the end of its answer, only for checked replies,
-  because only these tell which of the pipelined lines they answer
+- period_lateness: from the time at which a period was due to the start of its step. If periods
+  were missed, the first missed period counts.
+- step_time: from the start of a step to the end of its work.
+- command_age: from a command's arrival to the write of each line that carries it.
+- command_to_wire: from a command's arrival to the write of the first line that carries it. A
+  command that had to wait until its source was chosen is not counted.
+- feedback_to_bus: from the read of a feedback line's end to the moment at which the line's messages
+  are in the queue of the bus. Time that the line waited in the kernel before the read, because the
+  loop stood still, is not included.
+- mcu_round_trip: from the write of a line to the read of the end of its reply. Only checked replies
+  are measured, because only these tell which of several lines they reply to.
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)
 
 SLOT_NS = 10 * NS_PER_S
-"""Length of a slot of the last minute. The newest slot replaces the oldest."""
+"""Length of one slot of the last minute, ns. The newest slot replaces the oldest."""
 
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""Longest age of the cached values. Adding up a minute costs more than a control step."""
+"""Longest age of the cached values, ns. Adding up a minute takes longer than a control step."""
 
 
 class Figure:
@@ -98,11 +100,11 @@ class Figure:
 
     def __init__(self) -> None:
         self._past = Histogram()
-        """All measurements older than the last minute."""
+        """All measurements that are older than the slots."""
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
         self._slot, self._ends_ns = self._slots[0], 0
-        """The newest slot, and the monotonic time at which it ends."""
+        """The newest slot, and the monotonic time at which it ends, ns."""
 
     def add(self, now_ns: int, duration_ns: int) -> None:
         """Record a duration that was measured at monotonic `now_ns`."""
@@ -130,13 +132,13 @@ class Figure:
 
 
 class LastMinute:
-    """A counter of events in the last minute, to the 10 s of a slot."""
+    """A counter of the events in the last minute, with a resolution of one slot (10 s)."""
 
     def __init__(self) -> None:
         self._slots: deque[tuple[int, int]] = deque(maxlen=SLOTS)
 
     def add(self, now_ns: int, count: int) -> None:
-        """Count `count` events at monotonic `now_ns`."""
+        """Add `count` events that happened at monotonic `now_ns`."""
         number, before = now_ns // SLOT_NS, 0
         if self._slots and self._slots[-1][0] == number:
             _, before = self._slots.pop()
@@ -149,7 +151,7 @@ class LastMinute:
 
 
 class Stopwatch:
-    """The measurements of the control loop."""
+    """The latency measurements of the control loop."""
 
     def __init__(self) -> None:
         self.figures: dict[Name, Figure] = {name: Figure() for name in NAMES}
@@ -158,36 +160,43 @@ class Stopwatch:
         self._cached_ns = -FRESH_NS
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
-        """Return all figures by name, at most a second old."""
+        """Return all figures by name. The values are at most a second old at monotonic `now_ns`."""
         if now_ns - self._cached_ns >= FRESH_NS:
             self._cached_ns = now_ns
             self._cached = {name: figure.measured(now_ns) for name, figure in self.figures.items()}
         return self._cached
 
     def missed(self, now_ns: int) -> int:
-        """Return the number of periods in the last minute that had no step."""
+        """Return the number of periods without a step in the minute before monotonic `now_ns`."""
         return self._missed.count(now_ns)
 
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
-        """Record a period's step, `late_ns` late after `missed` periods without one."""
+        """Record that the step of a period began `late_ns` ns late, at monotonic `now_ns`.
+
+        `missed` is the number of periods without a step before it.
+        """
         self.figures["period_lateness"].add(now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
-        """Record the age of a sent line's command; the line before left at `before_ns`."""
+        """Record the age of the command in a line that was written at `sent_ns`.
+
+        `before_ns` is the time at which the line before was written. Both are monotonic, ns.
+        """
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
         self.figures["command_age"].add(sent_ns, sent_ns - command_ns)
-        if command_ns > before_ns:  # otherwise it waited for its source's turn, not for the wire
+        # An older command was in an earlier line already, or waited until its source was chosen.
+        if command_ns > before_ns:
             self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """Record the delays of a feedback line.
 
-        `told_ns` is the time at which its messages were queued for the bus, or None if no client
-        subscribes to them.
+        `told_ns` is the monotonic time at which the messages of the line were queued for the bus,
+        ns. It is None if no client subscribes to them.
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
@@ -196,5 +205,5 @@ class Stopwatch:
             self.figures["feedback_to_bus"].add(told_ns, told_ns - at_ns)
 
     def step(self, began_ns: int, ended_ns: int) -> None:
-        """Record the start and the end of a step."""
+        """Record the start and the end of a step, monotonic times in ns."""
         self.figures["step_time"].add(began_ns, ended_ns - began_ns)

@@ -1,8 +1,8 @@
-"""Decides when a line may go: in every period, and at once for a new command or mode.
+"""Decides when a line may be written: in every period, and early for a new command or mode.
 
-A line that goes at once replaces the line of the next period, so a flood of commands does not add
-lines. It keeps a distance to the line before it: the wire time of that line and a margin. Each
-period has one attempt.
+A line that is written early, between two periods, replaces the line of the next period. So a flood
+of commands does not cause more lines. After the line before it there must be a gap of the wire time
+of a line plus `BREATH_NS`. Each period allows one attempt to write an early line.
 """
 
 from __future__ import annotations
@@ -11,64 +11,73 @@ from msgspec import Struct
 
 
 class Period(Struct, frozen=True):
-    """The periods that ended since the last step, the first of them due at `due_ns`."""
+    """The number of periods that have ended since the last step, and when the first was due.
+
+    `due_ns` is a monotonic time.
+    """
 
     expired: int
     due_ns: int
 
 
 NO_PERIOD = Period(0, 0)
-"""The value for a step that another event than the timer caused."""
+"""The value for a step between two periods."""
 
 
 BREATH_NS = 1_000_000
-"""Time that a line leaves the board for its answer, besides the wire time, ns."""
+"""Time that the board has for its reply between two lines, in addition to the wire time of a line,
+ns."""
 
 IDLE_WAKES = 3
-"""Steps per period that commands without effect may cause. This bounds the cost of a stranger's
-flood, and a command that counts can still go at once in each period."""
+"""Largest number of steps without a new line that input from the bus may cause per period. If the
+number is exceeded, input waits for the next period. This bounds the cost of a flood from a
+stranger."""
 
 
 class Pace:
-    """A record of whether a line has already replaced the line of the next period.
+    """The record of the lines of one period, which decides when a line may be written.
 
-    The port knows when the last line went, so the methods take that time as an argument.
+    The port knows when it wrote the last line, so the methods get that time as `sent_ns`.
     """
 
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
         self._possible = self._gap_ns < period_ns
-        """Whether a line can go between two periods at all."""
+        """Whether the gap is shorter than a period, so that a line can be written between two
+        periods."""
         self._ahead = False
-        """Whether a line has gone in place of the next period's line."""
+        """Whether an early line was written in place of the next period's line."""
         self._tried = False
-        """Whether this period's attempt has been made, successful or not."""
+        """Whether this period's attempt to write an early line was made, successful or not."""
         self._waiting = False
-        """Whether a new command came too soon after a line and waits."""
+        """Whether a new command came too soon after a line and waits for the end of the gap."""
         self._idle = 0
 
     def period_ended(self, missed: int) -> bool:
-        """Note the end of a period. Return whether its line goes (`Inputs.tick`).
+        """Record the end of a period. Return whether its line must be written (`Inputs.tick`).
 
-        It does not go if a line went in its place. After `missed` periods it goes in any case,
-        because the line before it left long ago.
+        If an early line was written in its place, it is not written. After `missed` > 0 periods
+        without a step it is written in any case, because the line before was written long ago.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
         return missed > 0 or not ahead
 
     def at_once(self, now_ns: int, sent_ns: int) -> bool:
-        """Return whether a new command may go now, between two periods."""
+        """Return whether an early line may be written now for a new command.
+
+        `sent_ns` is the time at which the last line was written. Both are monotonic, ns.
+        """
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
     def note(self, tick: bool, due: bool, went: bool, news: bool, heard: bool) -> None:
-        """Note the result of a step.
+        """Record the result of a step.
 
         Args:
-            tick: Whether its line was the period's.
-            due: Whether it had a line to send.
-            went: Whether the line left.
-            news: Whether the next line differs from the last one.
+            tick: Whether the step was to write the line of a period.
+            due: Whether the step had a line to write.
+            went: Whether the line was written.
+            news: Whether the command or the mode has changed since the last line that was due.
             heard: Whether the bus had input for this step.
         """
         self._waiting = news and not due
@@ -78,14 +87,17 @@ class Pace:
 
     @property
     def listens(self) -> bool:
-        """Whether a command that arrives now is worth a step of its own."""
+        """Whether a command that arrives now gets a step of its own, before the next period."""
         return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
 
     @property
     def waits(self) -> bool:
-        """Whether a new command waits, because the last line has only just left."""
+        """Whether a new command waits because the last line has only just been written."""
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:
-        """Return the monotonic time at which a waiting command may go, or None if none waits."""
+        """Return the monotonic time at which a waiting command may be written, ns.
+
+        Return None if no command waits. `sent_ns` is the monotonic time of the last line, ns.
+        """
         return sent_ns + self._gap_ns if self.waits else None

@@ -1,7 +1,8 @@
-"""Reads the robot's URDF from the file in `[ros] urdf`, or says why the file cannot be published.
+"""Reads the robot's URDF from the file in `[ros] urdf`, or explains why it cannot be published.
 
-The daemon publishes the text as it is. The checks find the mistakes that would otherwise appear
-only in the tools of ROS: another file, a xacro file, a file that no link accepts.
+The daemon publishes the text unchanged. The checks find mistakes that would otherwise appear only
+in the tools of ROS: a file that is not a URDF, a xacro file, and a file that is too large for the
+links of the bus.
 """
 
 from __future__ import annotations
@@ -15,18 +16,20 @@ from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
 from acsard.host.errors import Exit, ExitError
 
 MAX_BYTES = 50_000
-"""Largest file, bytes. The TLS gateway and the routers accept no message above `MESSAGE_BYTES`, and
-JSON has two bytes for each quotation mark and each line end."""
+"""Largest size of the file, bytes. The TLS gateway and the routers accept no message above
+`MESSAGE_BYTES`, and JSON needs two bytes for each quotation mark and each line end."""
 
 MAX_JSON = MESSAGE_BYTES - 1024
-"""Largest message as JSON, bytes. The rest is for the key and for Zenoh's headers."""
+"""Largest size of the description as JSON, bytes. The other 1024 bytes of a message are for the key
+and for Zenoh's headers."""
 
 XACRO = "/xacro}"
-"""End of the namespace of xacro's elements, as ElementTree writes it. Files have different ones,
-such as http://www.ros.org/wiki/xacro and http://ros.org/wiki/xacro."""
+"""End of the namespace of a xacro element in its tag, as ElementTree writes it. Files use different
+namespaces, such as http://www.ros.org/wiki/xacro and http://ros.org/wiki/xacro."""
 
 DOCUMENT_TYPE = "<!DOCTYPE"
-"""Begins a declaration of entities, which could also expand to any length."""
+"""Beginning of a document type. The file must not have one, because its entities could expand to
+any length."""
 
 
 def robot_description(path: str) -> str:
@@ -39,7 +42,7 @@ def robot_description(path: str) -> str:
         return ""
     file = Path(path)
     try:
-        # A pipe of this name would never end.
+        # Reading a pipe would never end.
         if file.exists() and not file.is_file():
             raise _error(path, "it is not a file; name the URDF itself")
         with file.open("rb") as opened:

@@ -1,11 +1,11 @@
-"""The configuration file of a running daemon: compared with the settings in force, and changed.
+"""Compares the configuration file with the settings in force, and changes the file.
 
-The file and the settings differ after a `set` that was not written, and after a person has edited
-the file. A thread reads the file again whenever it changes.
+The file and the settings differ after a `set` that was not written to the file, and after a person
+has edited the file. A thread reads the file again whenever it has changed.
 
-A `set` with `keep` passes this module twice. First the thread checks that the file can be changed;
-otherwise nothing is set. Then the robot obeys, and the thread changes the file. The control loop
-hands over requests and answers, and never waits for the disk.
+A `set` with `keep` has two stages. First the thread checks that the file can be changed; if it
+cannot, nothing is set. Then the robot uses the settings, and the thread changes the file. The
+control loop exchanges requests and answers with the thread, and never waits for the disk.
 """
 
 from __future__ import annotations
@@ -34,48 +34,51 @@ from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
 
 LOOK_S = 2.0
-"""Pause between two looks at the file."""
+"""Time between two checks for a changed file, s."""
 
 NAMED = 3
-"""Largest number of differing settings that the text names, because `state` must stay short."""
+"""Largest number of differing settings that `SettingsFile.differ` names. The message `state`
+contains this text and must stay short."""
 
 MAX_TEXT = 200
-"""Largest number of characters of the text."""
+"""Largest number of characters of `SettingsFile.differ`."""
 
 PATIENCE_NS = 5 * NS_PER_S // 2
-"""Time from a `set` with `keep` to its answer, ns. A client waits for 3 s."""
+"""Longest time from a `set` with `keep` to its answer, ns. A client waits for 3 s."""
 
 JOBS = 32
-"""Largest number of requests that have no answer yet. Further ones are refused at once."""
+"""Largest number of `set` requests with `keep` that have no answer yet. Further requests are
+refused at once."""
 
 Signature = tuple[int, int, int]
-"""Inode, size in bytes and time of change in ns of a file."""
+"""Inode, size in bytes and modification time in ns of a file."""
 
 _decoder = Decoder(Settings)
 
 
 def keeps(encoding: str, payload: bytes) -> bool:
-    """Return whether the payload of a `set`, already checked, asks to change the file too."""
+    """Return whether the payload of a valid `set` asks to change the configuration file too."""
     return _decoder.decode(encoding, payload).keep
 
 
 class _Checked(Struct, frozen=True):
-    """A request whose settings can be written."""
+    """A `set` request whose settings can be written to the file."""
 
     request: Request
     edit: Edit
 
 
 class _Pending(Struct):
-    """A request that has no answer yet."""
+    """A `set` request with `keep` that has no answer yet."""
 
     request: Request
     due_ns: int
-    """Monotonic time at which it gets an answer in any case."""
+    """Monotonic time after which the request is answered as overdue, ns. While the robot decides
+    about it, the request waits for the robot's answer."""
     edit: Edit | None = None
-    """The checked change of the file; None before the check."""
+    """The change of the file, once the thread has checked it; None before."""
     answer: Answer | None = None
-    """The robot's answer; None before the robot has obeyed."""
+    """The robot's answer, once the robot has used the settings; None before."""
 
 
 class SettingsFile:
@@ -84,7 +87,7 @@ class SettingsFile:
     def __init__(
         self, file: Path | None, parse: Callable[[bytes], Config], started: Config
     ) -> None:
-        """Compare nothing until `start`.
+        """Prepare the comparison. It begins with `start`.
 
         Args:
             file: the file that the daemon has read, or None for the built-in defaults.
@@ -92,26 +95,27 @@ class SettingsFile:
             started: the configuration with which the daemon has started.
         """
         self.differ = ""
-        """Settings in force that differ from the file, or why the file is unusable, in words; else
-        empty."""
+        """The settings in force that differ from the file, in words. If the file cannot be used,
+        this text says why. It is "" if nothing differs."""
         self._file, self._parse = file, parse
         self._in_force = self._written = started
-        """The settings in force, and those of the file."""
+        """The settings in force, and the settings in the file."""
         self._signature: Signature | None = None
         """The signature of the file that `_written` was read from."""
         self._box = Mailbox[Request | Literal["look"]](JOBS)
-        """The requests that the thread is to check."""
+        """The requests that the thread must check. "look" only wakes the thread."""
         self._changes = deque[tuple[Edit, Answer]]()
-        """The changes that the thread is to write, each with the robot's answer and before the next
-        check."""
+        """The changes that the thread must write, each with the robot's answer. The thread writes
+        them before its next check."""
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
-        """The limits with which the daemon has started, and those with the ones written since."""
+        """The limits at the start of the daemon, and the same limits with the values that the
+        daemon has written to the file since."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """The arguments of the last call of `latches`, with `_limits`, and its result."""
+        """Cache of `latches`: its last arguments, the `_limits` at that time, and its result."""
 
-    # the control loop's side
+    # The control loop calls the methods below.
 
     def start(self) -> None:
         """Start the thread. If the process cannot start one, nothing is compared."""
@@ -122,28 +126,40 @@ class SettingsFile:
             self.differ = f"this process cannot compare them with the file ({error})"
 
     def use(self, config: Config) -> None:
-        """Take the configuration in force from now on, without a speed limit."""
+        """Compare the file with this configuration from now on.
+
+        `config` is the configuration in force, without a speed limit.
+        """
         self._in_force = config
         self._look()
 
     def keep(self, request: Request, now_ns: int) -> None:
-        """Take a `set` with `keep`. `results` returns it once its settings can be written."""
+        """Queue a `set` with `keep` for the check of the file. `now_ns` is the monotonic time.
+
+        If the file can be changed, `results` returns the request later, else an answer that refuses
+        it.
+        """
         full = len(self._pending) >= JOBS
-        # A request that is overdue from the start gets its answer in this step.
+        # Make a request that is one too many overdue at once, so that `results` refuses it in this
+        # step.
         self._pending[request.id] = _Pending(request, now_ns - 1 if full else now_ns + PATIENCE_NS)
         if not full:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread. A request that waits does so too, and must not be displaced."""
+        """Wake the thread, unless a waiting item has woken it already.
+
+        Another item could displace a request from a full mailbox.
+        """
         if not self._box.waiting:
             self._box.put("look")
 
     def obeyed(self, answer: Answer) -> bool:
-        """Take the robot's answer to a request that `results` has returned.
+        """Process the robot's answer to any request.
 
-        Return True if the thread now writes the settings: `results` will return the answer. Return
-        False if there is nothing to write.
+        If `results` has returned this request and the robot has used its settings, the thread now
+        writes them. Then this method returns True, and `results` will return the answer. Otherwise
+        it returns False: the caller must send the answer.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -157,7 +173,11 @@ class SettingsFile:
         return True
 
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
-        """Return the requests that the robot may obey now, and the answers; add events."""
+        """Return the requests that the robot may obey now, and the answers for clients.
+
+        For each request that was written, an event is added to `events`. `now_ns` is the monotonic
+        time.
+        """
         if not self._pending:
             return []
         found: list[Request | Answer] = []
@@ -165,10 +185,10 @@ class SettingsFile:
             number = one.id if isinstance(one, Answer) else one.request.id
             pending = self._pending.get(number)
             if pending is None:
-                continue  # it was overdue, and has its answer
+                continue  # the request was overdue and has been answered
             if isinstance(one, _Checked):
                 if now_ns > pending.due_ns:
-                    continue  # its answer below says that nothing is set
+                    continue  # the request is overdue: the code below answers it
                 pending.edit = one.edit
                 found.append(one.request)
                 continue
@@ -179,7 +199,8 @@ class SettingsFile:
                 # The log puts the kind in front of the text: `written: KEY to FILE`.
                 text = f"{keys} to {self._file}"
                 events.append(Event("set", text, by=pending.request.by, kind="written"))
-        # A request that the robot has gets the robot's answer, so it may not be called "not set".
+        # Skip a request that the robot still has, because the robot may set what it asks for. Its
+        # answer must not say that nothing is set.
         overdue = [
             waits
             for waits in self._pending.values()
@@ -191,14 +212,15 @@ class SettingsFile:
 
     @property
     def limits(self) -> LimitsConfig:
-        """The limits of the daemon's start, with those that it has written since."""
+        """The limits at the start of the daemon, with the values that it has written since."""
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
-        """Return the latches of the robot for the next start, which begins with the file.
+        """Return the robot's latches for the next start, which reads its limits from the file.
 
-        The robot compares its limits with those of its start. If this daemon has written others
-        since, a limit is lowered if it is below the one in the file.
+        The robot's own `lowered` compares the limits in force with those at the start of the
+        daemon. If the daemon has written limits to the file since, this method compares with the
+        file instead.
 
         Args:
             latches: the latches of the robot.
@@ -208,17 +230,18 @@ class SettingsFile:
         if file is self._started:
             return latches
         kept = self._kept
-        # The latch file is written again only if it gets another object.
+        # Return the same object for the same arguments, because the latch file is written again for
+        # each new object.
         if kept is None or not (kept[0] is latches and kept[1] is now and kept[2] is file):
             result = replace(latches, lowered=lowered(file, now))
             kept = self._kept = latches, now, file, result
         return kept[3]
 
     def close(self) -> None:
-        """Let the thread end."""
+        """Tell the thread to end, without waiting for it."""
         self._box.close()
 
-    # the thread's side
+    # The thread runs the methods below.
 
     def _work(self) -> None:
         while not self._box.closed:
@@ -232,14 +255,14 @@ class SettingsFile:
             self.differ = printable(self._difference())[:MAX_TEXT]
 
     def _write(self) -> None:
-        """Write the changes that the robot has obeyed."""
+        """Write the changes whose settings the robot has used."""
         while self._changes:
             self._results.put(self._written_answer(*self._changes.popleft()))
 
     def _checked(self, request: Request) -> _Checked | Answer:
         """Return the request if its settings can be written, else the answer that refuses it."""
         try:
-            # The robot would refuse these settings even while it stands.
+            # Refuse settings that the robot would refuse even at rest.
             changed(self._in_force, request.settings, at_rest=True)
         except ConfigError as error:
             return Answer(request.id, False, str(error))
@@ -249,7 +272,7 @@ class SettingsFile:
             return Answer(request.id, False, f"nothing is set: {error}")
 
     def _written_answer(self, edit: Edit, answer: Answer) -> Answer:
-        """Write a change, and return the answer to its request."""
+        """Write a change to the file, and return the answer to its request."""
         told = answer.message
         try:
             keep(edit)
@@ -273,7 +296,7 @@ class SettingsFile:
             return f"the file cannot be read: {error.strerror or error}"
         except ConfigError as error:
             self._signature = None
-            return f"the file cannot be used at the next start: {error.problems[0]}"
+            return f"the daemon could not start with the file as it is now: {error.problems[0]}"
         found = differences(self._in_force, self._written)
         told = [one.words(key) for key, one in found.items()]
         return listed(told, NAMED)
@@ -284,7 +307,7 @@ class SettingsFile:
             return
         about = self._file.stat()
         if not stat.S_ISREG(about.st_mode):
-            # Reading a pipe of this name would never end.
+            # Reading a pipe would never end.
             raise OSError(errno.EINVAL, "it is not a regular file")
         signature = about.st_ino, about.st_size, about.st_mtime_ns
         if signature != self._signature:
@@ -293,7 +316,7 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request for which the disk takes too long, or to one too many."""
+    """Return the answer to a request that took too long, or that was one too many."""
     why = (
         f"the disk did not answer within {PATIENCE_NS / NS_PER_S:g} s, or too many changes came at "
         "once"

@@ -1,8 +1,8 @@
 """Supervises the TLS gateway, a fleet's router or the web page, each a process of its own.
 
-The process sends a sign of life all the time. The supervisor ends a process that is silent, because
-it was stopped or hangs, and starts it again. If the gateway is a service, systemd does this for its
-own unit (`acsard-gateway.service`), with limits that only systemd can set.
+Each process sends signs of life to the supervisor. If a process is silent, because it was stopped
+or hangs, the supervisor ends it and starts it again. If the gateway is a service, systemd does this
+with the unit `acsard-gateway.service`, which has limits that only systemd can set.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from acsard.host.errors import Exit
 from acsard.host.threads import in_thread
 
 AGAIN_S = 0.1
-"""Seconds before a process that ended is started again."""
+"""Pause before a process that has ended is started again, s."""
 
 LATER_S = 2.0
-"""Seconds before a process that could not start is started again."""
+"""Pause before a process that could not be started is tried again, s."""
 
 
 class Kind(Struct, frozen=True):
@@ -30,24 +30,25 @@ class Kind(Struct, frozen=True):
     name: str
     ended: EventName
     final: frozenset[int] = frozenset()
-    """Exit codes after which it is not started again."""
+    """Exit codes after which the process is not started again."""
     again_s: float = AGAIN_S
-    """Seconds before it is started again."""
+    """Pause before the process is started again, s."""
     final_at_first: frozenset[int] = frozenset()
-    """Exit codes that are final for the first process only. A later one may have met files that a
-    person was changing."""
+    """Exit codes that are final for the first process only. A later process may have read files
+    while a person was changing them."""
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
-"""The gateway is always started again: the robot drives on, and an operator may fix its files
-meanwhile."""
+"""The TLS gateway. It is always started again, because the robot drives on and an operator may fix
+the gateway's files meanwhile."""
 
 ROUTER = Kind(
     "the router",
     "router_ended",
     final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
 )
-"""A fleet must not lose its router because its files were incomplete when it opened again."""
+"""The router of a fleet. After its first start, unusable files do not end it for good. They may
+only be incomplete at the moment of a restart, and a fleet must not lose its router for that."""
 
 PAGE = Kind(
     "the robot's page",
@@ -55,15 +56,17 @@ PAGE = Kind(
     frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
     LATER_S,
 )
-"""A page that keeps failing must take no time from the robot. It reports itself why it ends."""
+"""The web page. Its pause before a restart is longer, because a page that keeps failing must not
+take processor time from the robot. The page's process itself reports why it ends."""
 
 
 async def keep_running(
     words: Sequence[str], log: Callable[[Event], None], kind: Kind = GATEWAY
 ) -> int:
-    """Run `acsard` with these arguments ("gateway", ...), again whenever it ends, until cancelled.
+    """Run `acsard` with the arguments `words`, and start it again when it ends, until cancelled.
 
-    Return an exit code after which it must not be started again.
+    Return the exit code if it is one after which `kind` is not started again. `log` gets an event
+    for each restart.
     """
     final = kind.final | kind.final_at_first
     while True:
@@ -71,7 +74,8 @@ async def keep_running(
         try:
             code = await in_thread(child.run, None)
             why = child.silent or how_it_ended(code)
-        except (OSError, RuntimeError) as error:  # no room for a process or a thread
+        # The system could not start another process or thread.
+        except (OSError, RuntimeError) as error:
             code, why = Exit.USAGE, f"could not be started ({error})"
         else:
             if code in final:

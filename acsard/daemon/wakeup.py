@@ -1,15 +1,15 @@
-"""Runs a control step for each of these events, directly where the event loop learns of it.
+"""Runs a control step for each of these events, directly in the event loop's callback.
 
-- period: a period has ended. Missed periods are counted and never run in a burst.
+- period: a period has ended. Missed periods are counted, but get no steps of their own.
 - bytes: the port has read data or was lost.
-- retry: a line with a new command may go now (`pacing.py`).
-- command: the bus has a sample that may be a command, and its line could go at once (`pacing.py`).
-  Otherwise the next period takes it.
-- stop: the bus has a stop. It gets a step whatever the pace, but a flood of stops does not get a
-  step for each.
+- retry: a line with a new command may be written now (`pacing.py`).
+- command: the bus has a sample that may be a command, and `pacing.py` permits an early line.
+  Otherwise the next period processes the command.
+- stop: the bus has a stop. It gets a step even if `pacing.py` permits no early line. In a flood of
+  stops, not every stop gets a step of its own.
 - signal: the shutdown begins.
 
-Waking a task instead would cost another round of the event loop each time.
+Waking a task for the step would cost another round of the event loop each time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class _Timer:
         self._timer.close()
 
     def _expire(self) -> None:
-        # Without an expiration the timer was set again after it went off.
+        # If there is no expiration, the timer was set again after it had expired.
         if self._timer.expirations():
             self._ring()
 
@@ -49,28 +49,32 @@ class _Timer:
 
 
 class Alarm(_Timer):
-    """A timer that calls `wake` once, at a time that may be set again and again."""
+    """A timer that calls `wake` once, at a time that can be changed."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         super().__init__(wake)
         self._at_ns: int | None = None
 
     def set(self, at_ns: int | None) -> None:
-        """Wake at monotonic `at_ns`.
+        """Call `wake` at monotonic `at_ns`.
 
-        With None nothing is set, but an earlier setting still goes off.
+        With None, nothing new is set. An earlier setting stays in force.
         """
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
         self._at_ns = at_ns
 
     def _ring(self) -> None:
-        self._at_ns = None  # it may have gone off early and be set again for the same time
+        # The timer may have expired early. Then `set` must accept the same time again.
+        self._at_ns = None
         super()._ring()
 
 
 class Ticker(_Timer):
-    """A timer that wakes every period while entered; `take` returns the ended periods."""
+    """A timer that calls `wake` at the end of every period, while its context is entered.
+
+    `take` returns the periods that have ended.
+    """
 
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)
@@ -79,16 +83,16 @@ class Ticker(_Timer):
         self._due_ns = 0
 
     def start(self, now_ns: int) -> None:
-        """Start; the first period ends one period from now."""
+        """Start the timer. The first period ends one period after monotonic `now_ns`."""
         self._due_ns = now_ns + self._period_ns
         self._timer.set(self._due_ns)
 
     def take(self, now_ns: int) -> Period:
-        """Return the periods that have ended by `now_ns` since the last call."""
+        """Return the periods that have ended by monotonic `now_ns` since the last call."""
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
-        # This uses the daemon's clock. While NTP slews the timer's clock, the timer goes off up to
-        # a tenth of a period early.
+        # `now_ns` is from the daemon's clock. NTP may slew the timer's clock, and the timer then
+        # expires up to a tenth of a period early.
         early_ns = self._period_ns // 10 if self._rang else 0
         expired = max(0, (now_ns - self._due_ns + early_ns) // self._period_ns + 1)
         due_ns = self._due_ns
@@ -106,17 +110,17 @@ class Next(Struct, frozen=True):
     """The events to wait for after a step, besides period, bytes, stop and signal."""
 
     listens: bool
-    """Whether a command is worth a step of its own."""
+    """Whether a command gets a step of its own."""
     retry_ns: int | None
-    """Monotonic time of the next step for a waiting command, None if none waits."""
+    """Monotonic time of the next step for a waiting command, ns; None if no command waits."""
     period_ended: bool = True
-    """Whether a stop may cause a step again."""
+    """Whether a period has ended in the step. If so, the next stop gets a step of its own."""
 
 
 class Wakeup:
     """The wake-up of the control loop.
 
-    A call runs a step at once. A call during a step runs another step after it.
+    Calling this object runs a step at once. A call during a step runs another step after it.
     """
 
     def __init__(self) -> None:
@@ -134,9 +138,9 @@ class Wakeup:
             self._run(self._step, self._over)
 
     def command(self) -> None:
-        """Report a possible command, from any thread.
+        """Report a sample that may be a command, from any thread.
 
-        It wakes the loop once until a step listens again.
+        It wakes the loop if the last step listens (`Next.listens`), but only once per such step.
         """
         self._heard = True
         if self._listens:
@@ -144,7 +148,10 @@ class Wakeup:
             self._from_thread()
 
     def stop(self) -> None:
-        """Report a stop, from any thread."""
+        """Report a stop, from any thread.
+
+        Further stops do not wake the loop until a step has ended a period or listens for commands.
+        """
         if not self._stop_told:
             self._stop_told = True
             self._from_thread()
@@ -156,7 +163,7 @@ class Wakeup:
             pass  # the event loop has closed, so nothing is left to wake
 
     async def run(self, step: Callable[[], Next | None]) -> None:
-        """Run `step` on every event until it returns None; raise the exceptions that it raises."""
+        """Run `step` on every event until it returns None. Raise any exception that it raises."""
         self._over = self._loop.create_future()
         with self._alarm:
             self._step = step
@@ -174,8 +181,7 @@ class Wakeup:
             else:
                 self._arm(then)
         except BaseException as error:  # noqa: BLE001
-            # The event loop would log the exception and go on, but a bug in a step must end the
-            # process.
+            # The event loop would only log the exception, but a bug in a step must end the process.
             over.set_exception(error)
         finally:
             self._stepping = False
@@ -187,5 +193,6 @@ class Wakeup:
         self._listens = then.listens
         if then.listens or then.period_ended:
             self._stop_told = False
-        if then.listens and self._heard:  # a command came during the step, perhaps too late for it
+        # A command came during the step, perhaps too late to be part of it.
+        if then.listens and self._heard:
             self._listens, self._again = False, True

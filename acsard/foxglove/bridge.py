@@ -39,11 +39,11 @@ from acsard.foxglove.server import (
 from acsard.host import clock
 
 GONE = "daemon"
-"""Id of the status message that the daemon is gone."""
+"""Id of the status message which says that the daemon is gone."""
 
 
 class Bridge:
-    """One robot and its viewers."""
+    """Connects one robot to its viewers."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Bridge:
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
         self._deaf = facts.deaf
-        """Reason why no commands can be shown; "" once it is reported."""
+        """Reason why this program cannot show commands; "" if it can, or once this is reported."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
@@ -81,15 +81,15 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
-        """Run rounds until `end` is called; raise the error that ended the sending thread."""
+        """Run the main loop until `end` is called; raise the error if the sending thread dies."""
         dead = self._drives.outbox.dead
         while not self._ended.is_set():
             if dead.done():
                 dead.result()
             self._wake.wait(0.5)
-            # Time to gather messages before a round. A screen shows 60 frames a second, and
+            # Wait, so that messages gather before a round. A screen shows 60 frames a second, and
             # gathering for less than one frame makes the rounds a third cheaper. Commands do not
-            # wait for it.
+            # wait for this loop.
             time.sleep(0.015)
             self._wake.clear()
             self._round()
@@ -100,12 +100,12 @@ class Bridge:
         self._wake.set()
 
     def close(self) -> None:
-        """Release the robot first, then stop the server."""
+        """Stop driving for all viewers first, then stop the server."""
         self._drives.end()
         self._server.stop()
 
     def _viewer(self, client: int) -> Client:
-        """Return a client that sends commands for one viewer, under a sender name of its own."""
+        """Return a client that sends the commands of viewer `client` under its own sender name."""
         name = self._robot.sender.rpartition("/")[0]
         return self._robot.like(self._id, f"{name}/{client}")
 
@@ -172,7 +172,10 @@ class Bridge:
                 self._watch.look(now)
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Report to each viewer once why its commands do not drive. Withdraw the report later."""
+        """Report once for each viewer why the robot does not follow its commands.
+
+        `driving` has the viewers that request a speed. A report is withdrawn when its reason ends.
+        """
         now_ns = clock.mono_ns()
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()

@@ -1,8 +1,9 @@
 """Drives the robot from a viewer's panel. Each viewer is a sender of its own, under the daemon's
 rules.
 
-A panel repeats its command while a button is held and is silent after the release, and few of its
-messages have a stamp. Therefore a zero goes first after a silence, and a burst after it is dropped.
+A panel repeats its command while a button is held, and is silent after the release. Few of its
+messages have a stamp. Therefore a zero command is sent first after a silence, and a burst of
+commands that follows the silence is dropped.
 """
 
 from __future__ import annotations
@@ -24,16 +25,19 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""Thresholds for a panel that publishes too seldom: this many messages in a row after a silence of
-the commander, none longer than `SLOW_NS`."""
+"""Thresholds for a panel that publishes too seldom: `SLOW_TIMES` messages in a row that each follow
+a silence of at most `SLOW_NS`."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
-"""Decoder for twists only. They depend on neither joints nor wheels, so the defaults are
-sufficient."""
+"""Decoder for twists only. Twists depend on neither joints nor wheels, so the default configuration
+is sufficient."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
-    """Return the Zenoh encoding of a channel. Raises `DecodeError` if it cannot carry twists."""
+    """Return the Zenoh encoding for a channel that a viewer advertised.
+
+    Raises `DecodeError` if the channel cannot carry twists.
+    """
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
     if full not in (TWISTS[0], STAMPED_TWISTS[0]):
@@ -46,9 +50,9 @@ def encoding_of(encoding: str, schema_name: str) -> str:
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
-    """Return the twist and the stamp of a message, which is accepted or refused as a whole.
+    """Return the twist and the stamp of a message in this Zenoh encoding.
 
-    Raises `DecodeError`.
+    Raises `DecodeError` if any part of the message is refused.
     """
     found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)
@@ -65,9 +69,10 @@ class Viewer:
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
-        """Take the silence before a message, ns, or None if it was too short to count.
+        """Record the silence before a message, and return whether messages arrive too seldom.
 
-        Return whether messages come so seldom that the robot stops in between.
+        If they do, the robot stops between them. `silence_ns` is None if the silence was shorter
+        than `commander.SILENCE_NS`.
         """
         slow = silence_ns is not None and silence_ns <= SLOW_NS
         self._slow = self._slow + 1 if slow else 0
@@ -75,7 +80,7 @@ class Viewer:
 
 
 class Drives:
-    """All viewers that publish."""
+    """The viewers that publish commands, and the thread that sends these to the robot."""
 
     def __init__(
         self, robot_of: Callable[[int], Client], topic: str, notices: Notices, forbidden: str
@@ -86,14 +91,14 @@ class Drives:
         self._lock = Lock()
         self.outbox = Outbox()
         self.timeout_s = LONGEST_S
-        """Timeout of the source as which viewers drive, s."""
+        """Timeout of the command source under which viewers drive, s."""
 
     # Called by the server's threads.
 
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a channel. If it cannot drive, the viewer learns why when it publishes."""
+        """Register a viewer's channel. If it cannot drive, the reason is reported on publishing."""
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: drive on {self.topic}"
@@ -110,7 +115,7 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """Take a message that a viewer published."""
+        """Queue the command that a viewer published, or report why it cannot drive."""
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
         if viewer is None or not encoding:
@@ -128,7 +133,7 @@ class Drives:
         robot = viewer.robot
         with self._lock:
             if self._viewers.get(client) is not viewer:
-                return  # it has left, and its last zero is on its way
+                return  # the viewer has left, and its final zero command is queued
             silence_ns = self.outbox.take(
                 viewer.commander, lambda due: self._send(robot, due), wished
             )
@@ -141,7 +146,10 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Release the robot, because the viewer closed this channel or disconnected."""
+        """Remove a channel that its viewer has closed, also by disconnecting.
+
+        If the robot may still follow this viewer, send a zero command.
+        """
         with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:
@@ -155,14 +163,14 @@ class Drives:
     # Called by the main thread.
 
     def driving(self) -> dict[int, Client]:
-        """Return the viewers that currently ask for a speed, with their clients."""
+        """Return the clients of the viewers that currently request a speed, by viewer id."""
         now_ns = clock.mono_ns()
         with self._lock:
             viewers = self._viewers.items()
             return {one: it.robot for one, it in viewers if it.commander.drives(now_ns)}
 
     def end(self) -> None:
-        """Send one zero for each viewer that drives, then stop the sending thread."""
+        """Send a zero command for each viewer that drives, then stop the sending thread."""
         with self._lock:
             for viewer in self._viewers.values():
                 self.outbox.release(viewer.commander, self.timeout_s)

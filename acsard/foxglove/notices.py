@@ -1,4 +1,4 @@
-"""Messages to the viewers: as status messages, on the topic `log`, and on the terminal.
+"""Sends messages to the viewers as status messages and on the topic `log`, and to the terminal.
 
 `Objections` decides when a viewer learns why its commands do not drive.
 """
@@ -27,10 +27,10 @@ STATUS: dict[Level, StatusLevel] = {
 }
 
 AGAIN = Rate(0.5)
-"""Rate of the notices with the same text: one in two seconds."""
+"""Limit on the rate of notices with the same text: one in two seconds."""
 
 WAITING = 100
-"""Maximum number of waiting notices; the oldest are dropped."""
+"""Maximum number of waiting notices. If there are more, the oldest are dropped."""
 
 
 class Notice(Struct, frozen=True):
@@ -59,7 +59,8 @@ class Notices:
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
         """Queue a message to all viewers.
 
-        A repeated text is dropped unless it is a lasting status.
+        `name` is the subject, for the topic `log`. `stays` is the id of a lasting status, or "". A
+        text that repeats too soon (`AGAIN`) is dropped unless it is a lasting status.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -72,7 +73,10 @@ class Notices:
         self._waiting.put(Notice("info", "", "", stays))
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
-        """Send the waiting notices. With `newcomers`, send all lasting statuses again first."""
+        """Send the waiting notices; `log` publishes each of them on the topic `log`.
+
+        With `newcomers`, there are new viewers, so send all lasting statuses again first.
+        """
         if newcomers:
             for one in self._staying.values():
                 server.publish_status(one.text, STATUS[one.level], one.stays)

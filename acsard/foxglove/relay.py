@@ -35,7 +35,7 @@ EVENTS = "events"
 
 
 class News:
-    """The daemon's events as log lines, each of them once."""
+    """Converts the daemon's events to log lines, each event once."""
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
@@ -74,17 +74,18 @@ class Way(Struct, frozen=True):
     """How the daemon interprets samples on one key of the bus."""
 
     native: str
-    """The native key below the robot's id that the key stands for; "*" is the name of a
-    certificate."""
+    """The native key, below the robot's id, that has the same meaning. "*" in it stands for the
+    name of a certificate."""
     encoding: str = ""
-    """Encoding of samples that do not name one."""
+    """Encoding of all samples on the key; "" if each sample names its own."""
     via: Via = "native"
 
 
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
-    """Return each key on which this source accepts commands: twists, wheel speeds and the ROS keys.
+    """Return a `Way` for each key on which the command source `source` accepts commands.
 
-    `key_of` returns the full key for a key below the robot's id.
+    They are the keys of twists and wheel speeds, and the keys of ROS. `key_of` returns the full key
+    for a key below the robot's id.
     """
     native = source_keys([source])
     found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
@@ -102,7 +103,7 @@ class Reader:
         self._frame = config.odometry.base_frame
 
     def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
-        """Return the twist of a command that arrived at `wall_ns` (wall clock).
+        """Return the twist of a command that arrived at `wall_ns`, ns on the wall clock.
 
         Raises `DecodeError`.
         """
@@ -125,7 +126,7 @@ class Commanders:
         self._heard: dict[str, _Heard] = {}
 
     def use(self, facts: Facts) -> None:
-        """Use the configuration and sources of this robot."""
+        """Use the configuration and the sources in `facts` from now on."""
         ros, self._deaf = facts.config.ros, bool(facts.deaf)
         self._reader = Reader(facts.config)
         for source in facts.sources:
@@ -139,7 +140,7 @@ class Commanders:
         return self._ways.keys()
 
     def follow(self, topics: Collection[str]) -> None:
-        """Subscribe to these topics only, and to none if this program cannot receive commands."""
+        """Receive the commands of these topics only, or none if this program may receive none."""
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
             self._heard.pop(topic).undeclare()
@@ -169,7 +170,7 @@ class _Heard:
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
     ) -> None:
         self._ways = by_key
-        # About one second of the highest accepted rate; the oldest are dropped.
+        # About one second of commands at the highest accepted rate. The oldest are dropped.
         self._box = Mailbox[tuple[Arrival, int]](100, wake)
         handler = zenoh.handlers.Callback(self._take)
         self._declared = [session.declare_subscriber(key, handler) for key in by_key]
@@ -198,7 +199,7 @@ class _Heard:
         self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """Return the commands since the last call, with their wall-clock arrival times in ns."""
+        """Return the commands since the last call, with their arrival times, ns, wall clock."""
         return self._box.take()
 
     def undeclare(self) -> None:
@@ -299,7 +300,7 @@ class Relay:
             out.log(line)
 
     def _messages(self, key: str, samples: Subscription) -> list[msgspec.Struct]:
-        # A round takes a second's worth at 100 Hz.
+        # A round forwards at most this many messages of a key: those of one second at 100 Hz.
         held: deque[zenoh.Sample] = deque(maxlen=100)
         try:
             while (sample := samples.try_recv()) is not None:

@@ -32,7 +32,11 @@ class Facts(Struct, frozen=True):
     visible."""
 
     def rows(self) -> list[tuple[Channel, str]]:
-        """Return each channel with its source; a commander channel appears once for each source."""
+        """Return each published channel with its command source.
+
+        The channel `CMD_VEL_IN` appears once for each source. Every other channel has the source
+        "".
+        """
         found = []
         for row in published_channels(left_out(self.config)):
             names = self.sources if row is CMD_VEL_IN else ("",)
@@ -48,7 +52,8 @@ def key_of(row: Channel, source: str) -> str:
 def learn(robot: Client) -> Facts:
     """Query the robot for its configuration, its sources and the permissions of this client.
 
-    Raises the errors of `Client.get`, and `ReplyError` if its version differs.
+    Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable, for example
+    because the daemon has another version.
     """
     forbidden, role, deaf = "", "maintainer", ""
     if robot.where.tls:

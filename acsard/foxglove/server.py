@@ -1,7 +1,7 @@
 """The websocket server of foxglove-sdk: its callbacks, settings, services and its start.
 
 The library implements the protocol. The protocol has no authentication, so the subcommand
-(`cli/foxglove.py`) takes only an address of this machine. Viewers call the services in JSON, and
+(`cli/foxglove.py`) accepts only an address of this machine. Viewers call the services in JSON, and
 get the daemon's own replies.
 """
 
@@ -33,8 +33,8 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 
 POLL_NS = 5 * NS_PER_S
-"""Interval at which the settings are read while a viewer follows them, because other clients change
-them too."""
+"""Interval, ns, at which the settings are read while a viewer follows them, because other clients
+change them too."""
 
 
 class Shown:
@@ -70,7 +70,11 @@ class Shown:
 
 
 class Settings:
-    """The live settings. The server's threads query them; the main thread reads them again."""
+    """The settings that can be changed at run time.
+
+    The server's threads send them to viewers, and change them when a viewer asks for it. The main
+    thread updates them from the daemon.
+    """
 
     def __init__(self, robot: Robot, notices: Notices, tables: object) -> None:
         self._robot, self._notices = robot, notices
@@ -83,9 +87,9 @@ class Settings:
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
-        """Store the configuration and return the settings that changed.
+        """Store the configuration, and return the settings that changed.
 
-        `tables` is None if this program may not read the configuration.
+        `tables` has the configuration as plain tables. It is None if this program may not read it.
         """
         now = {} if tables is None else live_settings(tables)
         with self._lock:
@@ -95,7 +99,7 @@ class Settings:
         return news
 
     def get(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the settings with these names, or all, as last read."""
+        """Return the settings with these names, or all if `names` is empty, as last read."""
         with self._lock:
             self._asked = True
             return asked(self._known, names)
@@ -111,7 +115,7 @@ class Settings:
             self._followed.difference_update(names)
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Change settings, all or none, and return their values afterwards.
+        """Change all of these settings or none of them, and return their values afterwards.
 
         A refusal is reported to the viewers.
         """
@@ -144,7 +148,7 @@ class Settings:
 
 
 def live_settings(config: object) -> dict[str, Any]:
-    """Return the settings that can be changed at run time, by key, tuples as lists."""
+    """Return the settings that can be changed at run time, by key. Tuples become lists."""
     found = ((key, value) for key, value in flat(config) if live(key))
     return {key: list(value) if isinstance(value, tuple) else value for key, value in found}
 
@@ -212,7 +216,8 @@ def start(
     *,
     acts: bool,
 ) -> WebSocketServer:
-    """Start to listen. `acts` says whether viewers may send commands and change settings.
+    """Start the server at `address`, a host and a port. `acts` says whether viewers may
+    send commands and change settings.
 
     Raises `InUseError` if the port is taken, and `NotPermittedError` if the port needs root.
     """
@@ -245,14 +250,14 @@ def start(
 
 
 class Refusals(logging.Handler):
-    """Reports viewers that the library turned away, and ignores its other errors."""
+    """Log handler that reports the clients which the library refuses, and ignores other errors."""
 
     def __init__(self, notices: Notices) -> None:
         super().__init__(logging.ERROR)
         self._notices = notices
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Take a line of the library's log."""
+        """Report to the viewers if a line of the library's log says that a client was refused."""
         if "handshake failed" in record.getMessage():
             self._notices.say(
                 "warning",
@@ -263,7 +268,8 @@ class Refusals(logging.Handler):
 
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
-"""Services that are offered; `set` is left out because viewers set parameters instead."""
+"""Services that are offered with `--drive`. `set` is left out, because viewers set parameters
+instead."""
 
 STOPS: tuple[Verb, ...] = ("stop",)
 """Services that are offered without `--drive`. Any web page in a local browser can connect, and the
@@ -273,7 +279,7 @@ NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "propertie
 
 
 def services(robot: Robot, ros: RosConfig, verbs: Iterable[Verb]) -> list[foxglove.Service]:
-    """Return these services of the robot under their ROS names, for example `/acsard/stop`."""
+    """Return the services `verbs` of the robot under their ROS names, such as `/acsard/stop`."""
     return [_service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in verbs]
 
 
@@ -292,7 +298,7 @@ def _service(robot: Robot, verb: Verb, name: str) -> foxglove.Service:
 
 
 def called(robot: Robot, verb: Verb, payload: bytes) -> ServiceReply:
-    """Call a service. An error becomes a negative reply."""
+    """Call a service with a JSON payload. An error becomes a negative reply."""
     try:
         fields: dict[str, float] = {}
         if verb not in PLAIN_SERVICES:

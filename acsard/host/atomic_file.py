@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 NEW_MODE = 0o644
-"""Mode of a new file, unless another is given: the service's own user reads it."""
+"""Default mode of a new file. The service's own user must be able to read it."""
 
 
 def replace(
@@ -25,10 +25,11 @@ def replace(
     Args:
         file: The file. Other processes find the old one or the new one, never a part of it.
         content: The new content. Until its mode is set, only its owner can read it.
-        mode: The mode; by default that of the file before, or `NEW_MODE`.
-        owner: The user and the group. By default those before, if this process may set them.
+        mode: The mode. None keeps that of the old file, and gives a new file `NEW_MODE`.
+        owner: The user and the group. None keeps those of the old file, if this process may set
+            them.
         synced: True waits for the disk before the rename, so that a power cut leaves the old file
-            or the new one. After False a power cut may leave a part of the new one until `sync`.
+            or the new one. If False, a power cut before `sync` may leave a part of the new file.
     """
     kept = owner
     if file.exists():
@@ -45,8 +46,8 @@ def replace(
                 if kept:
                     os.fchown(new.fileno(), *kept)
             except PermissionError:
-                # The file of another user in a directory of ours becomes ours. Its group stays
-                # if we are in it.
+                # This process may not keep the other user as the owner, so its own user owns the
+                # new file. The group stays if this user is a member of it.
                 if owner or kept is None:
                     raise
                 with suppress(PermissionError):
@@ -60,7 +61,7 @@ def replace(
 
 
 def sync(path: Path) -> None:
-    """Wait until the disk has this file, or the names in this directory."""
+    """Wait until the disk has the content of this file, or the entries of this directory."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)

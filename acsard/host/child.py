@@ -1,11 +1,11 @@
-"""Processes that this program starts: how they start, are limited, show that they live, and end.
+"""Processes that this program starts: their start, limits, signs of life and end.
 
 Each child gets a session of its own, so that a Ctrl-C at the terminal reaches the parent alone,
 which then ends its children in its own way. A child does not outlive its parent.
 
 A `Child` and a `Parent` are the two ends of one socket, the child's standard input. The child
-writes a sign of life to it again and again, and ends when its parent closes it. The parent kills a
-child that falls silent.
+writes a sign of life to the socket again and again, and ends when its parent closes the other end.
+The parent kills a child that falls silent.
 """
 
 from __future__ import annotations
@@ -31,30 +31,38 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
-"""Variables that systemd sets for the parent. A child must not answer in the parent's name."""
+"""Variables that systemd sets for the parent. A child must not notify systemd in its name."""
 
 BEAT_S = 0.5
-"""Longest time between two looks for a sign of life, and between two signs, s."""
+"""Longest time between two signs of life of a child, and between two checks by its parent, s."""
 
 SILENT_NS = 3 * NS_PER_S
-"""Silence after which a child is killed. The gateway ends itself after a second without progress
-(`daemon/gateway/listener_process.py`); this limit is for a process that cannot even do that."""
+"""Silence after which a child is killed, ns.
+
+The gateway ends itself after a second without progress (`daemon/gateway/listener_process.py`). This
+limit is for a process that cannot even do that.
+"""
 
 START_NS = 15 * NS_PER_S
-"""Time for the first sign of life: the start of Python on a busy machine."""
+"""Longest wait for the first sign of life, ns. Python starts slowly on a busy machine."""
 
 
 class Silence:
-    """Judges again and again whether a peer has been silent for too long.
+    """Detector of a peer that has been silent for longer than `most_ns`, ns.
 
-    A machine or a CPU quota that stops this process too does not count as silence of the peer.
+    The machine or a CPU quota may stop both processes. Therefore at most 0.5 s of the time between
+    two calls of `too_long` is counted as silence.
     """
 
     def __init__(self, most_ns: int) -> None:
         self._most_ns, self._ns = most_ns, 0
 
     def too_long(self, heard: bool, passed_ns: int) -> bool:
-        """Return whether the silence exceeds `most_ns`, `passed_ns` after the last call."""
+        """Return whether the silence exceeds `most_ns`.
+
+        `heard` says whether the peer has given a sign of life since the last call, which was
+        `passed_ns` ago.
+        """
         self._ns = 0 if heard else self._ns + min(passed_ns, NS_PER_S // 2)
         return self._ns > self._most_ns
 
@@ -69,19 +77,19 @@ def acsard(*words: str) -> list[str]:
 
 
 def environment(hidden: Collection[str] = ()) -> dict[str, str]:
-    """Return the environment of a child, without the variables `hidden` and those of our unit."""
+    """Return the environment of a child, without the variables `hidden` and those in `OUR_UNIT`."""
     return {key: value for key, value in os.environ.items() if key not in (*OUR_UNIT, *hidden)}
 
 
 class Limits(Struct, frozen=True):
-    """Limits of a child whose work is less important than the robot's."""
+    """Nice value and data memory of a child whose work is less important than the robot's."""
 
     nice: int
     memory_bytes: int
 
 
 def limit(pid: int, limits: Limits) -> None:
-    """Set the priority and the data memory of a child; it is the first to go without memory."""
+    """Set the limits of a child, and let the kernel end it first when memory runs out."""
     try:
         with suppress(OSError):
             # When memory runs out, the kernel ends this child before any other process.
@@ -90,7 +98,7 @@ def limit(pid: int, limits: Limits) -> None:
         memory = limits.memory_bytes
         resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
     except ProcessLookupError:
-        pass  # it has ended already, and its output says why
+        pass  # the child has ended already, and its output says why
 
 
 def how_it_ended(code: int) -> str:
@@ -119,7 +127,8 @@ async def running(
 ) -> AsyncIterator[Process]:
     """Start a child in the event loop; kill it if it still runs at the end of the block.
 
-    Raises `OSError`.
+    `stdin`, `stdout` and `stderr` are as in `subprocess`. Raises `OSError` if the child cannot be
+    started.
     """
     child = await asyncio.create_subprocess_exec(
         *command,
@@ -140,25 +149,25 @@ async def running(
             # asyncio sees the end of a child only after the end of its output, and it stops
             # reading a pipe whose reader is behind.
             for output in (child.stdout, child.stderr):
-                with suppress(RuntimeError):  # somebody else reads this one
+                with suppress(RuntimeError):  # another task reads this output
                     await output.read() if output else b""
             await child.wait()
 
 
 class Child:
-    """One run of a child that ends with its standard input and is killed if it falls silent."""
+    """One run of a child, which ends with its standard input. It is killed if it falls silent."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._ours: socket.socket | None = None
         self._over = False
         self.silent = ""
-        """Why the child was killed, "" if it was not."""
+        """Why the child was killed, or "" if it was not killed."""
 
     def run(self) -> int:
         """Start the child, wait for its end and return its exit code; raise `OSError`.
 
-        All of this runs in one thread, so the thread ends together with the child.
+        This blocks its thread, so the thread ends together with the child.
         """
         ours, its = socket.socketpair()
         with ours:
@@ -199,14 +208,14 @@ class Child:
             try:
                 self._ours.shutdown(socket.SHUT_RDWR)
             except OSError:
-                pass  # it has ended, or its end of the socket is closed
+                pass  # the child has ended, or has closed its end of the socket
 
 
 # The child's side
 
 
 class Parent:
-    """The process at the other end of this one's standard input."""
+    """The process at the other end of this process's standard input, `fd`."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -228,12 +237,12 @@ class Parent:
         except BlockingIOError:
             return False
         except OSError:
-            return True  # the parent went before it had read all signs of life
+            return True  # the parent ended before it had read all signs of life
 
 
 def end_with_parent(number: signal.Signals) -> None:
-    """Ask the kernel for this signal when the thread that started this process ends.
+    """Let the kernel send this process a signal when the thread that started this process ends.
 
-    The child calls it. It then ends with its parent even if the parent crashes.
+    A child calls this function, so that it ends with its parent even if the parent crashes.
     """
     ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG in linux/prctl.h

@@ -3,7 +3,7 @@
 The monotonic clock is CLOCK_MONOTONIC_RAW. NTP slews CLOCK_MONOTONIC by up to 8 %, and with it
 every distance that is computed as speed times time, and every apparent delay of a command.
 
-An `Instant` is in whole us. Digits below that show only how long the reading took, and storing them
+An `Instant` is in whole us. Smaller digits only show how long the reading took, and storing them
 would make a recording twice as large.
 """
 
@@ -16,17 +16,23 @@ from functools import partial
 from acsard.core.values import Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
-"""Read the monotonic clock, ns. A dozen reads a period are too many for a Python wrapper."""
+"""Read the monotonic clock, ns.
+
+This is not a Python function, because the loop calls it about a dozen times in each period.
+"""
 
 
 def asleep_ns() -> int:
-    """Return how long this computer was suspended since its start, ns, while `mono_ns` stood."""
+    """Return how long this computer was suspended since its start, ns.
+
+    `mono_ns` does not advance in a suspend.
+    """
     awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
 
 def steady_ns() -> int:
-    """Return a time in ns that nobody adjusts and that goes on while this computer is suspended."""
+    """Return a time, ns, that is never adjusted and that also advances in a suspend."""
     return mono_ns() + asleep_ns()
 
 
@@ -34,7 +40,7 @@ NS_PER_US = 1000
 
 
 def now() -> Instant:
-    """Read both clocks as close together as possible."""
+    """Read the monotonic and the wall clock as close together as possible."""
     for _ in range(5):
         mono, wall = mono_ns(), time.time_ns()
         # Two readings take 1 us, unless another process gets the core between them.

@@ -22,7 +22,11 @@ PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
 
 def find(path: str | None) -> tuple[str, bytes]:
-    """Return the path and the content of the configuration, or ("built-in defaults", b"")."""
+    """Return the path and the content of the configuration file.
+
+    If `path` is None or "", the file is the one in $ACSARD_CONFIG, or else the first existing one
+    of `PLACES`. If there is no file, return ("built-in defaults", b"").
+    """
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
         try:
@@ -44,8 +48,8 @@ def find(path: str | None) -> tuple[str, bytes]:
 def writable(path: str | None) -> Path:
     """Return the file that --write changes.
 
-    Raises `MendableError` if it or the library tomlkit is missing, or if it is the reference file
-    of a clone of acsard.
+    Raises `MendableError` if the file or the library tomlkit is missing, or if the file is the
+    reference file of a clone of acsard.
     """
     require_tomlkit()
     where, text = find(path)
@@ -83,7 +87,8 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
     """Return the change that writes these settings into the file of a running daemon.
 
     Raises `MendableError` with the reason if the file is None, tracked by git or read-only, if the
-    library tomlkit is missing, or if the text before or after the change is no configuration.
+    library tomlkit is missing, or if the text before or after the change is not a valid
+    configuration.
     """
     if file is None:
         raise MendableError(
@@ -109,7 +114,7 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
 def keep(edit: Edit) -> None:
     """Write the change. It is computed again if another program has changed the file meanwhile.
 
-    Raises `MendableError` and leaves the file unchanged if that is impossible.
+    Raises `MendableError` and leaves the file unchanged if the change cannot be written.
     """
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
@@ -118,8 +123,8 @@ def keep(edit: Edit) -> None:
             _require_writable(place)
             if place.read_bytes() == edit.before:
                 replace(place, edit.after.encode())
-                # Without this a power cut may bring the old file back after the answer. Some file
-                # systems refuse it.
+                # Without this sync, a power cut may bring the old file back after the daemon has
+                # reported success. Some file systems refuse the sync.
                 with suppress(OSError):
                     sync(place.parent)
                 return
@@ -141,7 +146,10 @@ def _require_writable(place: Path) -> None:
 
 
 def is_tracked(place: Path) -> bool:
-    """Return whether git tracks the file at this resolved path, as far as git can say it."""
+    """Return whether git tracks the file at this resolved path.
+
+    If git cannot tell, only the reference file of a clone counts as tracked.
+    """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False
     # git refuses to read the repository of another user, whose configuration could make git run
@@ -176,8 +184,8 @@ def require_tomlkit() -> None:
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
     """Set keys in an `acsard.toml`, and return them.
 
-    `keys` may be a function that computes them from the configuration. Raises `MendableError` and
-    leaves the file unchanged if that is impossible. With `new` the file need not exist.
+    `keys` may be a function that computes them from the configuration. With `new` the file need not
+    exist. Raises `MendableError` and leaves the file unchanged if it cannot be changed.
     """
     try:
         place, text, given = _changed(file, keys, new)

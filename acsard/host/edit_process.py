@@ -1,8 +1,8 @@
 """Computes the changed text of an `acsard.toml` in a process of its own, for the daemon.
 
-The library needs a tenth of a second for a file like the reference. In a thread of the daemon it
-would hold the interpreter for half a millisecond again and again meanwhile: the control loop was up
-to 12 ms late, and missed 3 of 559 periods.
+The library tomlkit needs a tenth of a second for a file like the reference. In a thread of the
+daemon it would hold the interpreter again and again, for half a millisecond each time. In a
+measurement of that, the control loop was up to 12 ms late and missed 3 of 559 periods.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ class Result(Struct, frozen=True):
 
 
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text of a file with new values, as `edited` does, by another process.
+    """Return the text of a file with new values. Another process computes it with `edited`.
 
-    Raises `ValueError` with the reason if that is impossible, and `OSError` if no process starts.
+    Raises `ValueError` with the reason if the text cannot be changed, and `OSError` if no process
+    can be started.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.
@@ -66,9 +67,9 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
 
 def main() -> None:
     """Read a `Task` from standard input, and write a `Result` to standard output."""
-    # The unit of the service blocks this call.
+    # The unit of the service does not permit this call.
     with suppress(OSError):
-        # Everything of the robot comes first.
+        # All processes of the robot have priority over this one.
         os.nice(10)
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=Task)
     try:

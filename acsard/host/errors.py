@@ -2,8 +2,9 @@
 
 Each error is an `AcsardError` and also the built-in exception that Python uses for such a case, so
 either can be caught. The text says what is wrong and how to fix it. Each class has the exit code of
-a subcommand that ends with it. A `MendableError` itself is for what no other class names. Bugs are
-not among these errors, and neither are states of the robot, such as a lost port or a stale command.
+a subcommand that ends with it. `MendableError` itself is raised for problems that no other class
+describes. Bugs are not among these errors, and neither are states of the robot, such as a lost port
+or a stale command.
 """
 
 from __future__ import annotations

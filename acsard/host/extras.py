@@ -1,4 +1,4 @@
-"""Tells how to install an extra of `pyproject.toml`, as acsard is not on a package index."""
+"""Finds the command that installs an extra of `pyproject.toml`. No package index has acsard."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Extra = Literal["foxglove", "report", "shell", "tls", "web", "write"]
 
 
 def install(extra: Extra) -> str:
-    """Return the command to type, as an error about a missing library shows it."""
+    """Return the shell command that installs an extra, for an error about a missing library."""
     try:
         wanted = wanted_by(distribution("acsard"), extra)
     # acsard runs from a directory and was never installed.
@@ -33,10 +33,10 @@ def missing(library: str, extra: Extra) -> MendableError:
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
-    """Return the arguments of pip for an extra.
+    """Return the arguments with which `pip install` installs an extra.
 
-    They name the directory that acsard was installed from, with the extra, or only the libraries if
-    that directory is gone.
+    They name the directory from which `installed` was installed, with the extra. If that directory
+    no longer exists, they name only the libraries of the extra.
     """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))

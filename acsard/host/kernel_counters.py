@@ -20,14 +20,16 @@ from acsard.host import clock
 
 SLOWED_BITS = 0b1110
 """Bits of `get_throttled`: the clock is limited, the processor is throttled, the soft temperature
-limit is active. All of them are about the present."""
+limit is active. Each bit describes the present state, not the past."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
-"""Drivers whose governor `powersave` chooses the clock by the load. That of every other driver
-keeps the lowest clock."""
+"""Drivers whose governor `powersave` chooses the processor's clock by the load.
+
+With every other driver, this governor keeps the lowest clock.
+"""
 
 COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
-"""Beginnings of the types of cooling devices that slow a processor down."""
+"""Prefixes of the types of cooling devices that slow a processor down."""
 
 
 class SlowClock(Struct, frozen=True):
@@ -59,14 +61,14 @@ class Reading(Struct, frozen=True, omit_defaults=True):
     disk_ns: int = 0
     """Time in which a program waited for a disk."""
     own_disk_ns: int = 0
-    """Time in which the first thread of the process waited for a disk. Most kernels do not measure
-    it unless the setting kernel.task_delayacct asks for it."""
+    """Time in which the first thread of this process waited for a disk. Most kernels measure it
+    only if the setting kernel.task_delayacct is on."""
     own_bytes: int = 0
-    """Number of bytes that the first thread of the process read from disks and wrote to them."""
+    """Number of bytes that the first thread of this process read from disks and wrote to them."""
     major_faults: int = 0
-    """Number of pages that the process had to read from a disk before it could go on."""
+    """Number of memory pages that this process had to read from a disk before it could continue."""
     quota_ns: int = 0
-    """Time in which the process's cgroup had used up its processor time."""
+    """Time in which the cgroup of this process had used up its processor time."""
     conditions: Conditions = Conditions()
 
 
@@ -100,20 +102,20 @@ def scheduled(text: bytes) -> Scheduled:
 
 
 def steal(text: str, tick_ns: int) -> tuple[int, ...]:
-    """Decode the steal time of each processor from `/proc/stat`."""
+    """Decode the steal time of each processor from `/proc/stat`, ns. `tick_ns` is a clock tick."""
     return tuple([int(row[8]) * tick_ns for row in _processors(text) if len(row) > 8])
 
 
 def iowait(text: str, tick_ns: int) -> int:
     """Decode from `/proc/stat` the time in which a processor was idle and a program waited for I/O.
 
-    The processors are not added up.
+    Return the longest such time of a single processor, ns. `tick_ns` is a clock tick.
     """
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 
 
 def _processors(text: str) -> list[list[str]]:
-    """Return the words of the line of each processor in `/proc/stat`, without that of all."""
+    """Return the words of each processor's line in `/proc/stat`, without the line of the sums."""
     rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
     return [row for row in rows if row[0] != "cpu"]
 
@@ -152,7 +154,7 @@ def fields(text: str) -> list[str]:
 
 
 def program(text: str, tick_ns: int) -> Program:
-    """Decode `/proc/PID/stat`. Raise `ValueError` or `IndexError` if it is not such a text."""
+    """Decode `/proc/PID/stat`. Raise `ValueError` or `IndexError` if the text has another form."""
     rest = fields(text)
     before = text.rpartition(")")[0]
     pid, _, name = before.partition(" (")
@@ -163,10 +165,11 @@ def program(text: str, tick_ns: int) -> Program:
 def busiest(
     before: Iterable[Program], after: Iterable[Program], within_ns: int, priority: int
 ) -> Program | None:
-    """Return the process that ran most between two looks, with the time it ran in between.
+    """Return the process that ran most between two readings, with the time that it ran in between.
 
-    Return None if it used less than a quarter of a processor. A process that a thread of this
-    `priority` displaces does not count.
+    `before` and `after` are the two readings, `within_ns` apart. Processes that a thread of this
+    `priority` displaces are left out. Return None if no other process used a quarter of a
+    processor.
     """
     # A process that is 9 nicer can delay the thread noticeably. At 10 more the kernel gives it a
     # tenth of the thread's weight.
@@ -226,7 +229,7 @@ class Kernel:
         self._quota = next((path for path in self._cgroups() if path.is_file()), None)
 
     def read(self, conditions: Conditions | None = None) -> Reading:
-        """Read all counters, and the conditions unless the caller has them."""
+        """Read all counters. Read the conditions too, unless the caller passes them."""
         stat = _text(self._proc / "stat")
         own = fields(_text(self._proc / "self/stat"))
         pressure = "" if self._pressure is None else _text(self._pressure)
@@ -260,10 +263,10 @@ class Kernel:
         )
 
     def busiest(self, seconds: float) -> Program | None:
-        """Look at all processes twice, `seconds` apart, and return the busiest one.
+        """Read the times of all processes twice, `seconds` apart, and return the busiest process.
 
-        Return None if no process uses a quarter of a processor or has enough priority to delay this
-        one, and if the kernel shows this user only its own processes.
+        Return None if no process uses a quarter of a processor and has enough priority to delay
+        this process. The result is None, too, if the kernel hides the processes of other users.
         """
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)

@@ -33,7 +33,7 @@ if sys.modules["rich"] is None:
     del sys.modules["rich"]
 
 _PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}
-"""Priorities of syslog."""
+"""Priority of each log level in syslog."""
 
 
 def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
@@ -65,7 +65,10 @@ def _message(line: Mapping[str, Any]) -> str:
 
 
 class JournalStream(io.StringIO):
-    """Stream that sends each write as a datagram. Raises `OSError` without a journal."""
+    """Stream that sends each written text to the journal as a datagram.
+
+    Creating it raises `OSError` if there is no journal.
+    """
 
     def __init__(self, path: str = "/run/systemd/journal/socket") -> None:
         super().__init__()
@@ -84,15 +87,16 @@ class JournalStream(io.StringIO):
 Form = Literal["console", "json", "logfmt", "journal"]
 
 MAX_VALUE = 500
-"""Largest number of characters of one value, which may be a stranger's text."""
+"""Largest number of characters of a logged value, which may be a text from another program."""
 
 
 class Writer:
-    """Stream that never blocks and never raises."""
+    """Stream whose `write` never blocks and never raises: a thread writes the queued lines."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        # The daemon logs less in a minute, even with all faults at once (`event_throttle.py`).
+        # The daemon logs fewer lines in a minute, even with all faults at once
+        # (`event_throttle.py`).
         self._lines: queue.Queue[str | None] = queue.Queue(1000)
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
@@ -101,7 +105,7 @@ class Writer:
         try:
             self._lines.put_nowait(text)
         except queue.Full:
-            # The reader is stuck, and the robot must not wait for it.
+            # The thread cannot write any more. Drop the line, because the robot must not wait.
             pass
         return len(text)
 
@@ -158,7 +162,7 @@ class Log:
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
-        """Log from this level on. The destination and the format stay as they were at the start."""
+        """Use the level of these settings. Keep the destination and the format of the start."""
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[
@@ -175,7 +179,7 @@ class Log:
         )
 
     def event(self, event: Event) -> None:
-        """Log an event of the core or of another module."""
+        """Log an event, with its sender and its count if it has them."""
         fields: dict[str, object] = {"text": event.text}
         if event.by:
             fields["by"] = event.by

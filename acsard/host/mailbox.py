@@ -22,23 +22,26 @@ T = TypeVar("T")
 
 
 class Bell:
-    """Wakes one thread. Any number of rings before a wait end that wait at once."""
+    """Signal that wakes one waiting thread.
+
+    If `ring` was called before `wait`, once or several times, that wait ends at once.
+    """
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._lock.acquire()
 
     def ring(self) -> None:
-        """End the present wait, or else the next one. Any thread may call this."""
+        """End the present wait, or the next one if no thread waits. Any thread may call this."""
         # Releasing a lock is the cheapest way to wake a thread.
         if self._lock.locked():
             try:
                 self._lock.release()
             except RuntimeError:
-                pass  # another thread rang at the same moment
+                pass  # another thread called this method at the same moment
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait for a ring, at most `seconds`; return False if none came."""
+        """Wait until `ring` is called. Return False after `seconds`; None waits for ever."""
         return self._lock.acquire(timeout=-1 if seconds is None else max(0.0, seconds))
 
 
@@ -54,22 +57,25 @@ class Mailbox(Generic[T]):
                 default ends the reader's `wait`.
         """
         self.waiting: deque[T] = deque(maxlen=most)
-        """The items that wait, the oldest on the left. Only the reader may take from it directly.
-        In each step the daemon looks at about forty mailboxes, too many for a method call each."""
+        """The items that wait, the oldest on the left. Only the reader may remove items from it.
+
+        It is public because the daemon checks about forty mailboxes in each step, which are too
+        many for a method call each.
+        """
         self.lost = 0
-        """Number of items that newer ones have displaced. It is exact for a single writer."""
+        """Number of items that newer ones have displaced. It is exact if there is one writer."""
         self._bell = Bell()
         self.wake = wake or self._bell.ring
         """Wakes the reader. A writer that uses `store` calls it afterwards."""
         self.closed = False
-        """Whether the last item has arrived. It may still wait."""
+        """Whether no more items will arrive. Earlier items may still wait."""
 
     # The writers' side
 
     def store(self, item: T) -> bool:
-        """Store an item and wake nobody; return False if the oldest one was dropped for it.
+        """Store an item without waking the reader; return False if the oldest item was dropped.
 
-        The answer is exact for a single writer.
+        The result is exact if there is one writer.
         """
         items = self.waiting
         room = len(items) < items.maxlen  # type: ignore[operator]
@@ -79,20 +85,23 @@ class Mailbox(Generic[T]):
         return room
 
     def put(self, item: T) -> bool:
-        """Store an item and wake the reader; return False if the oldest one was dropped for it."""
+        """Store an item and wake the reader; return False if the oldest item was dropped for it."""
         room = self.store(item)
         self.wake()
         return room
 
     def close(self) -> None:
-        """Mark the end and wake the reader, which still gets the items that wait."""
+        """Mark the end of the items, and wake the reader, which still gets the items that wait."""
         self.closed = True
         self.wake()
 
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Call `wake` from now on instead of ending `wait`, and at once if an item waits."""
+        """Let writers call `wake` from now on, instead of ending `wait`.
+
+        It is called at once if an item waits or the mailbox is closed.
+        """
         self.wake = wake
         if self.waiting or self.closed:
             wake()
@@ -103,12 +112,12 @@ class Mailbox(Generic[T]):
         return self.waiting.popleft() if self.waiting else None
 
     def take(self) -> list[T]:
-        """Remove and return the items that wait now. A flood cannot prolong this."""
+        """Remove and return the items that wait now. Items that arrive meanwhile stay for later."""
         items = self.waiting
         return [items.popleft() for _ in range(len(items))]
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait until there is an item or the end; return False if `seconds` pass before."""
+        """Wait for an item or for `close`. Return False after `seconds`; None waits for ever."""
         began_ns, left = clock.mono_ns(), seconds
         while not (self.waiting or self.closed):
             if left is not None and left <= 0:

@@ -28,7 +28,7 @@ def own_name() -> str:
 
 
 def sender_id(name: str, secret: str = "") -> str:
-    """Return a sender id of this name, `NAME/SECRET`, with a new secret unless one is given."""
+    """Return a sender id `NAME/SECRET`. If `secret` is "", it has a new secret."""
     return f"{name[:MAX_NAME]}/{secret or new_secret()}"
 
 

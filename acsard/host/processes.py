@@ -1,7 +1,7 @@
 """Finds the processes that have a device open, and runs a command.
 
-Procfs shows the open files, and no file is opened. Only files below a /dev directory are examined:
-a file on a network disk that hangs would block this process.
+Procfs shows the open files of a process, so the module opens no device. It examines only files
+below a /dev directory, because a file on a network disk that hangs would block this process.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def holders(path: str) -> Iterator[Holder]:
 
 
 def holder_of(path: str) -> Holder | None:
-    """Return the process that keeps this one out of a device.
+    """Return the process that prevents this process from using a device, or None.
 
-    It is the process with a lock on the device, else one that has it open, or None.
+    It is a process with a lock on the device, or else one that has the device open.
     """
     found = None
     for one in _having_open(path):
@@ -172,5 +172,8 @@ def _comm(process: Path) -> str:
 
 
 def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end; raise `OSError` or `subprocess.TimeoutExpired`."""
+    """Run a command and wait for its end.
+
+    Raises `OSError` if it cannot be started, and `subprocess.TimeoutExpired` after `within_s` s.
+    """
     return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)

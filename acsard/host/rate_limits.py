@@ -1,7 +1,8 @@
 """Limits how often something may happen, and how many of a kind there may be. This module is pure.
 
-The rates are token buckets: per name (an address, a token, a text), and for all names together. A
-bucket for one unit at a time sets a shortest interval. The places are counted per name and in all.
+`Buckets` limits rates by token buckets: one per name (an address, a token, a text), and one for all
+names together. A bucket with room for one unit enforces a shortest interval. `Places` limits how
+many things exist at the same time, per name and in all.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from acsard.core.values import NS_PER_S
 
 
 class Rate(NamedTuple):
-    """A sustained rate with a burst allowance."""
+    """A sustained rate, `hz` units per second, with a burst allowance."""
 
     hz: float
     most: float = 1.0
@@ -23,20 +24,20 @@ class Rate(NamedTuple):
 
 
 class Bucket:
-    """A token bucket, full at first."""
+    """A token bucket. It is full at first. All times are in ns on the monotonic clock."""
 
     def __init__(self, rate: Rate) -> None:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
         self._paid_ns = 0
-        """Time until which the units taken so far are paid for, at `_unit_ns` each."""
+        """Time until which the consumed units are paid for, ns, at `_unit_ns` each."""
 
     def room(self, now_ns: int) -> bool:
         """Return whether a unit is left."""
         return self._paid_ns <= now_ns + self._burst_ns
 
     def full(self, now_ns: int) -> bool:
-        """Return whether all units are back."""
+        """Return whether the bucket has all of its units again."""
         return self._paid_ns <= now_ns
 
     def take(self, now_ns: int) -> bool:
@@ -51,7 +52,7 @@ class Buckets:
     """A token bucket for each name, and one for all names together."""
 
     def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
-        """Set the rate of each name; `in_all` is None if their sum is not limited."""
+        """Set the rate of each name. `in_all` limits all names together, unless it is None."""
         self._of_one = of_one
         self._shared = None if in_all is None else Bucket(in_all)
         self._buckets: dict[str, Bucket] = {}
@@ -61,9 +62,9 @@ class Buckets:
         return name not in self._buckets or self._buckets[name].room(now_ns)
 
     def take(self, name: str, now_ns: int) -> bool:
-        """Consume one unit of this name; return False if it, or all together, have none left."""
+        """Consume one unit of this name. Return False if its bucket or the shared one is empty."""
         if name not in self._buckets:
-            # A full bucket equals a new one. Without it, names cannot fill the memory.
+            # Drop the full buckets, which equal new ones: many names must not fill the memory.
             self._buckets = {k: one for k, one in self._buckets.items() if not one.full(now_ns)}
         own = self._buckets.setdefault(name, Bucket(self._of_one))
         if self._shared is None:
@@ -73,7 +74,7 @@ class Buckets:
 
 
 class Places:
-    """Places that are limited in all and per name."""
+    """A limited number of places, for example for connections: `most` in all, `of_one` per name."""
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one

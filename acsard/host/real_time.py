@@ -75,7 +75,7 @@ def _capable(capability: int) -> bool:
 
 def _schedule() -> bool:
     if has(0):
-        # systemd has started this process with it.
+        # systemd has started this process with real-time scheduling.
         return True
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -98,7 +98,7 @@ def _stay_awake() -> bool:
         return True
     except OSError:
         return False
-    # The value is 0 us. It holds while the file is open, so until this process ends.
+    # The written value is 0 us. It is in force while the file is open, so until this process ends.
     os.write(wish, bytes(4))
     return True
 

@@ -1,8 +1,8 @@
 """Notifies the service manager: ready, alive, status and stopping.
 
 Without a service manager (`$NOTIFY_SOCKET` unset) nothing is sent. The protocol is that of
-sd_notify: a datagram with `NAME=value` lines. The control step itself sends `WATCHDOG=1`, so a loop
-that stands still is silent, and systemd ends it.
+sd_notify: a datagram with `NAME=value` lines. The control step itself sends `WATCHDOG=1`. If the
+control loop hangs, the messages stop, and systemd ends the process.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ because that would hide a loop that is late.
 """
 
 PATIENCE_S = 30
-"""Time by which a waiting start asks systemd to extend its timeout, s."""
+"""Time by which `waiting` extends systemd's timeout for the start, s."""
 
 
 class Systemd:
@@ -91,7 +91,7 @@ class Systemd:
         try:
             self._socket.send(text.encode())
         except OSError:
-            # The manager's queue is full, or it is gone. The robot drives on.
+            # The service manager's queue is full, or the manager has ended. The robot drives on.
             return False
         return True
 

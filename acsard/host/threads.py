@@ -24,8 +24,8 @@ async def in_thread(
 ) -> T:
     """Return the result of `call`, or raise `TimeoutError` after `timeout` s (None: wait for ever).
 
-    Raises `NoThreadError` at once if no thread can be started. If the caller no longer waits, the
-    thread passes the result to `late`, which gives it back.
+    Raises `NoThreadError` at once if no thread can be started. If `call` returns after the caller
+    has stopped waiting, the thread passes the result to `late`, which releases it.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()

@@ -27,7 +27,7 @@ class _Itimerspec(ctypes.Structure):
 
 
 class TimerFd:
-    """One timer; `fileno` becomes readable when it expires.
+    """One timer. Its file descriptor becomes readable when the timer expires.
 
     The kernel does not offer a timerfd on CLOCK_MONOTONIC_RAW, so `set` passes the remaining time.
     """

@@ -28,7 +28,7 @@ def version() -> str:
 
 
 def commit_of(clone: Path) -> str:
-    """Return the commit that is checked out in this directory, or "" if it is no clone of git.
+    """Return the commit that is checked out in this directory, or "" if it is not a git clone.
 
     The files of git are read directly, because a computer that runs the daemon may have no git.
     Changes since the commit are not visible in them.

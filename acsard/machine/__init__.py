@@ -1,1 +1,1 @@
-"""What an administrator does with the computer: doctor, certificates, serial ports, the service."""
+"""Administration of this computer: the doctor, certificates, serial ports and the service."""

@@ -1,8 +1,8 @@
 """Certificates and their authority as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
 
 The keys are P-256 keys, in files that only their owner can read. People trust the authority on
-their phones, so its certificate limits the hosts that it may sign for: a thief of its key can pose
-as the robots and as hosts of a private network, and as no other web site.
+their phones, so its certificate limits the hosts that it may sign for. A thief of its key can pose
+as the robots and as hosts of a private network, but not as any other web site.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PRIVATE = (
     "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
     "192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10",
 )  # fmt: skip
-"""Networks whose addresses every authority may sign, because nobody has them on the Internet."""
+"""Networks whose addresses every authority may sign. No Internet host has such an address."""
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
@@ -44,12 +44,14 @@ class Authority:
     def make(
         cls, directory: Path, name: str, days: int, addresses: Sequence[str] = ()
     ) -> Authority:
-        """Create an authority in `directory`, valid five times as long as its certificates.
+        """Create an authority in `directory` with the common name `name`.
+
+        It is valid for five times `days`, the validity of the certificates that it signs.
 
         The host names that it may sign are those of `addresses` and of `LOCAL`, with all names
-        below them. The IP addresses are those of `addresses` (of IPv6 the whole /64 network) and of
-        `PRIVATE`. Names of other kinds are not limited: a certificate may have any common name,
-        which names a client on the bus.
+        below them. The IP addresses are those of `addresses` and of `PRIVATE`. For an IPv6 address,
+        the whole /64 network is permitted. Names of other kinds are not limited: a certificate may
+        have any common name, which names a client on the bus.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -69,8 +71,8 @@ class Authority:
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
         """Load the authority from `directory`.
 
-        Raises `OSError` or `ValueError` if that is impossible. `password` is called for the
-        password if the key is encrypted.
+        If the key is encrypted, `password` is called and returns the password. Raises `OSError` or
+        `ValueError` if the authority cannot be loaded.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
@@ -119,8 +121,8 @@ class Authority:
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
         """Write a certificate for server and client use, its key and the authority's certificate.
 
-        `addresses` are the host names and IP addresses under which its holder is reached, and
-        `days` is how long it is valid.
+        `name` is the common name of the certificate. `addresses` are the host names and IP
+        addresses at which the holder of the certificate is reached. `days` is its validity.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -156,7 +158,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        # A robot's clock may be slow when the robot starts.
+        # A robot's clock may be behind when the robot starts.
         .not_valid_before(min(now, now + timedelta(days=days)) - timedelta(hours=1))
         .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
@@ -186,13 +188,13 @@ def _constraints(addresses: Sequence[str]) -> x509.NameConstraints:
             hosts.append(address.lower())
         elif not any(named.value in one for one in networks):
             networks.append(_network_of(address))
-    # A name below another one needs no entry of its own.
+    # A host name below another permitted name needs no entry of its own.
     own = [one for one in dict.fromkeys(hosts) if not any(one.endswith(f".{h}") for h in hosts)]
     return x509.NameConstraints([*map(x509.DNSName, own), *map(x509.IPAddress, networks)], None)
 
 
 def _network_of(address: str) -> Network:
-    # The address of a host changes within its /64 network of IPv6.
+    # The IPv6 address of a host changes within its /64 network.
     length = 64 if ":" in address else 32
     return ipaddress.ip_network((address, length), strict=False)
 
@@ -217,5 +219,5 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file by one of this user that is never readable beyond `mode`."""
+    """Replace a file by one of this user. It never has more permissions than `mode`."""
     replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))

@@ -1,6 +1,6 @@
 """Examines the certificates of this machine and of the routers that it connects to.
 
-Each finding has the command that mends it, as a person can type it.
+Each finding about a problem has the remedy, with the commands that a person can type.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def certificates(tls: str) -> Iterator[Finding]:
 def renewal(tls: str, whose: str) -> str:
     """Return the commands that replace a certificate which ends soon.
 
-    `tls` is the directory of this machine's certificate, and `whose` the owner of the certificate
-    that ends first, as in `expiry`.
+    `tls` is the directory of this machine's certificate. `whose` is the owner of the certificate
+    that ends first; "" means this machine. `expiry` has the same names of owners.
     """
     directory, name = Path(tls), common_name(tls)
     if whose == AUTHORITY:
@@ -84,7 +84,7 @@ def renewal(tls: str, whose: str) -> str:
 
 
 def _mend_of_absent(directory: Path) -> str:
-    """Return what to do if a file of the directory cannot be used."""
+    """Return the remedy if a certificate file in the directory is missing or cannot be used."""
     if (directory / CA_KEY).exists():
         return f"run `{_command('renew', directory)}`, or this command with sudo"
     if not directory.is_dir() or not any(directory.iterdir()):
@@ -98,7 +98,8 @@ def _mend_of_absent(directory: Path) -> str:
 def _command(action: str, directory: Path) -> str:
     """Return the command line of an action of `acsard tls` in this directory.
 
-    With sudo it has the path of the program, because sudo does not search this user's PATH.
+    If the command needs sudo, it has the path of the program, because sudo does not search this
+    user's PATH.
     """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"

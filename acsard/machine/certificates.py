@@ -1,7 +1,7 @@
-"""The directory of certificates: the robot's own, the authority, and those of all clients.
+"""Makes and renews the certificates in a directory: the authority's, the robot's, the clients'.
 
-The robot admits clients with a certificate of its authority. The common name in the certificate
-decides on their permissions (`[access]`).
+The robot admits a client if the robot's authority has signed the client's certificate. The common
+name in that certificate decides on the client's permissions (`[access]`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 PORT = 7449
 CA_KEY = "ca-key.pem"
-"""Key of the authority. Clients do not get it."""
+"""Name of the file with the authority's key. Clients do not get the file."""
 
 OWN = "robot"
 """Common name of the certificate that `tls init` makes for the robot itself."""
@@ -38,11 +38,18 @@ ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 
 LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
 HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
-"""Matches a common name that OpenSSL takes for a host name if it has a dot, `10.0.0.5` too."""
+"""Matches a common name in the form of a host name.
+
+OpenSSL takes such a name for a host name if it has a dot, even if it is `10.0.0.5`.
+"""
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
-    """Create an authority and the first certificates. Returns the robot's names."""
+    """Create an authority and the first certificates, and return the robot's names and addresses.
+
+    `addresses` are further names and addresses of the robot. `days` is the validity of the
+    certificates. An existing authority is replaced only if `force` is set.
+    """
     if (directory / CA).exists() and not force:
         raise MendableError(
             f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
@@ -60,7 +67,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 
 
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Create one more client certificate, and return its directory."""
+    """Create one more client certificate with the common name `name`, and return its directory."""
     authority = _load(directory)
     place = directory / "clients" / name
     if place.exists():
@@ -74,7 +81,7 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Replace the certificate that `add` made for this name, and return its directory.
 
-    The new certificate has the host names and addresses of the old one, and `addresses`.
+    The new certificate has `addresses`, and the host names and addresses of the old one.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -93,22 +100,25 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 
 
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
-    """Replace the robot's own certificate. Returns its names, with those of the old one."""
+    """Replace the robot's own certificate, and return the names and addresses in the new one.
+
+    They include those of the old certificate, unless the authority may not sign for them.
+    """
     authority = _load(directory)
     _require_permitted(authority, addresses)
     known = _robot_names(authority.names_in(directory))
-    # The machine may have another name or address than when the authority was made.
+    # The name or address of the machine may have changed since the authority was made.
     names = [*filter(authority.permits, known), *addresses]
     authority.issue(directory, OWN, names, days)
     return list(dict.fromkeys(names))
 
 
 def _names_of(name: str) -> list[str]:
-    """Return the host names under which the holder of a certificate is reached.
+    """Return the host names for a certificate with this common name.
 
-    The name in mDNS is needed for a common name like `anna.meyer` or `10.0.0.5` too: without any
-    host name TLS would take that for one, and compare it with the names that the authority may
-    sign.
+    The result includes the mDNS name NAME.local even for a common name like `anna.meyer` or
+    `10.0.0.5`. If a certificate has no host name, TLS takes such a common name for the host name,
+    and refuses it if the authority may not sign for it.
     """
     named = [name] if ADDRESS.match(name) else []
     if not HOST_LIKE.match(name) or name.endswith(".local"):
@@ -123,20 +133,21 @@ def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
         named = " ".join(f"--address {one}" for one in barred)
         raise MendableError(
             f"the authority may not sign for {', '.join(barred)}: its certificate permits only "
-            "the names and addresses of `tls init`, .local and private networks. `acsard tls init "
-            f"--force {named}` makes a new authority; then every client needs a new certificate",
+            "private networks, .local names, and the names and addresses given to `tls init`. "
+            f"`acsard tls init --force {named}` makes a new authority; then every client needs a "
+            "new certificate",
         )
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
-    """Return the robot's names: for DNS, mDNS and itself, its present addresses, `more`."""
+    """Return the robot's names: in DNS and mDNS, loopback, its present addresses, and `more`."""
     host = socket.gethostname()
     names = [host, f"{host}.local", "localhost", "127.0.0.1", *own_addresses(), *more]
     return list(dict.fromkeys(names))
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """Return the settings that open the bus to the network. Existing TLS endpoints stay."""
+    """Return the settings that open the bus to the network. Existing TLS endpoints are kept."""
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):
         listen.append(f"tls/0.0.0.0:{PORT}")
@@ -157,7 +168,7 @@ def _load(directory: Path) -> Authority:
     _writable(directory)
     try:
         return maker.load(directory, _password)
-    except UsageError:  # it is a ValueError, too
+    except UsageError:  # `UsageError` is a `ValueError`, too
         raise
     except FileNotFoundError:
         if (directory / CA).exists():

@@ -1,7 +1,7 @@
-"""Asks the running daemon, and examines it: whether it can be reached, and its own reports.
+"""Queries the running daemon, and examines whether it can be reached, and its own reports.
 
-It is asked for its configuration, and for its state twice, a second apart. The counters of the two
-states show how well the serial link works.
+The doctor queries the daemon's configuration once, and its state twice, a second apart. The
+difference between the counters of the two states shows how well the serial link works.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
 SHOWN = 6
-"""Number of differing keys that are named one by one. More mean another file."""
+"""Largest number of differing keys that a finding names. If more differ, another file is in use."""
 
 
 OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""Keys that `acsard run` takes as options, so that a different value is intended."""
+"""Keys that `acsard run` takes as options. A value that differs from the file's is intended."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
@@ -78,7 +78,11 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         "the file",
     ),
 )
-"""Reasons for a value that differs from the file's, by its key, and the remedy."""
+"""Possible reasons why a value of the daemon differs from the value in the file.
+
+Each row has a function that says whether the row applies to a key, the level of the finding, the
+reason, and the remedy.
+"""
 
 
 class Running(Struct, frozen=True):
@@ -89,15 +93,15 @@ class Running(Struct, frozen=True):
     before: RobotState
     state: RobotState
     looked_ns: int
-    """Middle of the query of `state`, from request to answer, by this machine's wall clock, ns."""
+    """Time halfway between the request for `state` and its answer, this host's wall clock, ns."""
     trip_ns: int = 0
-    """Duration of that request, ns."""
+    """Time from the request for `state` to its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
     """Rows of the daemon's diagnostics."""
     here: bool = True
-    """Whether the daemon runs on this machine, as far as its processes can be seen.
+    """Whether the daemon runs on this machine, that is, whether its process is found here.
 
-    A tunnel or a router may stand between.
+    The address does not show that, because it may lead to a tunnel or a router.
     """
     events: tuple[LogEvent, ...] = ()
     """The daemon's last events."""
@@ -106,8 +110,8 @@ class Running(Struct, frozen=True):
 def asked(config: Config, address: Address) -> Running:
     """Query the daemon at this address for its configuration, its state and its events.
 
-    `config` is the content of the configuration file. It stands in for the daemon's configuration
-    if this client may not query that. Raises an `AcsardError`.
+    `config` is the content of the configuration file. It replaces the daemon's configuration if
+    this client may not query the latter. Raises an `AcsardError` if the daemon does not answer.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -125,7 +129,7 @@ def asked(config: Config, address: Address) -> Running:
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
     """Return the daemon's configuration.
 
-    A client that may not query it gets the file's, with the values that `info` contains.
+    If this client may not query it, return the configuration `file` with the values in `info`.
     """
     try:
         return from_builtins(robot.get("config"))
@@ -136,7 +140,7 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
-    """Yield findings about the agreement of the daemon's configuration with the file."""
+    """Yield findings that compare the daemon's configuration with the configuration file."""
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
@@ -154,13 +158,13 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(its: Mapping[str, Difference]) -> str:
-    """Return the daemon's values as lines of the file."""
+    """Return the daemon's values in the form that the configuration file has."""
     parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
 def answers(endpoint: str) -> bool:
-    """Return whether a program listens at this endpoint; raise `UsageError` for another text."""
+    """Return whether a program listens at this endpoint; raise `UsageError` if it is not valid."""
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)
@@ -262,7 +266,10 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Yield a warning if too few of the lines sent between the two states were answered."""
+    """Yield a warning if too few of the lines sent between the two states were answered.
+
+    `passed` has the increase of each counter between the two states.
+    """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     # With fewer than 40 lines between both states the fraction means nothing.
     if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
@@ -274,7 +281,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a warning about refused lines if there are too many of them."""
+    """Return a warning about lines that the daemon refused, or nothing if they are few."""
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
@@ -287,7 +294,10 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return the number of link losses that this computer did not cause, with a description."""
+    """Return the number of link losses that this computer did not cause, with a description.
+
+    The list is empty if there were none.
+    """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
         f"it was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
@@ -317,7 +327,7 @@ GYRO_MENDS = {
 """Remedy for each gyro status in `state`; "" if the status is good."""
 
 CAUSES_SHOWN = 3
-"""Number of events with a cause of lateness that are shown, the last ones."""
+"""Largest number of events with a cause of lateness that are shown. The last ones are chosen."""
 
 CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
@@ -331,7 +341,7 @@ ANOTHER = (
     "another program use that port?"
 )
 
-SIGN = "commands signed as the README describes need no common clock"
+SIGN = "or sign the commands (deploy/clients/README.md), which then need no common clock"
 
 
 START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon connects by itself"
@@ -345,7 +355,7 @@ PUT_ROUTER = (
 
 
 def routers(config: Config) -> Iterator[Finding]:
-    """Yield findings about the routers: whether they listen, and which rights they pass on."""
+    """Yield findings about the routers: whether they listen, and which rights they give."""
     for endpoint in config.bus.connect:
         if not answers(endpoint):
             yield Finding("router", "warning", f"no program listens at {endpoint}", START_ROUTER)
@@ -382,7 +392,7 @@ def found(config: Config, address: Address) -> Running | Finding:
 
 
 def daemon(running: Running) -> Iterator[Finding]:
-    """Yield the findings of the daemon's reports."""
+    """Yield the findings that follow from the daemon's reports."""
     state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
     mend = f"see the reason; `acsard call clear` releases it; {check(running)}"
@@ -412,8 +422,8 @@ def daemon(running: Running) -> Iterator[Finding]:
 def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     """Yield a finding if a certificate that the daemon or its gateway uses ends soon.
 
-    `row` is that of the daemon's diagnostics. `here` says that the daemon runs on this machine,
-    where its files are examined too.
+    `row` is the row about certificates in the daemon's diagnostics, or None. `here` says whether
+    the daemon runs on this machine, so that its files are examined as well.
     """
     if row is None or not row.level:
         return
@@ -456,24 +466,27 @@ def late(running: Running) -> Iterator[Finding]:
 def clocks(running: Running) -> Iterator[Finding]:
     """Yield warnings if clocks differ, or if stamps were replaced.
 
-    The daemon's time was taken at some moment of the round trip. A daemon on this machine shares
-    our clock.
+    The daemon took its time at an unknown moment between the request and the answer. A daemon on
+    this machine has the same clock as the doctor.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
-    # From 0.5 s on, Zenoh replaces the stamps of the clock that is ahead.
+    # From a difference of 0.5 s on, Zenoh replaces the stamps of the clock that is ahead.
     if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
-        yield Finding("clock", "warning", text, f"let NTP set both (timedatectl); {SIGN}")
+        yield Finding("clock", "warning", text, f"let NTP set both (timedatectl), {SIGN}")
     replaced = counters.get("stamps_replaced", 0)
     if replaced:
         text = f"{replaced} commands came from clocks over 0.5 s ahead: their stamps were replaced"
-        yield Finding("clock", "warning", text, f"let NTP set both clocks; {SIGN}")
+        yield Finding("clock", "warning", text, f"let NTP set both clocks, {SIGN}")
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield findings about the gyro's status in `state` and about refused samples."""
+    """Yield findings about the gyro and about its refused samples.
+
+    `does` is the status of the gyro in the daemon's `state`.
+    """
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
         mend = GYRO_MENDS.get(does, "is the daemon of another version?")

@@ -1,10 +1,12 @@
 """All examinations in their order, from the configuration to a moving robot.
 
-This module itself examines the configuration, the machine and the serial port;
-`certificate_findings.py` examines the certificates, and `daemon_findings.py` the daemon and its
-link. The doctor opens no port and sends nothing to a robot. If a daemon runs, its own configuration
-is examined, because the file may have changed since and options may override it. For a daemon on
-another machine, only its own reports are examined: its port, files and gateway are there.
+This module itself examines the configuration, the machine and the serial port.
+`certificate_findings.py` examines the certificates, and `daemon_findings.py` examines the daemon
+and its link. The doctor opens no port and sends nothing to a robot.
+
+If a daemon runs, its own configuration is examined, because the file may have changed since the
+daemon's start, and options may override the file. If the daemon runs on another machine, only its
+reports are examined, because its port, files and gateway are on that machine.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ def meddlers() -> Iterator[Finding]:
 
 
 def clock_set() -> Iterator[Finding]:
-    """Yield a finding about the wall clock, which the stamps depend on."""
+    """Yield a finding about the wall clock, from which the stamps of messages are taken."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < 2026:  # boards without a battery start in the past
         mend = "set it (timedatectl), or let chrony set it; odometry stamps are wall-clock times"
@@ -159,10 +161,10 @@ def examine(
     Args:
         where: the path of the configuration, for messages.
         text: the content of the configuration file.
-        given: values that override the file.
+        given: values that override the file, by table and key.
         told: returns the daemon's address for a configuration.
 
-    Raises `UsageError` if that address is not an endpoint.
+    Raises `UsageError` if that address is not a valid endpoint.
     """
     try:
         config = parse(text, given)
@@ -193,8 +195,8 @@ def examine(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
     yield from slowness()
-    # The service has copies of the certificates from its start. A file that has since been deleted
-    # is reported at its original place.
+    # The service made copies of the certificates when it started. A file that has been deleted
+    # since then is reported at its original path.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)

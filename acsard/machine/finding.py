@@ -12,7 +12,10 @@ LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
 
 
 class Finding(Struct, frozen=True):
-    """The result for one subject. `mend` is the remedy, or advice if the level is ok."""
+    """The doctor's result for one subject.
+
+    `mend` is the remedy, or advice if the level is ok. It is "" if there is neither.
+    """
 
     subject: str
     level: Level

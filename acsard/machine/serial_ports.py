@@ -23,8 +23,9 @@ BOARDS: dict[str, str] = {
     "0403:6015": "FTDI FT-X",
     "10c4:ea60": "Silicon Labs CP210x",
 }
-"""USB ids of the interfaces behind which a robot's microcontroller is found. A test proves that
-deploy/udev/70-acsar.rules has the same ids.
+"""USB ids of the boards and USB-to-serial chips through which a robot's microcontroller connects.
+
+A test proves that deploy/udev/70-acsar.rules has the same ids.
 """
 
 BY_ID = Path("/dev/serial/by-id")

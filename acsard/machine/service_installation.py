@@ -1,9 +1,9 @@
 """acsard as a system service: its files, its commands, and the steps that install or remove it.
 
 The files are those of `deploy/`, with the path of this installation in the units. A file that
-somebody else has written is neither overwritten nor removed without force. A service cannot run
-from every place: `misplaced` says why it cannot run from this one. A step is a value that the user
-reads before it is carried out.
+another person or program has written is neither overwritten nor removed without force. A service
+cannot run from every directory: `misplaced` returns why it cannot run from this one. A step is an
+object with a text, so that the user can read all steps before they are carried out.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ def misplaced(
     """Return why a service cannot run this installation, or "" if it can."""
     if prefix == base or _hidden(Path(prefix), hidden):
         return (
-            f"a service cannot run from {prefix}, because it cannot see homes and /tmp; install "
-            f"acsard in a venv at {HOME} (deploy/systemd/README.md)"
+            f"a service cannot run from {prefix}, because services have no access to home "
+            f"directories and /tmp; install acsard in a venv at {HOME} (deploy/systemd/README.md)"
         )
-    # A venv borrows its Python: its bin/python is a link to the one that it was made with.
+    # A venv has no Python of its own: its bin/python is a link to the Python that made it.
     interpreter = Path(os.path.realpath(executable))
     for path in (Path(base), interpreter):
         if _hidden(path, hidden):
@@ -87,7 +87,7 @@ def _closed(path: Path) -> Path | None:
 
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
-"""Directories that are removed with the last file in them."""
+"""Names of the directories that are removed when they have become empty."""
 
 
 class File(Struct, frozen=True):
@@ -136,7 +136,7 @@ class Write(Struct, frozen=True):
         path.parent.mkdir(parents=True, exist_ok=True)
         for place in made:
             place.chmod(0o755)
-        # A link is replaced, not written through.
+        # Replace a symbolic link. Writing through it would change the file to which it points.
         path.unlink(missing_ok=True)
         path.write_bytes(self.file.content)
         path.chmod(self.file.mode)
@@ -171,7 +171,7 @@ class Remove(Struct, frozen=True):
 
 
 class Keep(Struct, frozen=True):
-    """Step that leaves a file as it is, with the reason."""
+    """Step that leaves a file as it is. `why` is the reason for the user, or ""."""
 
     path: Path
     why: str = ""
@@ -230,14 +230,14 @@ STATES = {
 """State directories of the units, each with a description of its content."""
 
 Found = Mapping[Path, bytes | None]
-"""Present content of each file's path; None if it does not exist."""
+"""Present content of the file at each path; None if there is no file."""
 
 RELOAD = (
     Run(("systemctl", "daemon-reload")),
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
 AGAIN = ("tty", "usb-serial", "misc")
-"""Subsystems of the devices that the udev rules cover; udev applies the rules to them again."""
+"""Subsystems of the devices that the udev rules cover. `udevadm trigger` selects them."""
 
 INSTALLED = (
     *RELOAD,
@@ -281,9 +281,9 @@ def lan_drop_in(unit: str) -> File:
 def admitting(directory: Path) -> Write | Keep | None:
     """Return the step that gives the TLS gateway of the service these certificates, or None.
 
-    None means that the service is not installed, or the user is not root. The unit itself may use
-    loopback only and reads none of root's files. A drop-in that exists keeps its networks, which an
-    administrator may have narrowed.
+    None means that the service is not installed, or that the user is not root. Without the drop-in,
+    the gateway may use loopback only and cannot read root's files. An existing drop-in keeps its
+    networks, because an administrator may have narrowed them.
     """
     if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
@@ -294,7 +294,8 @@ def admitting(directory: Path) -> Write | Keep | None:
 def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
     """Return the step that puts the certificates of `directory` into the drop-in.
 
-    `found` is the drop-in's present content, or None; then the delivered content is the base.
+    `found` is the drop-in's present content, which is changed. If it is None, the content of `file`
+    is changed instead.
     """
     place = str(directory).encode()
     text = re.sub(
@@ -313,7 +314,11 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
 
 
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """Return the installation steps; raise `MendableError` if one would replace a changed file."""
+    """Return the installation steps.
+
+    `found` has the present contents of the files. Raises `MendableError` if a step would replace a
+    changed file, unless `force` is set.
+    """
     steps: list[Step] = []
     changed: list[str] = []
     for file in wanted:
@@ -336,7 +341,7 @@ def own_places() -> list[Path]:
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the other files in these places, such as certificates and further drop-ins."""
+    """Return the paths in `places` that are not in `files`: certificates, other drop-ins, ..."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -353,8 +358,11 @@ def uninstalling(
 ) -> list[Step]:
     """Return the steps that remove the service, with a reason for each file that stays.
 
-    A changed file stays unless `force` or `purge` is set. A changed `kept` file stays unless
-    `purge` is set, and so do `others` and the `STATES` of the `stateful` units.
+    `found` has the present contents of the files in `wanted`. `others` are further paths in the
+    directories of the service, and `stateful` are the units that have a state directory.
+
+    A changed file stays unless `force` or `purge` is set. A changed file with `kept` stays unless
+    `purge` is set. So do `others`, and the state directories of the `stateful` units.
     """
     there = [file for file in wanted if found[file.path] is not None]
     why: dict[Path, str] = {}
@@ -366,7 +374,8 @@ def uninstalling(
         elif not force:
             why[file.path] = "it has been edited; --force removes it"
     if any(path.name == UNIT for path in why):
-        # A unit that may start again needs the program that sends zeros after it.
+        # The daemon's unit stays and may start again. Then it needs the program that sends zeros
+        # after the daemon's end.
         why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
     steps: list[Step] = [
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
@@ -376,7 +385,7 @@ def uninstalling(
         steps.append(Remove(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
         where, what = STATES[unit]
-        # systemd knows the real place of the state directory, as long as it knows the unit.
+        # systemd knows the real path of the state directory, but only while the unit is installed.
         clean = Run(("systemctl", "clean", "--what=state", unit))
         steps.insert(0, clean if purge else Keep(where, f"{what}; --purge removes it"))
     units = [name for name in reversed(ALL) if any(file.path.name == name for file in there)]

@@ -2,8 +2,8 @@
 
 The content is written under another name in the same directory and renamed at the end. Therefore
 the target is complete or absent. With `force` an existing target is replaced, but only if it is a
-regular file or a ROS bag. A recording is replaced only by one that has everything in it, and a
-directory with other files never.
+regular file or a ROS bag. A recording is replaced only by a recording with the same content or more
+of it. A directory with other files is never replaced.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BAG_SUFFIXES = (".mcap", ".db3")
 
 
 def never(recording: Recording) -> bool:
-    """Return False: a caller that does not write recordings replaces none."""
+    """Return False. This is the default of a caller that must not replace any recording."""
     return False
 
 

@@ -45,9 +45,9 @@ DIRECTORY_MODE = 0o750
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
 """Modes of the directory and its files when the daemon records as a systemd service.
 
-Every user may read them. That is safe because only root can enter the parent directory, and the
-unit of the robot's page mounts this directory read-only. A group cannot give the page access: a
-dynamic group has no name, and on the disk systemd 257 gives a state directory to the user nobody.
+Every user may read them. That is safe because only root can enter the parent directory. The systemd
+unit of the robot's web page mounts this directory read-only. A group cannot give that unit access:
+a dynamic group has no name, and on the disk systemd 257 gives a state directory to the user nobody.
 """
 
 PRIVATE = Path("/var/lib/private")
@@ -72,7 +72,7 @@ Ten minutes are short enough, because a file may cover an hour.
 S_PER_DAY = 86400
 
 FRESH_S = 10.0
-"""Age of the last write, s, from which a `.part` file does not count as being recorded.
+"""Time since the last write, s, after which a `.part` file does not count as being recorded.
 
 A daemon writes once a second. A disk that hangs for longer than this is reported in the log.
 """
@@ -95,7 +95,7 @@ def listed(directory: Path) -> list[Path]:
 def is_being_recorded(path: Path, now_s: float) -> bool:
     """Return whether a daemon writes to this recording at the time `now_s`, s since 1970.
 
-    Raises `OSError`.
+    Raises `OSError` if the file cannot be examined.
     """
     return path.name.endswith(PART) and abs(now_s - path.stat().st_mtime) < FRESH_S
 
@@ -114,7 +114,7 @@ def _stem(path: Path) -> str:
 
 
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """Mark a `.part` file whose end could not be written, so that it does not pass for a crash.
+    """Mark a `.part` file whose end could not be written, so that it does not count as a crash.
 
     The marker is an empty file, and its name holds the retention class `kind` and the cause `cut`.
     Even a full disk usually accepts a new name. Raises `OSError` if it does not.
@@ -137,7 +137,7 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State that lasts as long as the daemon, even if a disk error makes it reopen the `Ring`."""
+    """State that lasts as long as the daemon. After a disk error a new `Ring` takes it over."""
 
     numbers: set[int] = field(default_factory=set)
     """Numbers of the files that ended in this run of the daemon."""
@@ -147,7 +147,7 @@ class Run(Struct):
     All other `.part` files without a marker were cut off by a crash before this run.
     """
     freed: int = 0
-    """Number of bytes deleted because the disk refuses to write; 0 once it accepts data again."""
+    """Number of bytes deleted because the disk refuses to write; 0 after a successful write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
 
 
@@ -162,7 +162,8 @@ class Ring:
     ) -> None:
         """Lock the directory, make room in it, and finish the files that were cut off.
 
-        `refused` says that the last write failed because the disk was full.
+        `run` is the state of this run of the daemon, or None for a new one. `refused` is true if
+        the last write failed because the disk was full.
         """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
@@ -171,7 +172,7 @@ class Ring:
         self.messages: list[str] = []
         """Messages for the log about files that could not be finished."""
         self.cut_ns: int | None = None
-        """Time at which a crash cut off the newest file, ns since 1970, or None."""
+        """Time at which a crash cut off the newest unfinished file, ns since 1970, or None."""
         here = self._directory.resolve()
         as_service = os.environ.get(RECORD) == settings.directory
         self._open_to_all = as_service and here.is_relative_to(PRIVATE)
@@ -238,7 +239,7 @@ class Ring:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and its files, also those of an earlier version."""
+        """Let every user read the directory and its files, even files of an earlier version."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -262,7 +263,10 @@ class Ring:
         return writing
 
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
-        """Finish a file as `Writing.finish` does, and return its path, which has its class."""
+        """Finish a file, rename it for its retention class `kind`, and return its new path.
+
+        `cut` and `why` say how the daemon ended, as in `Writing.finish`.
+        """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
         writing.path.rename(path)
@@ -281,7 +285,7 @@ class Ring:
                 yield self._directory / file.name, file.kind, now.mono_ns - ago_ns
 
     def retain(self, path: Path) -> None:
-        """Retain a finished plain file, because an incident happened within a minute of it."""
+        """Rename a finished plain file to `near`, because an incident happened close to it."""
         if path.name.endswith(WHOLE) and _kind(path) == "plain":
             # Another process may have removed the file.
             with suppress(FileNotFoundError):
@@ -289,7 +293,10 @@ class Ring:
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
-        """Trim every ten minutes and if the disk is nearly full. Call this once a second."""
+        """Trim the directory every ten minutes, and whenever the disk is nearly full.
+
+        Also detect jumps of the wall clock. Call this method once a second.
+        """
         jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
             self._shift_times(jumped_ns)
@@ -317,7 +324,7 @@ class Ring:
 
         Args:
             now: the present time, or None if it is not known; then no file counts as too old.
-            refused: the last write failed because the disk was full.
+            refused: true if the last write failed because the disk was full.
         """
         ended, disk = self._ended(), self._disk()
         oldest_s = -math.inf
@@ -348,7 +355,7 @@ class Ring:
 
     def _disk(self) -> Disk:
         size = os.statvfs(self._directory)
-        # This file system does not report its size.
+        # Some file systems do not report their size.
         if not size.f_blocks:
             return Disk(0, self._bytes)
         return Disk(size.f_blocks * size.f_frsize, size.f_bavail * size.f_frsize)

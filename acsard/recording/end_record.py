@@ -45,10 +45,10 @@ CUTS = {
     "late": "cut: the daemon was asked to end, and the disk was too slow for the rest",
     "open": "cut, or still being recorded, when it was recovered",
 }
-"""Why a recording does not end with an ordinary end of the daemon: each cause with its text.
+"""Maps each cause for which a recording has no ordinary end to its description.
 
-Only for the cause `bug` does the failing daemon itself finish the file. A file with another cause
-is finished later.
+For the cause `bug`, the failing daemon itself finishes the file. For every other cause, the file is
+finished later.
 """
 
 
@@ -76,13 +76,14 @@ class EndRecord(Struct, frozen=True):
 
 
 CRASHES = frozenset({"bug", "crash"})
-"""The causes after which the robot was left without its daemon."""
+"""The keys of `CUTS` for failures that left the robot without its daemon."""
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
     """Describe how a recording was cut off, from the fields `cut` and `why` of its end record.
 
-    Returns "" if the daemon ended in the ordinary way, and "cut" for a cause of a later version.
+    Returns "" if the daemon ended in the ordinary way, and "cut" for a cause that only a later
+    version knows.
     """
     if not cut:
         return ""
@@ -99,8 +100,8 @@ def as_metadata(last: EndRecord) -> dict[str, str]:
 def read_end(path: Path) -> EndRecord | None:
     """Read the end record of a file. Return None if it has no end record or cannot be read.
 
-    This function reads only the last `TAIL_BYTES`. It does not follow the index and unpacks no
-    chunk, because a file from a stranger may claim gigabytes.
+    This function reads only the last `TAIL_BYTES`. It does not follow the index, and it does not
+    unpack chunks, because the lengths in a forged file may claim gigabytes.
     """
     try:
         with path.open("rb") as stream:
@@ -115,7 +116,7 @@ def read_end(path: Path) -> EndRecord | None:
 
 
 def end_in(data: bytes) -> EndRecord | None:
-    """Return the end record in the last bytes of a file, or None if they have none."""
+    """Return the end record in `data`, the last bytes of a file, or None if there is none."""
     try:
         metadata = _last(data[-TAIL_BYTES:])
         return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
@@ -125,7 +126,10 @@ def end_in(data: bytes) -> EndRecord | None:
 
 
 def _last(tail: bytes) -> dict[str, str] | None:
-    """Return the end record in the last bytes of a file, or None if it is not finished."""
+    """Return the metadata of the end record in the last bytes of a file.
+
+    Returns None if the file is not finished.
+    """
     footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None

@@ -1,9 +1,9 @@
 """Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV.
 
 In the CSV table each feedback line and each gyro sample has its own row. The columns for `acsard
-calibrate` come first. The pose from odometry is in the columns `odom_...`, which calibration does
-not take for a measured position: odometry uses the wheels, and calibration must not compare the
-wheels with themselves.
+calibrate` come first. The pose from odometry is in the columns `odom_...`. Calibration does not use
+these columns as a measured position: odometry is computed from the wheels, and calibration must not
+compare the wheels with themselves.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ENDLESS = "{sec: 9223372036, nsec: 854775807}"
 
 
 class BagTopic(Struct, frozen=True):
-    """A topic of the bag."""
+    """A topic of a ROS bag."""
 
     name: str
     type: str
@@ -75,9 +75,9 @@ def offered_qos(qos: Qos) -> str:
 def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: int) -> str:
     """Return the `metadata.yaml` that makes a ROS bag of a directory with one MCAP file.
 
-    It has format version 5 with numeric QoS policies, which every ROS 2 release since Humble reads.
-    The MCAP file holds the same QoS text in the metadata of each channel, because `ros2 bag play
-    FILE` reads it there.
+    The text has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
+    reads. The MCAP file holds the same QoS text in the metadata of each channel, because
+    `ros2 bag play FILE` reads the QoS there.
 
     Args:
         file: name of the MCAP file.
@@ -133,7 +133,7 @@ OUTPUT_COLUMNS = (
     "odom_x [m]", "odom_y [m]", "odom_yaw [rad]", "linear [m/s]", "angular [rad/s]",
     "applied_linear [m/s]", "applied_angular [rad/s]", "mode", "link", "source",
 )  # fmt: skip
-"""Columns with outputs of the robot. A row of a gyro sample leaves them empty."""
+"""Columns with outputs of the robot. They are empty in the row of a gyro sample."""
 
 CSV_HEADER = ",".join([*MEASURED, *OUTPUT_COLUMNS])
 MEASURED_CSV_HEADER = ",".join([*MEASURED, "applied_linear [m/s]", "applied_angular [rad/s]"])
@@ -166,7 +166,7 @@ def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def wheel_columns(estimate: Estimate) -> str:
-    """Return the measured columns of a feedback line."""
+    """Return the CSV columns with the measured wheel values of one feedback line."""
     wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
     return f"{_csv_seconds(estimate.at.wall_ns)},{wheels},"
 
@@ -174,8 +174,8 @@ def wheel_columns(estimate: Estimate) -> str:
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
     """Return the measured columns of a gyro sample.
 
-    The time is the sample's stamp. If it has no stamp, the time is that of its arrival, which `now`
-    converts from the monotonic to the wall clock.
+    The time is the sample's stamp. For a sample without a stamp it is the arrival of the sample,
+    converted from the monotonic clock to the wall clock. `now` gives the offset of the two clocks.
     """
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
@@ -198,11 +198,11 @@ class ExportResult(Struct, frozen=True):
     count: int
     """Number of messages, or of rows of a CSV table."""
     gaps: list[Gap]
-    """The parts of the time span that are not exported."""
+    """The gaps of the recording that overlap the time span. Their steps are not exported."""
 
 
 class _Writer:
-    """A file format: takes steps and writes them to a stream."""
+    """Base class of the writers: writes steps to a stream in one file format."""
 
     count = 0
     """Number of messages or rows so far."""
@@ -212,13 +212,14 @@ class _Writer:
         raise NotImplementedError
 
     def skip(self, step: Step, inside: bool) -> None:
-        """Take a step that is not replayed, or that is not in the time span.
+        """Process a step whose outputs are not exported.
 
-        A step of the time span, for which `inside` is true, has lines of the log nevertheless.
+        `inside` is false for a step outside of the time span. It is true for a step in the time
+        span that cannot be replayed; then the log lines of the step are exported nevertheless.
         """
 
     def end(self, ending: str = "") -> None:
-        """Write the lines of the log after the last step, as `TimelineWriter.end` makes them."""
+        """Write the log lines after the last step; `ending` is as in `TimelineWriter.end`."""
 
     def finish(self) -> None:
         """Write the end of the file."""
@@ -320,14 +321,17 @@ def export(
     """Replay a recording and write its messages to `new`: a file, or a directory for `rosbag2`.
 
     Args:
+        kind: the format of the exported file.
         other: the configuration to replay with; None for the recorded one.
+        span: the part of the recording to export.
+        progress: called every `PROGRESS_STEPS` steps.
         force: overwrite `new`, as far as `atomic_output.replacing` allows it.
 
     Raises:
         RecordingError: nothing was recorded in the span of time, or the recording cannot be
             replayed.
         FileExistsError: `new` must not be overwritten.
-        OSError: the disk refuses. After any error no partial file is left.
+        OSError: the disk refuses to write. After any error no partial file is left.
     """
     run = RecordedRun(recording, other)
 
@@ -364,11 +368,11 @@ def export(
 def _write_steps(
     run: RecordedRun, writer: _Writer, recording: Recording, span: Span, progress: Progress
 ) -> None:
-    """Replay all steps, because each changes the robot, and write those in the time span."""
+    """Replay all steps, because each one changes the robot. Write only those in the time span."""
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in the time span. The first one behind it ends the log."""
+        """Return whether a step is in the time span. The first step after the span ends the log."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:
@@ -396,7 +400,7 @@ def _write_steps(
 
 
 def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
-    """Return the gaps in the time span."""
+    """Return the gaps that overlap the time span."""
     begin_ns, end_ns = [about.mono_ns + seconds * NS_PER_S for seconds in span]
     return [gap for gap in run.gaps if gap.begin_ns < end_ns and gap.end_ns > begin_ns]
 

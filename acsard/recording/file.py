@@ -1,21 +1,21 @@
-"""One recording as an MCAP file: written second by second, and readable if cut off or damaged.
+"""One recording as an MCAP file: written every second, and readable even if cut off or damaged.
 
 A file has four channels:
 - `steps`: batches of steps, as `rows.py` encodes them.
 - `events`: one event per message, in JSON.
-- `state`: a robot, as `state.py` encodes it. Such a message has a chunk of its own: damage to steps
-  does not cost the state from which a replay goes on, and damage to the state costs no step. A file
-  that does not begin with the daemon's start has this message before all others.
+- `state`: the robot between two steps, as `state.py` encodes it. Each of these messages has its own
+  chunk. Therefore damage to a chunk of steps does not destroy a state, and damage to a state does
+  not destroy steps. A file that begins after the daemon's start has a `state` message first.
 - `unfinished`: the inputs of the step in which the daemon failed.
 
 A metadata record names the robot and the version of acsard, and an attachment holds the
 `acsard.toml`. A finished file has both at its beginning and before its end, because nothing can be
-replayed without them. The metadata of the channels, and a further metadata record, tell people with
-other MCAP programs how to read the file.
+replayed without them. The metadata of the channels, and a further metadata record, explain the file
+to a person who opens it with another MCAP program.
 
 The messages are in chunks of about ten seconds, which `mcap_records.py` writes. A file that was cut
-off has no end record, but all data that was synced to the disk can still be read. `rewrite` makes a
-finished file of such a file.
+off has no end record, but all data that was synced to the disk can still be read. `rewrite` copies
+its messages to a new, finished file.
 """
 
 from __future__ import annotations
@@ -56,18 +56,21 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import INCIDENTS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
-"""Longest time that a chunk covers. Longer chunks save little space, and lose more if damaged."""
+"""Longest time that a chunk covers, ns.
+
+Longer chunks save little space, and more data is lost if one of them is damaged.
+"""
 
 CHUNK_BYTES = 1 << 20
-"""Uncompressed size at which a chunk ends. Ten seconds of driving have 160 000 bytes."""
+"""Uncompressed size at which a chunk ends, bytes. Ten seconds of driving take 160 000 bytes."""
 
 MODE = 0o640
-"""File mode of a recording: the service's group may read it."""
+"""File mode of a recording. The group of the daemon's service may read the file."""
 
 Topic = Literal["steps", "events", "state", "unfinished"]
 
 CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
-"""Channels in the order of their numbers, which begin with 1.
+"""Channels in the order of their MCAP channel numbers, which begin with 1.
 
 The reader relies on this order, because the records that define the channels may be damaged.
 """
@@ -98,13 +101,13 @@ CONTENTS: dict[Topic, str] = {
     "unfinished": "the inputs of the step in which the daemon failed, in MessagePack: a map of "
     f"{', '.join(Unfinished.__struct_fields__)}",
 }
-"""Description of the messages of each channel, which its metadata holds."""
+"""For each channel, the text in its metadata that describes its messages."""
 
 UNFINISHED = "no end: cut off, or still being recorded"
-"""The ending of a file that is not finished, in words."""
+"""Text that describes the ending of an unfinished file."""
 
 EVENTS_SCHEMA = 1
-"""Number of the schema of the events. The other channels have no schema."""
+"""MCAP schema number of the channel `events`. The other channels have no schema."""
 
 
 class About(Struct, frozen=True):
@@ -119,7 +122,7 @@ class About(Struct, frozen=True):
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
     config: str = ""
-    """The configuration at the beginning, as an `acsard.toml` with every key."""
+    """Configuration at the beginning of the recording, as an `acsard.toml` with every key."""
     format: str = FORMAT
     started_ns: Ns = 0
     """Wall-clock time of the daemon's start, ns since 1970; 0 if it is not known.
@@ -135,10 +138,13 @@ class EndRecordBuilder:
         self._wall_ns = self._last_ns = self._earliest_ns = about.wall_ns
         self._incidents: list[TimelineEntry] = []
         self._starts = False
-        """True once the first step of the daemon was among the messages."""
+        """True if the messages so far include the daemon's first step."""
 
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Take a message of any channel. For an event, call `event` as well."""
+        """Process a message of any channel; `wall_ns` is its wall-clock time, ns since 1970.
+
+        For a message of the channel `events`, call `event` as well.
+        """
         self._last_ns = max(self._last_ns, wall_ns)
         self._earliest_ns = min(self._earliest_ns, wall_ns)
         if topic == "steps":
@@ -148,15 +154,15 @@ class EndRecordBuilder:
                 self._starts = self._starts or unfinished(data).number == 0
 
     def event(self, event: TimelineEntry) -> None:
-        """Take an event for the summary."""
+        """Add an event to the summary if it is one of `INCIDENTS`."""
         if event.name in INCIDENTS:
             self._incidents.append(event)
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the end record.
+        """Return the end record for the messages so far.
 
-        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS` and `why` may
-        explain it.
+        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS`, and `why` may
+        explain that cause. Otherwise both are "".
         """
         text = summary(self._incidents, self._starts)
         return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
@@ -180,7 +186,7 @@ class Index:
         )
 
     def message(self, channel: int, wall_ns: int) -> None:
-        """Take a message; `wall_ns` is its wall-clock time in ns since 1970, at least 0."""
+        """Count a message; `wall_ns` is its wall-clock time in ns since 1970, at least 0."""
         totals = self._totals
         first_ns = totals.message_start_time if totals.message_count else wall_ns
         totals.message_start_time = min(first_ns, wall_ns)
@@ -194,9 +200,9 @@ class Index:
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Take a record. `at` is its offset in the file and `length` its size, both in bytes.
+        """Add a record to the index if it is metadata or an attachment. Ignore all other records.
 
-        Only metadata and attachments are indexed.
+        `at` is the offset of the record in the file, and `length` is its size, both in bytes.
         """
         if isinstance(record, Metadata):
             self._totals.metadata_count += 1
@@ -215,7 +221,7 @@ class Index:
 class Writing:
     """A recording that is being written.
 
-    Every method may raise `OSError`, and after that the object must not be written to.
+    Every method may raise `OSError`. After that, call only `close`.
     """
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
@@ -252,7 +258,10 @@ class Writing:
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message. `flush` writes it to the file, or the end of its chunk does."""
+        """Add a message to the current chunk; `wall_ns` is its wall-clock time, ns since 1970.
+
+        The message is written to the file at the next `flush`, or when its chunk ends.
+        """
         self._end_builder.message(topic, wall_ns, data)
         wall_ns = max(0, wall_ns)
         chunk = self._chunk
@@ -269,7 +278,7 @@ class Writing:
             self.end_chunk()
 
     def event(self, event: TimelineEntry) -> None:
-        """Add an event as a message, and to the summary in the end record."""
+        """Add an event as a message of `events`, and to the summary in the end record."""
         wall_ns = int(event.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(event))
         self._end_builder.event(event)
@@ -284,7 +293,7 @@ class Writing:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
     def _put(self, data: bytes) -> None:
-        """Write compressed bytes of the chunk, after its head if they are the first."""
+        """Write compressed bytes of the chunk. Write its head first if it is not written yet."""
         if self._chunk_at is None:
             self._chunk_at = self._file.tell()
             self._file.write(GROWING_HEAD)
@@ -337,7 +346,7 @@ class Writing:
 
 
 def _about_records(about: About) -> list[McapRecord]:
-    """Return the metadata and the attachment that tell what made a recording."""
+    """Return the metadata and the attachment `acsard.toml` that hold the fields of `about`."""
     meta = {key: str(value) for key, value in msgspec.to_builtins(about).items()}
     text, at_ns = meta.pop("config").encode(), about.wall_ns
     return [
@@ -347,7 +356,7 @@ def _about_records(about: About) -> list[McapRecord]:
 
 
 def _checksum(metadata: Mapping[str, str]) -> int:
-    """Return a checksum of the metadata, because MCAP has none."""
+    """Return a checksum of the metadata. An MCAP metadata record itself has no checksum."""
     return zlib.crc32(msgspec.json.encode(metadata, order="sorted"))
 
 
@@ -373,15 +382,16 @@ class Recording:
         """Read the file; raise `RecordingError` if it is not a recording that can be read."""
         self.path = path
         self.paths = [path]
-        """The files that are read, in order."""
+        """Paths of the files that are read, in order. Only a `Series` has more than one."""
         try:
             self._data = path.read_bytes()
         except OSError as error:
             raise RecordingError(f"cannot read {path}: {error.strerror}") from None
         self.ended = False
-        """True once `messages` has read the whole file, if the file is finished.
+        """True if the file is finished. This is known only after `messages` was read to its end.
 
-        Damage may hide the end of a finished file. Then `damaged` counts it.
+        It is also true if damage separates the end of the file from the readable messages.
+        `damaged` counts such damage.
         """
         self.damaged = 0
         """Number of damaged places, mostly chunks, that have readable data after them."""
@@ -390,12 +400,15 @@ class Recording:
         self.why = ""
         """For the cause `bug`: the step in which the daemon failed, and the exception."""
         self.unfinished: bytes | None = None
-        """Encoded inputs of the step in which the daemon failed."""
+        """Encoded inputs of the step in which the daemon failed; None if it did not fail."""
         self.about = self._about()
 
     @property
     def whole(self) -> bool:
-        """True if the file is finished and has no damaged place. Read all messages first."""
+        """True if the file is finished and has no damaged place.
+
+        This is known only after `messages` has been read to its end.
+        """
         return self.ended and not self.damaged
 
     @property
@@ -419,7 +432,7 @@ class Recording:
         return "; ".join(filter(None, [damaged, self.ending]))
 
     def compute_end_record(self) -> EndRecord:
-        """Read the recording, and return the end record that it lacks."""
+        """Read all messages, and return an end record for them whose `cut` is ""."""
         builder = EndRecordBuilder(self.about)
         for topic, wall_ns, data in self.messages():
             builder.message(topic, wall_ns, data)
@@ -429,7 +442,7 @@ class Recording:
         return builder.end_record()
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the topic, the wall-clock time in ns and the bytes of each message.
+        """Yield the topic, the wall-clock time in ns since 1970 and the bytes of each message.
 
         This also sets `ended`, `damaged`, `cut`, `why` and `unfinished`.
         """
@@ -451,7 +464,8 @@ class Recording:
             # A damaged chunk has its readable messages before the damage.
             self.damaged += place.damaged
         if not self.ended and (end := end_in(self._data)) is not None:
-            # The walk took the damage for a cut, because no complete chunk follows it.
+            # `walk` mistook the damage for the end of a cut-off file, because no complete chunk
+            # follows the damage.
             self.ended, self.cut, self.why = True, end.cut, end.why
             self.damaged += 1
 
@@ -512,7 +526,10 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def is_part(part: Recording, recording: Recording) -> bool:
-    """Return whether a recording has everything that `part` has, so that it may replace `part`."""
+    """Return whether `recording` has the metadata and all messages of `part`.
+
+    Then `recording` may replace `part`.
+    """
     if part.about != recording.about:
         return False
     return Counter(part.messages()) <= Counter(recording.messages())

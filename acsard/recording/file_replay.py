@@ -45,20 +45,23 @@ def no_progress(wall_ns: int) -> None:
 INCOMPLETE_STATE_ERRORS = (
     AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError
 )  # fmt: skip
-"""Exceptions that a robot raises if its recorded state lacks parts that this version expects."""
+"""Exceptions in the code of a robot whose recorded state lacks parts that this version expects."""
 
 
 class Gap(Struct):
-    """A part of a recording that is not replayed, because steps before it cannot be read."""
+    """A part of a recording that is not replayed.
+
+    It has the steps that cannot be read, and the steps from there to the next state of the robot.
+    """
 
     begin_ns: int
-    """Monotonic time of the last replayed step before it, ns."""
+    """Monotonic time of the last replayed step before the gap, ns."""
     end_ns: int
-    """Monotonic time of the first replayed step after it, or of the end of the recording, ns."""
+    """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
     unreadable: int = 0
-    """Number of steps that cannot be read, as far as it is known."""
+    """Known number of steps that cannot be read."""
     skipped: int = 0
-    """Number of steps that can be read, but come before the next state of the robot."""
+    """Number of steps that are readable, but not replayed: they precede the next robot state."""
     lines: int = 0
     """Number of lines to the board in the skipped steps."""
     end_lost: bool = False
@@ -77,11 +80,11 @@ class ReplayResult(NamedTuple):
     It is "" if the daemon did not fail.
     """
     event_copies: str = ""
-    """Sentence about the first copy of an event that differs from its step; "" if none does."""
+    """Sentence about the first event in a step whose copy differs; "" if all are equal."""
 
     @property
     def same(self) -> bool:
-        """True if all outputs of the replay are equal, and all copies of the events."""
+        """True if the replayed outputs equal the recorded ones, and the copies equal the events."""
         return self.comparison.same and not self.event_copies
 
 
@@ -107,7 +110,7 @@ def _items(
 ) -> Iterator[list[Step] | Checkpoint]:
     """Yield the batches of steps and the states of the robot, in order.
 
-    `copies` takes the same steps and the copies of their events.
+    If `copies` is not None, it receives the same steps, and the messages of the channel `events`.
     """
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
@@ -125,23 +128,24 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Largest size of the states that are decoded behind gaps, in bytes for each byte of the file.
+"""Limit on the total size of the states that are decoded after gaps, in bytes per byte of the file.
 
-A state takes a third of its size in a file. Without this limit a forged file of 5 kB took 4 s.
+In a file a state is compressed to a third of its size. Without this limit the replay of a forged
+file of 5 kB took 4 s.
 """
 
 
 class _Source:
-    """A recording that is replayed, and the robot that the replay took from it last."""
+    """A recording that is replayed, and the last robot that was decoded from it."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._state: State | None = None
-        """The robot that came from the file; None for a new robot."""
+        """The last robot that was decoded from the file; None if the robot is a new one."""
         self._left = MAX_BYTES
-        """Largest size in bytes of the states that may still be decoded behind gaps."""
+        """Total size of the states that may still be decoded after gaps, bytes."""
         for path in recording.paths:
-            # A file that is gone is reported when its steps are read.
+            # The reader of the steps reports a missing file later.
             with suppress(OSError):
                 self._left += MAX_STATE_BYTES * path.stat().st_size
 
@@ -169,10 +173,16 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Return the robot of `saved` if it is the robot before the step `number`.
+        """Decode the robot in `saved` if it is the robot before the step `number`.
 
-        Returns None if it is not, or if this version cannot read it. `tried` takes the
-        configuration of that robot, and returns the one that it gets.
+        Returns None if it is not, if this version cannot read it, or if the states that were
+        decoded after gaps exceed their limit in size.
+
+        Args:
+            saved: the last checkpoint that was read; None if there is none.
+            number: number of the next step.
+            tried: function that takes the configuration of the decoded robot, and returns the
+                configuration that replaces it. None keeps the configuration.
         """
         if saved is None or saved.number != number:
             return None
@@ -204,19 +214,19 @@ class RecordedRun(_Source):
         super().__init__(recording)
         self._other, self._recorded = other, config_of(recording)
         self.config = other or self._recorded
-        """Configuration of the first step."""
+        """Configuration with which the replay begins."""
         self.gaps: list[Gap] = []
-        """The gaps before the present step."""
+        """The gaps that were found so far."""
         self.number: int | None = None
-        """Number of the last step that `steps` yielded."""
+        """Number of the last step that `steps` yielded; None before the first."""
         self.skipped: Callable[[Step], None] = lambda step: None
         """Called with each step that can be read but not replayed."""
         self.copies = EventCopies(recording)
-        """The copies of the events of the steps that can be read."""
+        """Compares the events in the steps with their copies in the channel `events`."""
         self._next, self._state = _first_state(recording)
-        """Number of the step before which `robot` is known, and the recorded robot if it is one."""
+        """Number of the step before which `robot` is known. The state is None for a new robot."""
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
-        """The robot and its guard's memory. They are other objects after a gap."""
+        """The robot with which to replay, and its guard's memory. A gap replaces both objects."""
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
@@ -271,7 +281,10 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Take the robot from `saved`, and return True, if it is the one before this step."""
+        """Continue with the robot in `saved` if it is the robot before the step `number`.
+
+        Returns whether the replay can continue.
+        """
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
         state = self._resumed(saved, number, tried)
@@ -285,7 +298,8 @@ class RecordedRun(_Source):
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
     """Return `other` with the settings that changed from `recorded` to `present`.
 
-    A change that `other` does not permit is refused, as the robot would have refused it.
+    If `other` does not permit these changes, return `other` itself, because a robot with that
+    configuration would have refused them.
     """
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
@@ -300,7 +314,8 @@ def replay_file(
 ) -> ReplayResult:
     """Replay a recording with the configuration `other`, or with its own if `other` is None.
 
-    Raises `RecordingError` if this version cannot replay the recording.
+    Calls `progress` every `PROGRESS_STEPS` steps. Raises `RecordingError` if this version cannot
+    replay the recording.
     """
     run = RecordedRun(recording, other)
     with run.state_errors():
@@ -338,7 +353,10 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
 
 
 class DisplayReplay(_Source):
-    """Replay of a recording for display, which goes on after missing steps."""
+    """Replay of a recording for display.
+
+    It also replays the steps that come after missing steps and before the next state of the robot.
+    """
 
     def __init__(self, recording: Recording) -> None:
         """Read the recording; raise `RecordingError` if its configuration cannot be read."""
@@ -364,7 +382,7 @@ class DisplayReplay(_Source):
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
         """Yield each recorded step, its replayed outputs, and the robot after the step.
 
-        After a gap the robot does not match the recorded one until the next state of the robot.
+        After a gap the robot differs from the recorded one until the next state in the file.
         Raises `RecordingError` if the recorded state lacks a part that a step uses.
         """
         saved: Checkpoint | None = None
@@ -390,9 +408,11 @@ class DisplayReplay(_Source):
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:
-    """Return the number of the first step and the robot before it, or 0 and None for a new robot.
+    """Return the number of the first step, and the recorded robot before that step.
 
-    Raises `RecordingError` if the state is damaged, or if this version cannot read it.
+    Returns 0 and None if the recording has no state before its first step. Then the replay begins
+    with a new robot. Raises `RecordingError` if the state is damaged, or if this version cannot
+    read it.
     """
     for topic, _, data in recording.messages():
         if topic == "state":
@@ -437,7 +457,7 @@ class EventCopies:
         """Number of damaged places before the last batch."""
 
     def batch(self, steps: list[Step]) -> None:
-        """Take a batch of steps; its copies follow."""
+        """Add a batch of steps. `copy` must then be called for the copies of its events."""
         self._compare(last=False, follows=self._number in (None, steps[0].number))
         self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [
@@ -448,14 +468,14 @@ class EventCopies:
         self._copies = []
 
     def copy(self, data: bytes) -> None:
-        """Take a message of the channel `events`."""
+        """Add a message of the channel `events`, the copy of an event in the last batch."""
         try:
             self._copies.append(event_of(self._recording, data))
         except RecordingError as error:
             self._differs(str(error))
 
     def end(self) -> None:
-        """Compare the copies of the last batch, and the summary in the end record."""
+        """Compare the copies of the last batch. In a whole file, also compare its summary."""
         recording = self._recording
         self._compare(last=True)
         if self.difference or not recording.whole:

@@ -2,9 +2,10 @@
 
 `Report`, which the daemon uses too, builds the messages as if a client had subscribed to every
 topic all the time. A recording does not hold the daemon's measurements of itself, so the rows of
-`diagnostics` with such measurements are omitted. The lines of `log` are the entries of the
-timeline, so that they tell the same as `acsard recording show` and the report. They have all events
-of the robot, and also entries that the robot does not publish, such as `drive` and `reason`.
+`diagnostics` with such measurements are omitted. The messages of `log` are the entries of the
+timeline, so that `log` agrees with `acsard recording show` and with the report. These entries
+include all events of the robot, and also entries that the robot does not publish, such as `drive`
+and `reason`.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Publisher:
         """Time of the last step."""
         self._static: TFMessage | None = None
         self._static_due = True
-        """True before the first step, and after a setting has changed."""
+        """True if `tf_static` must be built: before the first step, and after a changed setting."""
 
     def _wanted_keys(self) -> frozenset[str]:
         names = {channel.native for channel in published_channels(left_out(self._config))}
@@ -73,9 +74,9 @@ class Publisher:
     def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
         """Yield the messages of a step that was just replayed: commands first, log lines last.
 
-        The steps must come in order. Give a step whose messages are not wanted to `skip`.
+        The steps must come in order. If the messages of a step are not wanted, call `skip` instead.
         """
-        # The step changed a setting.
+        # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
             self._config = self.robot.config
             self._report.use(self._config)
@@ -91,12 +92,12 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: Step) -> Iterator[Published]:
-        """Yield only the log lines of a step, which needs no replay."""
+        """Yield only the log lines of a step. The step need not have been replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 
     def end(self, ending: str = "") -> Iterator[Published]:
-        """Yield the log lines after the last step, as `TimelineWriter.end` does."""
+        """Yield the log lines after the last step; `ending` is as in `TimelineWriter.end`."""
         yield from map(self._line, self._timeline.end(ending))
 
     def _line(self, entry: TimelineEntry) -> Published:

@@ -50,7 +50,7 @@ class Taken(NamedTuple):
 class Start(NamedTuple):
     """The robot as it is before step `number`, so that a new file can begin there.
 
-    If the current file goes on, it gets the robot as a checkpoint.
+    If no new file is necessary, the robot is added to the current file as a checkpoint.
     """
 
     number: int
@@ -61,9 +61,9 @@ class Start(NamedTuple):
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
-    """Split the recorder's queue at each `Start`, and yield each `Start` with its steps.
+    """Split the recorder's queue at each `Start`, and yield each `Start` with the steps after it.
 
-    The first group has None instead of a `Start`.
+    The first group has the steps before the first `Start`, with None instead of a `Start`.
     """
     start: Start | None = None
     steps: list[Taken] = []
@@ -77,7 +77,7 @@ def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]
 
 
 class BlackBox(Protocol):
-    """Interface of the recorder for the control loop. No method waits."""
+    """Interface of the recorder for the control loop. No method waits for the disk."""
 
     def begins(self, robot: Robot, guard: Guard) -> None:
         """Record the robot and its guard before the first step."""
@@ -85,10 +85,14 @@ class BlackBox(Protocol):
     def step(
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a finished step; `sent` is the line that was sent to the board, or None."""
+        """Record a finished step.
+
+        `sent` is the line that the daemon wrote to the serial port, or None if it wrote no line.
+        `robot` and `guard` are in their state after the step.
+        """
 
     def died(self, inputs: Inputs) -> None:
-        """Take the inputs of the step in which the daemon failed. The failure ends the daemon."""
+        """Record the inputs of the step in which the daemon failed. The failure ends the daemon."""
 
     @property
     def status(self) -> Recording:
@@ -154,7 +158,10 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Return the CRC-32 `before`, continued by all bits of poses, twists and wheel angles."""
+    """Return the CRC-32 `before`, continued with all bits of poses, twists and wheel angles.
+
+    `before` is the CRC-32 of the earlier estimates of the batch, or 0 if there is none.
+    """
     for e in estimates:
         pose, twist = e.pose, e.twist
         data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)
@@ -165,7 +172,8 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 def input_names(inputs: Inputs, before: int) -> int:
     """Return the CRC-32 of the names of the sources, senders and clients in the inputs of a step.
 
-    `before` is the CRC-32 of the names in the inputs before these, or 0.
+    The result continues `before`, the CRC-32 of the names in the earlier inputs of the batch.
+    `before` is 0 for the first step of a batch.
     """
     names = [
         *[name for command in inputs.commands for name in (command.source, command.sender)],
@@ -173,12 +181,12 @@ def input_names(inputs: Inputs, before: int) -> int:
         *[name for refusal in inputs.refusals for name in (refusal.source, refusal.sender)],
         *[event.by for event in inputs.events],
     ]
-    # Most steps have no name. JSON keeps the ends of the names apart.
+    # Most steps have no name. The JSON encoding shows where each name ends.
     return zlib.crc32(msgspec.json.encode(names), before) if names else before
 
 
 def count_superseded(commands: Sequence[Command]) -> int:
-    """Return how many commands of a step a newer command of the same sender follows."""
+    """Return the number of commands of a step that precede a newer one of the same sender."""
     return len(commands) - len({(command.source, command.sender) for command in commands})
 
 

@@ -1,10 +1,10 @@
-"""The black box of a running daemon: takes the inputs and outputs of each step without waiting.
+"""The black box of a running daemon: records each step without delaying the control loop.
 
-The control loop puts references to the steps into a bounded queue. Once a second a thread takes all
-steps from the queue, adds them to the file as a block, and syncs the file to the disk. The log
-reports a disk that hangs for 3 s. If the queue fills, further steps are lost and counted. The
-recording then goes on in a new file that begins with the robot's state, so that the new file can be
-replayed.
+The control loop puts references to the inputs and outputs of each step into a bounded queue. Once a
+second a thread takes all steps from the queue, adds them to the file as a block, and syncs the file
+to the disk. The log reports a disk that hangs for 3 s. If the queue is full, further steps are lost
+and counted. The recording then goes on in a new file that begins with the robot's state, so that
+the new file can be replayed.
 """
 
 from __future__ import annotations
@@ -24,27 +24,31 @@ from acsard.recording.state import freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
 MAX_QUEUED_STEPS = 4096
-"""With 400 steps a second, a disk may hang for 10 s without a loss of steps."""
+"""Largest number of steps in the queue.
+
+At 400 steps a second, a disk may hang for 10 s without a loss of steps.
+"""
 
 SLOW_NS = 3 * NS_PER_S
-"""Time that a sync of the recording may take until the disk counts as hanging."""
+"""Duration of a sync of the recording above which the disk counts as hanging, ns."""
 
 SLOW = "the disk has accepted nothing for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Longest time between two steps that counts as waiting for the disk.
+"""Longest part of the time between two steps that is counted as waiting for the disk, ns.
 
-If this process did not run, its recorder's thread did not run either.
+During a longer pause this process did not run. Then the recorder's thread did not run either, and
+the disk is not the cause.
 """
 
 FLUSH_S = 0.98
-"""Pause between two syncs. Together with the duration of a sync, that is about one second."""
+"""Pause between two syncs, s. The pause and a sync together take about one second."""
 
 MAX_TEXT = 200
 """Largest number of characters of an exception's text."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
-"""Time limits of `close`: to write the end of the file, and then to write a marker instead."""
+"""Time limits of `close`, s: first to write the end of the file, then to write a marker instead."""
 
 
 class Recorder:
@@ -60,14 +64,14 @@ class Recorder:
 
         Args:
             config: the configuration at the daemon's start.
-            report: takes the recorder's own events; only `step` calls it.
+            report: function that receives the recorder's own events. Only `step` calls it.
             started_ns: wall-clock time of the daemon's start, ns since 1970. An export stamps the
                 messages that never change with it.
         """
         self._queue: deque[Taken | Start] = deque()
         self._report = report
         self._events: deque[Event] = deque()
-        """Events of the thread, which `step` passes on."""
+        """Events from the recorder's thread. `step` passes them to `report`."""
         self._number = 0
         """Number of steps so far."""
         self._lost = 0
@@ -76,16 +80,17 @@ class Recorder:
         self._syncs = 0
         """`StepWriter.syncs` at the last step."""
         self._waited_ns = self._now_ns = 0
-        """Time for which the present sync has lasted, and time of the last step."""
+        """Time for which the present sync has lasted, and monotonic time of the last step, ns."""
         self._slow = False
-        """True from the report of a disk that hangs until the report that it goes on."""
+        """True from the report that the disk hangs until the report that it accepts data again."""
         self._lost_before = 0
-        """Number of lost steps before the disk hung."""
+        """Number of steps that were lost before the disk hung."""
         self._failed_inputs: Inputs | None = None
-        """Inputs of the step in which the daemon failed."""
+        """Inputs of the step in which the daemon failed; None if it did not fail in a step."""
         self._wants_state = False
-        """The thread sets this for a new file or a checkpoint. `step` queues a robot's state and
-        clears it.
+        """True if the thread needs the robot's state for a new file or a checkpoint.
+
+        The thread sets this flag. `step` then queues the robot's state, and clears the flag.
         """
         self._writer = StepWriter(config, self._events.append, self._request_state, started_ns)
         self._over = threading.Event()
@@ -95,13 +100,17 @@ class Recorder:
     # These methods run in the control loop's thread.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Begin the first file with this robot. Without this call it begins with a new robot."""
+        """Begin the first file with this robot. Without this call the file has a new robot."""
         self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
 
     def step(
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a finished step; `sent` is the line that was sent to the board, or None."""
+        """Record a finished step.
+
+        `sent` is the line that the daemon wrote to the serial port, or None if it wrote no line.
+        `robot` and `guard` are in their state after the step.
+        """
         self._number += 1
         if self._events:
             self._report(self._events.popleft())
@@ -128,7 +137,7 @@ class Recorder:
             queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
 
     def _watch_disk(self, now_ns: int) -> None:
-        """Report that the disk hangs, and that a sync ends in time again."""
+        """Report when the disk begins to hang, and when a sync ends in time again."""
         before, self._syncs = self._syncs, self._writer.syncs
         passed = self._syncs - before
         if passed:
@@ -150,7 +159,7 @@ class Recorder:
             self._slow, self._lost_before = True, self._lost
 
     def died(self, inputs: Inputs) -> None:
-        """Take the inputs of the step in which the daemon failed. The failure ends the daemon."""
+        """Record the inputs of the step in which the daemon failed. The failure ends the daemon."""
         self._failed_inputs = inputs
 
     @property
@@ -164,10 +173,13 @@ class Recorder:
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
-        """Write the last steps and the end of the file, if the disk is quick enough.
+        """Write the last steps and the end of the file if the disk is quick enough.
 
-        `error` is the exception that ends the daemon. A `BaseException` that is not an `Exception`,
-        such as a `KeyboardInterrupt`, is an ordinary end.
+        If it is not, write a marker that says so, except after a failure of the daemon.
+
+        `error` is the exception that ends the daemon, or None for an ordinary end. A
+        `BaseException` that is not an `Exception`, such as a `KeyboardInterrupt`, counts as an
+        ordinary end too.
         """
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]
@@ -183,7 +195,7 @@ class Recorder:
 
     def _bug(self, error: Exception) -> Bug:
         why = type(error).__name__
-        # The text of an exception may be impossible to produce. Then its type must be enough.
+        # Python may fail to produce the text of an exception. Then its type must be enough.
         with suppress(Exception):
             why = f"{why}: {error}"[:MAX_TEXT].encode(errors="replace").decode()
         if self._failed_inputs is None:

@@ -24,7 +24,11 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
 
 NOTHING_BYTES = 64 << 10
-"""A larger file has more than a header and one second, so it held data, perhaps unreadable."""
+"""Largest size of a file that may hold no data, bytes.
+
+A larger file has more than a header and one second of steps, so it holds data, even if the data is
+unreadable.
+"""
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
@@ -42,7 +46,7 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
         A message for the log, or "" if the recovery succeeded completely.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the disk refuses to read or write.
     """
     before, message = part.stat(), ""
     try:
@@ -102,13 +106,13 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the end of the file after the last readable second, over the torn rest.
+    """Write the end of the file after the last readable second, over the incomplete data there.
 
-    A chunk without its true head gets it. If a power cut interrupted an earlier recovery after it
-    wrote the end, only the heads are written.
+    Also write the true head of each chunk that still has the head of a growing chunk. If a power
+    cut interrupted an earlier recovery after it had written the end, write only the heads.
 
-    Returns False if the disk has no room; then the file is unchanged. No recorded second is given
-    up to gain room: some disks return no room, and then everything would be lost.
+    Returns False if the disk has no room. Then the file is unchanged. No recorded second is removed
+    to gain room: some disks do not give the room back, and then everything would be lost.
     """
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -139,15 +143,16 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
     """Return the writes that finish a file, each with its offset, and the file's new size.
 
-    `before` is the file as it is. The end of the file is written before the heads, because the disk
-    may have no room for it.
+    `before` is the present content of the file, and `last` is the end record to write. The end of
+    the file comes before the heads, because the disk may have no room for the end.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
     for place in walk(before):
         if isinstance(place.record, Footer) and before.startswith(MAGIC, place.end):
             return heads, place.end + len(MAGIC)
-        # A record after a chunk belongs to an earlier end, which the new end overwrites.
+        # A record after a chunk belongs to the end that an earlier recovery began to write. The new
+        # end overwrites it.
         if place.record is not None and chunk is None:
             length = len(encoded(place.record))
             index.record(place.record, place.end - length, length)
@@ -158,7 +163,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
                 index.message(message.channel, message.wall_ns)
             if chunk.complete and not before.startswith(head := chunk.head(before), chunk.begin):
                 heads.append((chunk.begin, head))
-    # Another process has changed the file since it was read.
+    # Without any chunk, another process has changed the file since it was read.
     if chunk is None:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
     before_end = b""
@@ -170,7 +175,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at` and sync it. After an `OSError`, a part may be written."""
+    """Write `data` at the offset `at` and sync it. An `OSError` may leave a part of it written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -178,10 +183,10 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the end of an MCAP file, to be written at the offset `at`.
+    """Return the end of an MCAP file with the end record `last`, to be written at the offset `at`.
 
     The summary section omits the copy of the schema and the channels, because the disk may be
-    nearly full. It has the statistics, because some readers take a file without them for empty.
+    nearly full. It has the statistics, because some readers treat a file without them as empty.
     """
     record = Metadata(END, as_metadata(last))
     data = encoded(record)

@@ -47,16 +47,16 @@ Output = Literal[
     "event text",
     "input names",
 ]
-"""An output that is compared.
+"""Name of an output whose recorded and replayed values are compared.
 
 `line` is the line that the robot decided, and `sent line` the line that the guard let pass. `event`
-is the name, level, kind or number of an event, and `client` the name of the client in an event.
-`input names` are the names in the inputs of a batch, which differ from its checksum; the difference
-is in the last step of the batch.
+is the name, level, kind or count of an event, and `client` the name of the client in an event.
+`input names` are the names in the inputs of a batch of steps. They are compared by a checksum of
+the whole batch, so a difference belongs to the last step of the batch.
 """
 
 WORDING: frozenset[Output] = frozenset({"reason", "event text"})
-"""Outputs that are text for people, so that another version may word them differently."""
+"""Outputs that are text for people. Another version may word them differently."""
 
 
 class Difference(Struct, frozen=True):
@@ -86,10 +86,10 @@ class Comparison(Struct):
     links_same: int = 0
     sources_same: int = 0
     events: int = 0
-    """Number of events. A step counts with the side, recorded or replayed, that has more."""
+    """Number of compared events: for each step, the larger of the recorded and replayed numbers."""
     events_same: int = 0
     exact: bool = True
-    """True while every recorded checksum matches: all poses are equal to the last bit."""
+    """True if every checksum so far matches. Then all estimates are equal to the last bit."""
     first: Difference | None = None
     first_by_output: dict[Output, Difference] = {}
     """First difference of each output that differs."""
@@ -109,7 +109,7 @@ class Comparison(Struct):
 
     @property
     def only_words(self) -> bool:
-        """True if nothing but the words of reasons or events differs."""
+        """True if there are differences, but only in the words of reasons or events."""
         return not self.same and self.first_by_output.keys() <= WORDING
 
 
@@ -136,9 +136,12 @@ class Replay:
     def __init__(
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
-        """Start with `robot` and the guard's `memory`, or with a new robot of `config`."""
+        """Start with `robot` and its guard's `memory`.
+
+        If `robot` is None, start with a new robot of `config`.
+        """
         self.outputs: Outputs | None = None
-        """Outputs of the last replayed step."""
+        """Outputs of the last replayed step; None before the first step."""
         self.comparison = Comparison()
         self.resume(robot or Robot(config), memory)
         self._checksum = self._names = 0
@@ -146,7 +149,7 @@ class Replay:
         """The last replayed pose."""
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
-        """Go on with this robot and its guard's memory, because steps before it are missing."""
+        """Continue with another robot and its guard's memory, for example after missing steps."""
         self.robot = robot
         self._config = robot.config
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
@@ -160,7 +163,7 @@ class Replay:
         if step.begins:
             self._checksum = self._names = 0
         outputs = self.outputs = replay_step(self.robot, step)
-        # The step changed a setting.
+        # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
             self._config = self.robot.config
             self._guard.use(self._config)
@@ -180,7 +183,10 @@ class Replay:
         return difference
 
     def _keep(self, difference: Difference) -> None:
-        """Keep the first difference, that of each output, and the replay's own first fault."""
+        """Store the difference if it is the first one, the first of an output, or the first fault.
+
+        A fault is stored only if the recording is not in fault at that step.
+        """
         comparison = self.comparison
         comparison.first = comparison.first or difference
         for output in difference.what:
@@ -247,7 +253,7 @@ class Replay:
 def _different_parts(
     replayed: tuple[Event, ...], recorded: tuple[Event, ...]
 ) -> tuple[Output, ...]:
-    """Return the parts in which the events of a step differ."""
+    """Return the names of the outputs in which the replayed and the recorded events differ."""
     parts: tuple[tuple[Output, Callable[[Event], object]], ...] = (
         ("event", lambda event: (event.name, event.level, event.kind, event.count, event.news)),
         ("client", lambda event: event.by),
@@ -258,7 +264,7 @@ def _different_parts(
 
 @lru_cache(64)
 def fastest(line: bytes | None) -> int:
-    """Return the highest wheel speed in a line, hundredths of rad/s; 0 without any."""
+    """Return the highest wheel speed in a line, hundredths of rad/s; 0 if there is no speed."""
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

@@ -60,7 +60,7 @@ def explain_verdict(other: bool) -> str:
 
 
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Describe in a sentence what the gaps cost, or return "" if there is none.
+    """Describe in a sentence how much the gaps leave out, or return "" if there is no gap.
 
     `how` says what did not happen to the steps in the gaps, for example "not compared".
     """
@@ -121,8 +121,8 @@ def explain_settings(
 ) -> list[str]:
     """Explain in lines of text why another configuration leads to other results.
 
-    The lines name the changed settings, the first line to the board that differs because of those
-    settings, and a new fault. They also warn that the recorded wheels did not obey the other
+    The text names the changed settings, the first line to the board that differs because of those
+    settings, and a new fault. It also warns that the recorded wheels did not obey the other
     configuration. `began_ns` is the monotonic time at which the recording began, ns.
     """
     before, after = (dict(flat(effective(config))) for config in (recorded, other))
@@ -164,9 +164,9 @@ def _speeds(recorded: int, replayed: int) -> str:
 def describe_outcome(comparison: Comparison) -> list[str]:
     """Describe in lines of text how the replayed robot moved, compared with the recorded one."""
     rows = [
-        f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines would differ, and "
-        f"{comparison.steps - comparison.modes_same} of {comparison.steps} steps would have "
-        "another mode",
+        f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
+        f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "
+        f"{comparison.steps} steps have another mode",
         f"the fastest wheel of all lines: {_speeds(*comparison.fastest)}",
     ]
     if comparison.end is not None:

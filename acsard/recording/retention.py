@@ -1,9 +1,10 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
 A recording is protected if an incident happened in it, or within a minute of it. Protected
-recordings are deleted last. A part of the disk is left to other programs. If they need more than
-that part, the unprotected recordings except the newest are deleted. Protected recordings and the
-newest are deleted only when the space for recordings is nearly used up.
+recordings are deleted last. All recordings together have a largest size, and a part of the disk
+(`Disk.spare`) is left to other programs. If less than that part is free, old unprotected recordings
+are deleted, but not the newest recording. Protected recordings and the newest one are deleted only
+if less than a fifth of that part is free, or if the largest size is exceeded.
 
 `ClockWatch` decides whether the wall clock can be trusted for the age of a recording.
 """
@@ -27,19 +28,22 @@ incident. All others are `plain`.
 """
 
 AROUND_NS = 60 * NS_PER_S
-"""Time before and after an incident within which recordings are retained."""
+"""Time before and after an incident within which recordings are retained, ns."""
 
 KEPT_FILES = 50
-"""Number of recordings with an incident that are protected: the newest ones."""
+"""Largest number of recordings with an incident that are protected. The newest are chosen."""
 
 FILES = 100
-"""A file may take a hundredth of the total size, so 50 protected files take about half of it."""
+"""The largest size of a file is the total size divided by this number.
+
+Then 50 protected files take about half of the total size.
+"""
 
 LEAST_BYTES = 100_000
 """Size up to which a file may grow even on a small disk, bytes."""
 
 SPARE = 0.05
-"""Fraction of the disk that is left to other programs."""
+"""Fraction of the disk that is left to other programs, but at most `SPARE_BYTES`."""
 
 SPARE_BYTES = 1_000_000_000
 """Largest number of bytes that is left to other programs."""
@@ -48,10 +52,10 @@ NEEDED = 0.2
 """If less than this fraction of `Disk.spare` is free, protected recordings are deleted too."""
 
 JUMP_NS = 60 * NS_PER_S
-"""A larger change of the wall clock against the monotonic clock is a jump of the wall clock."""
+"""Change of the wall clock against the monotonic clock above which it counts as a jump, ns."""
 
 STEADY_NS = 600 * NS_PER_S
-"""Time without a jump after which the wall clock is trusted for the age of a recording."""
+"""Time without a jump after which the wall clock is trusted for the age of a recording, ns."""
 
 
 class Disk(NamedTuple):
@@ -168,10 +172,13 @@ def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
 
 
 class ClockWatch(Struct):
-    """Detects jumps of the wall clock. The wall clock is trusted a while after the last jump."""
+    """Detects jumps of the wall clock. The clock is trusted `STEADY_NS` after the last jump."""
 
     _since_ns: int | None = None
-    """Monotonic time of the last jump, or of the first call of `jump_ns`; None before it."""
+    """Monotonic time of the last jump, or of the first call of `jump_ns`, ns.
+
+    None before the first call of `jump_ns`.
+    """
     _ahead_ns: int = 0
     """Offset of the wall clock from the monotonic clock at the last call of `jump_ns`, ns."""
 
@@ -204,11 +211,11 @@ class IncidentWindow(Generic[File]):
         self._happened_ns = -AROUND_NS
 
     def begin(self, now_ns: int) -> None:
-        """Register the beginning of a new file at `now_ns`."""
+        """Register the beginning of a new file at the monotonic time `now_ns`, ns."""
         self.kind = "near" if now_ns - self._happened_ns < AROUND_NS else "plain"
 
     def happened(self, now_ns: int) -> list[File]:
-        """Retain the current file because of an incident at `now_ns`.
+        """Retain the current file because of an incident at the monotonic time `now_ns`, ns.
 
         Returns the plain files that ended less than a minute before the incident. The caller must
         retain them too.
@@ -219,18 +226,24 @@ class IncidentWindow(Generic[File]):
         return close
 
     def end(self, file: File, last_ns: int) -> None:
-        """Register the end of the current file as `file`, with its last step at `last_ns`."""
+        """Register the end of the current file as `file`.
+
+        `last_ns` is the monotonic time of its last step, ns.
+        """
         self._recent = [(older, ns) for older, ns in self._recent if last_ns - ns < AROUND_NS]
         if self.kind == "plain":
             self._recent.append((file, last_ns))
 
     def earlier(self, file: File, kind: Kind, ended_ns: int) -> None:
-        """Register a file of the previous run of the daemon, with its class and its end."""
+        """Register a file of the previous run of the daemon.
+
+        `kind` is its retention class, and `ended_ns` the monotonic time of its end, ns.
+        """
         if kind == "plain":
             self._recent.append((file, ended_ns))
         elif kind == "kept":
             self.earlier_happened(ended_ns)
 
     def earlier_happened(self, at_ns: int) -> None:
-        """Register the time of an incident of the previous run, such as its crash."""
+        """Register the monotonic time `at_ns`, ns, of an incident or crash of the previous run."""
         self._happened_ns = max(self._happened_ns, at_ns)

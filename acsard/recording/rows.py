@@ -49,10 +49,10 @@ MAX_ROWS = 4096
 """Largest number of rows in a batch. The recorder's queue never holds more steps."""
 
 MAX_TIME_NS = 1 << 61
-"""Largest time since the computer's start, and largest age of a serial read: 73 years."""
+"""Largest time since the computer's start, and largest age of a serial read, ns: 73 years."""
 
 MAX_OFFSET_NS = 1 << 62
-"""Largest offset of the wall clock from the monotonic clock, which a recording reaches in 2116.
+"""Largest offset of the wall clock from the monotonic clock, ns. A recording reaches it in 2116.
 
 The sum of such an offset, a time and an age fits in 64 bits.
 """
@@ -65,8 +65,8 @@ class BatchError(AcsardError):
 class Rare(Struct, frozen=True, omit_defaults=True):
     """Values that most steps do not have.
 
-    `opened`, `trouble` and `status` are None if they are as in the previous row. `guard_trip` is
-    the input that says why the guard replaced the previous line.
+    None in `opened`, `trouble` or `status` means that the value of the previous row still applies.
+    `guard_trip` is the input that says why the guard replaced the previous line.
     """
 
     opened: int | None = None
@@ -90,7 +90,7 @@ class Read(NamedTuple):
     """One read from the serial port. Its times are in units of `Batch.unit`."""
 
     age: int
-    """Time from the read to the step that takes the bytes."""
+    """Time from the read to the step that processes the bytes."""
     offset: int
     """Offset of the wall clock at the read, encoded as in `Row.offset`."""
     data: bytes
@@ -189,7 +189,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
 def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
     """Yield the `now` and `offset` of each row, then the `age` and `offset` of its reads, in ns.
 
-    `mono_ns` and `offset_ns` are those of the batch.
+    `mono_ns` and `offset_ns` are the fields of the `Batch`.
     """
     tick_ns = mono_ns
     for inputs, _, _ in taken:
@@ -309,7 +309,10 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return the instant with an encoded `offset`; raise `ValueError` if it is out of range."""
+    """Return the instant at `mono_ns`; raise `ValueError` if one of its times is out of range.
+
+    `offset` is the offset of the wall clock, encoded as in `Row.offset`.
+    """
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
         raise ValueError("a time is out of range")

@@ -22,17 +22,19 @@ from acsard.recording.file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
 
 MARGIN_S = 60.0
-"""Time around a recording in which its steps are searched for.
+"""Tolerance for the times in an end record, s.
 
-The end record has the time at which the last message began, and a slow disk makes messages long.
+A file is read completely if it covers a time within this tolerance of the searched range. The end
+record has only the time at which the last message began, and a slow disk makes messages long. The
+pause between two files of one series is also shorter than this.
 """
 
 GAP_S = 2.0
-"""Longest time between two recordings that is not reported as a gap."""
+"""Longest time between two recordings that is not reported as a gap, s."""
 
 
 class Series(Recording):
-    """Several files of one run of the daemon without a missing step between them, read as one."""
+    """Several files of one run of the daemon, read as one. No step is missing between them."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         """Read the first file. Raises `RecordingError` as `Recording` does."""
@@ -68,7 +70,7 @@ class Search(Struct):
     unreadable: list[str] = field(default_factory=list)
     """A sentence for each file that cannot be read."""
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    """Times in the range in which nothing was recorded, s since 1970."""
+    """Begin and end of each time in the range in which nothing was recorded, s since 1970."""
 
 
 class NothingRecordedError(AcsardError):
@@ -76,7 +78,7 @@ class NothingRecordedError(AcsardError):
 
 
 class _Piece(NamedTuple):
-    """A time that a file covers, s since 1970."""
+    """A range of time that a file covers, from `begin` to `end`, s since 1970."""
 
     begin: float
     end: float
@@ -84,10 +86,11 @@ class _Piece(NamedTuple):
 
 
 def search(files: Sequence[Path], first: float, last: float) -> Search:
-    """Find the steps between two times, s since 1970, in the files of a directory, in their order.
+    """Find the recordings that have steps between the times `first` and `last`, s since 1970.
 
-    If a drive was under way at the beginning of a found file, the file before it is read too.
-    Raises `NothingRecordedError` if there is no such step.
+    `files` are the recordings of a directory, oldest first. If a drive was under way at the
+    beginning of a found file, the files that hold the earlier part of the drive are read too.
+    Raises `NothingRecordedError` if no file has a step between these times.
     """
     result, pieces = Search(), list[_Piece]()
     chosen: dict[int, Contents] = {}
@@ -120,7 +123,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
 
 
 def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
-    """Return the times between two times that no piece covers."""
+    """Return the ranges longer than `GAP_S` between `first` and `last` that no piece covers."""
     inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
     ends = [first]
     for piece in inside:
@@ -131,7 +134,10 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    """Return the numbers of the chosen files, grouped into series."""
+    """Return the indices in `files` of the chosen files, grouped into series.
+
+    Each group begins with the files that `_earlier` adds.
+    """
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
@@ -142,7 +148,11 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the numbers of the files before this one in which its first drive began."""
+    """Return the indices of the earlier files with the drive that is under way as a file begins.
+
+    `number` is the index of that file, and `contents` are its contents. If no drive is under way
+    at its beginning, the list is empty.
+    """
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
         number -= 1
@@ -165,14 +175,14 @@ def _continues(before: Contents, contents: Contents) -> bool:
 
 
 def _covered(path: Path) -> _Piece:
-    """Return the time that a file covers. The whole file must be read if it has no end."""
+    """Return the range of time that a file covers. Without an end record, read the whole file."""
     end = read_end(path) or Recording(_present(path)).compute_end_record()
     earliest_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
     return _Piece(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
 
 
 def _present(path: Path) -> Path:
-    """Return the present path of a recording, because the daemon renames a file at its end."""
+    """Return the present path of a recording. The daemon renames each file that it finishes."""
     if path.exists() or not path.parent.is_dir():
         return path
     stem = path.name.partition(".")[0]
@@ -194,7 +204,7 @@ def _described(piece: _Piece) -> str:
 
 
 def in_words(first: float, last: float) -> str:
-    """Describe a range of time, s since 1970, both of which may be infinite."""
+    """Describe the range of time from `first` to `last`, s since 1970. Both may be infinite."""
     parts = [
         f"{word} {clock(at, day=True)}"
         for word, at in (("from", first), ("to", last))

@@ -1,7 +1,7 @@
 """Encodes a robot between two steps as bytes, decodes it, and applies another configuration to it.
 
-A file that begins during a drive begins with such a robot, and every file has one about every 20 s,
-from which a replay goes on behind a damaged place.
+A file that begins during a drive begins with such a robot. Every file has another one about every
+20 s, from which a replay goes on after a damaged place.
 
 `freeze` uses pickle, which encodes a robot in a fraction of a millisecond. `thaw` does not use
 pickle, because a forged file could run code through it. It uses `unpickling.py`, which makes only
@@ -88,7 +88,10 @@ _checkpoint = msgspec.msgpack.Decoder(Checkpoint)
 
 
 def checkpoint(data: bytes) -> Checkpoint:
-    """Decode a message of `state`, but not its robot; raise `StateError` if damaged."""
+    """Decode a message of the channel `state`, but not the robot in it.
+
+    Raises `StateError` if the message is damaged.
+    """
     try:
         return _checkpoint.decode(data)
     except msgspec.MsgspecError as error:
@@ -107,7 +110,7 @@ def freeze(robot: Robot, memory: Memory) -> bytes:
 
 
 def thaw(data: bytes) -> State:
-    """Return a robot and its guard's memory; raise `StateError` if it cannot be made."""
+    """Decode a robot and its guard's memory; raise `StateError` if this is not possible."""
     try:
         made = unpickle(data, part_class)
     except ValueError as error:
@@ -148,9 +151,9 @@ PLAIN = (bool, int, float, str, bytes, type(None))
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
     """Apply another configuration to the recorded robot `robot`, in place.
 
-    The three robots are compared attribute by attribute. If an attribute of the recorded robot
-    still equals that of the robot `begun`, it takes the value of `other`. If the drive has changed
-    the attribute, it keeps its value. The classes of the robot need no code for this.
+    The three robots are compared attribute by attribute. An attribute of `robot` that equals the
+    attribute of `begun` is replaced by the attribute of `other`. An attribute that the drive has
+    changed keeps its value. The classes of the robot need no code for this.
 
     Args:
         robot: the recorded robot.
@@ -165,18 +168,23 @@ class _Walk:
 
     def __init__(self) -> None:
         self._visited: dict[int, Any] = {}
-        """Visited objects with their `id`. The reference keeps the object alive, and its `id`
-        unique.
+        """Maps the `id` of each visited object to the object.
+
+        The reference keeps the object alive, so that its `id` stays unique.
         """
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Merge each attribute of the object `now` in place."""
+        """Merge the attributes of the object `now` in place.
+
+        `now`, `begun` and `other` are the same object in the three robots of `adopt`.
+        """
         if id(now) in self._visited:
             return
         self._visited[id(now)] = now
         for name in _names(other):
             new = getattr(other, name)
-            # Another version recorded the robot without this attribute. Take it from a new robot.
+            # Another version may have recorded the robot without this attribute. The new robot has
+            # it.
             if not hasattr(now, name):
                 setattr(now, name, new)
                 continue
@@ -186,9 +194,9 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the merged value: `now`, perhaps with changed parts, or `other`.
+        """Return the merged value of an attribute: `now`, perhaps with changed parts, or `other`.
 
-        `now`, `begun` and `other` are the same attribute of the three robots.
+        `now`, `begun` and `other` are the values of the attribute in the three robots of `adopt`.
         """
         if type(now) is not type(other):
             return other if _same(now, begun) else now

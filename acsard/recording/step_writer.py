@@ -1,9 +1,9 @@
 """The recorder's thread: writes steps to the current file, and reacts to errors of the disk.
 
 One thread calls `StepWriter.write` about once a second. That call writes and syncs the steps that
-have arrived, begins and ends files, and retains the files around an incident. If the disk refuses,
-the steps of that call are lost and counted. The writer then pauses for `RETRY_ROUNDS` calls and
-tries again with a new file, which begins with the robot's state.
+have arrived, begins and ends files, and marks the files around an incident so that they are deleted
+last. If the disk refuses to write, the steps of that call are lost and counted. The writer then
+pauses for `RETRY_ROUNDS` calls. After the pause it begins a new file with the robot's state.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import entry_of
 
 RETRY_ROUNDS = 5
-"""Number of calls of `write`, about one each second, to wait after the disk refused."""
+"""Number of calls of `write`, about one each second, that pass without a write after an error."""
 
 BATCH = 256
 """Largest number of steps in one message. A second has fewer, unless many commands arrive."""
 
 CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
-"""Time from one state of the robot in a file to the request for the next one, about two chunks.
+"""Time from a checkpoint in a file to the request for the next one, ns: about two chunks.
 
-Damage to a chunk of steps then costs a replay 20 s at most. In a step of the control loop a
-checkpoint takes 0.6 ms, after the line has left. In the file it takes 6 kB at rest and 13 kB while
-driving.
+After damage to a chunk of steps, a replay then lacks at most 20 s. A checkpoint takes 0.6 ms of the
+control loop's step, after the loop has written its line to the port. In the file a checkpoint takes
+6 kB at rest and 13 kB while driving.
 """
 
 MAX_FILE_NS = 3600 * NS_PER_S
-"""Longest time that one file may cover."""
+"""Longest time that one file may cover, ns."""
 
 INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
     "port_lost",
 })  # fmt: skip
-"""Events because of which the files within a minute of the event are retained."""
+"""Names of the events for which all files within a minute of the event are retained."""
 
 
 class Bug(NamedTuple):
@@ -78,27 +78,31 @@ class StepWriter:
 
         Args:
             config: the configuration at the daemon's start.
-            report: takes events for the log.
-            request_state: asks the control loop for a `Start`.
+            report: function that receives each event for the log.
+            request_state: function that asks the control loop for a `Start`.
             started_ns: wall-clock time of the daemon's start, ns since 1970.
         """
         self._started_ns = started_ns
         self.where = config.record.directory
         self.trouble = ""
-        """Why the disk refuses, for the user; "" if it does not."""
+        """The error of the disk, in words for the user; "" if the disk accepts data."""
         self.lost = 0
         """Number of steps lost because the disk refused to write."""
         self.syncs = 0
-        """Number of beginnings and ends of a sync of the current file; odd during a sync."""
+        """Number of syncs that have begun plus number that have ended; odd during a sync."""
         self._lost_before = 0
         """Number of steps that were lost before the present trouble began."""
         self._safe_ns: int | None = None
-        """Monotonic time of the last step that a sync has brought to the disk, ns."""
+        """Monotonic time of the last step that a sync has brought to the disk, ns, or None."""
         self._config, self._report, self._request_state = config, report, request_state
         self._ring: Ring | None = None
         self._writing: Writing | None = None
         self._start: Start | None = Start(0, b"", config)
-        """Start of the next file. None if steps were lost, so that the robot's state is needed."""
+        """The robot with which the next file begins.
+
+        It is None after a file has begun with it, and after steps were lost. Before a new file
+        the writer then requests a new `Start`.
+        """
         self._incidents = IncidentWindow[Path]()
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
@@ -112,14 +116,17 @@ class StepWriter:
         self._cut_ns: int | None = None
         """Wall-clock time at which a crash cut off the previous run's file, ns since 1970.
 
-        It is set when that file is finished, and used once.
+        It is set when that file is recovered, and cleared when this run begins its first file.
         """
         self.bug: Bug | None = None
         """The failure that ends the daemon; only the last call of `write` reads it."""
         self._pause = 0
         self._handed = self._safe = 0
-        """Steps of this call that were written to the file or counted as lost, and how many of
-        those are synced or counted. If the disk refuses, the other steps are lost.
+        """Numbers of steps of the present call of `write`.
+
+        `_handed` counts the steps that were written to the file or counted as lost. `_safe` counts
+        those of them that are synced or counted as lost. If the disk refuses to write, all other
+        steps of the call are lost.
         """
 
     def write(self, items: list[Taken | Start], over: bool) -> None:
@@ -146,7 +153,7 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Mark the unfinished file, so that the next start does not report it as cut by a crash.
+        """Mark the unfinished file with the cause `cut`, so that it does not count as a crash.
 
         Another thread may call this method while `write` waits for the disk.
         """
@@ -167,8 +174,8 @@ class StepWriter:
     def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
         """Write steps to the current file, after the robot's state if `start` is not None.
 
-        A new file begins with `start` if steps are missing before it, or if the current file is
-        long enough.
+        A new file begins with `start` if steps are missing before `start`, or if the current file
+        is long enough.
         """
         if start is not None and self._writing is not None and self._goes_on(ring, start):
             self._add_checkpoint(self._writing, start, self._last)
@@ -187,7 +194,7 @@ class StepWriter:
             self._add(ring, self._writing, steps[at : at + BATCH])
 
     def _goes_on(self, ring: Ring, start: Start) -> bool:
-        """Return whether the current file goes on with the step before which `start` was taken."""
+        """Return whether the current file can go on with the first step after `start`."""
         return start.number == self._number and not self._is_long_enough(ring)
 
     def _is_long_enough(self, ring: Ring) -> bool:
@@ -200,7 +207,7 @@ class StepWriter:
         self._state_ns = now.mono_ns
 
     def _add(self, ring: Ring, writing: Writing, batch: list[Taken]) -> None:
-        """Write steps as one message, or as several if a reader would refuse such a large one."""
+        """Write steps as one message, or as several if one message is too large for a reader."""
         data = encode(self._number, batch)
         if len(data) > MAX_DATA_BYTES and len(batch) > 1:
             half = len(batch) // 2
@@ -239,7 +246,10 @@ class StepWriter:
         self._add_checkpoint(self._writing, start, now)
 
     def _look_back(self, ring: Ring, now: Instant) -> None:
-        """Register the files of the previous run, so that incidents count over a restart."""
+        """Register the files of the previous run of the daemon.
+
+        Then an incident also protects the files within a minute of it that another run wrote.
+        """
         for path, kind, ended_ns in ring.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)
         self._looked_back = True

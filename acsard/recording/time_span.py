@@ -1,7 +1,7 @@
 """Times that a person types, and the part of a recording between two of them.
 
-A recording may cross midnight, and its clock may be set in the middle of it. A time is therefore
-looked up in every stretch between two clock steps.
+A recording may cross midnight, and the wall clock may be set during the recording. A time is
+therefore looked up in every `Stretch`, a part of the recording between two settings of the clock.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A day, from `begin` to `end`, or a moment, at which both are equal; s since 1970."""
+    """A day from `begin` to `end`, s since 1970. For a moment `begin` and `end` are equal."""
 
     begin: float
     end: float
@@ -80,7 +80,7 @@ def parse_when(text: str, now_s: float) -> When:
     if re.fullmatch(r"\d+(\.\d+)?", words):
         return Offset(float(words))
     if ago := _AGO.fullmatch(words):
-        # No recording is older than 1970, and older times have no date everywhere.
+        # No recording is older than 1970, and not every system can convert older times to a date.
         moment = max(0.0, now_s - float(ago[1]) * _UNIT_S[ago[2]])
         return Moment(moment, moment)
     day, _, rest = words.partition(" ")
@@ -121,7 +121,10 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
 
 
 def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
-    """Return a local time `days` days after a date, s since 1970. The day may exceed its month."""
+    """Return the local time `when`, `days` days after a date, in s since 1970.
+
+    The day of the month may be less than 1 or beyond the end of the month.
+    """
     year, month, day = date
     whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)
     return time.mktime(whole) + when.seconds
@@ -132,10 +135,14 @@ def _unknown(text: str) -> TimeError:
 
 
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
-    """Return the range of time between two times, s since 1970, both of which may be infinite.
+    """Return the begin and the end of a range of time, s since 1970. Both may be infinite.
 
-    A time of day of `begin` is its last occurrence before `end` or before the present time `now_s`.
-    A time of day of `end` is its first occurrence after `begin`, or the last one before `now_s`.
+    - None, or an `Offset`, does not limit the range on its side.
+    - A time of day in `begin` means its last occurrence before `end` if `end` is a `Moment`.
+      Otherwise it means the last occurrence before the present time `now_s`, s since 1970.
+    - A time of day in `end` means its first occurrence after `begin`. If `begin` does not limit the
+      range, it means the last occurrence before `now_s`.
+
     Raises `TimeError` if the range ends before it begins.
     """
     first, last = -math.inf, math.inf
@@ -161,7 +168,7 @@ def _last_occurrence(when: TimeOfDay, before_s: float) -> float:
 
 
 def clock(seconds: float, day: bool = False) -> str:
-    """Return a time in s since 1970 as local time, to the ms or with the date."""
+    """Return a time in s since 1970 as local time: with its date if `day`, else with its ms."""
     local = time.localtime(seconds)
     if day:
         return time.strftime("%Y-%m-%d %H:%M:%S", local)
@@ -179,12 +186,13 @@ class Stretch(NamedTuple):
     at: float
     """Start of the stretch, s after the beginning of the recording."""
     begin: float
+    """Wall-clock time at the start of the stretch, s since 1970."""
     end: float
-    """End of the stretch, s since 1970, as is `begin`."""
+    """Wall-clock time at the end of the stretch, s since 1970."""
 
 
 def span(recording: Recording, begin: When | None, end: When | None) -> Span:
-    """Return the part of a recording between two times."""
+    """Return the part of a recording between two times. None does not limit the part."""
     by_clock = any(isinstance(when, TimeOfDay | Moment) for when in (begin, end))
     found = stretches(recording) if by_clock else []
     first = None if begin is None else _seconds(begin, found, end=False)
@@ -211,13 +219,16 @@ def _seconds(when: When, found: list[Stretch], end: bool) -> float:
 
 
 def part_between(found: list[Stretch], first: float, last: float) -> Span | None:
-    """Return the part of a recording between two times, s since 1970; None if it is empty."""
+    """Return the part of a recording between the times `first` and `last`, s since 1970.
+
+    `found` are the stretches of the recording. Returns None if none of them overlaps that range.
+    """
     inside = [one for one in found if one.begin <= last and first <= one.end]
     if not inside:
         return None
     begin = min(one.at + max(first, one.begin) - one.begin for one in inside)
     end = max(one.at + min(last, one.end) - one.begin for one in inside)
-    # The end of the file belongs to the part too if the last step does.
+    # If the part includes the last step, it also includes the end of the file.
     whole_begin = inside[0] is found[0] and first <= found[0].begin
     whole_end = inside[-1] is found[-1] and last >= found[-1].end
     return Span(-math.inf if whole_begin else begin, math.inf if whole_end else end)
@@ -238,7 +249,7 @@ class Contents(NamedTuple):
 
 
 def stretches(recording: Recording) -> list[Stretch]:
-    """Return the stretches between clock steps in order; none if no step can be read."""
+    """Return the stretches of a recording in order. The list is empty if no step is readable."""
     contents = read_contents(recording)
     return contents.stretches if contents else []
 
@@ -280,7 +291,7 @@ def _from(recording: Recording, now: Instant) -> Stretch:
 
 
 def _steps(data: bytes) -> list[Step]:
-    """Return the steps of a message, or nothing if it is damaged."""
+    """Return the steps of a message, or an empty list if the message is empty or damaged."""
     try:
         return list(decode(data)) if data else []
     except BatchError:

@@ -30,31 +30,40 @@ FURTHEST_S = 2**63 / 1e9
 
 
 REASON_NS = NS_PER_S
-"""Shortest time between two entries about a reason. Two sources may alternate in every step."""
+"""Shortest time between two entries about a reason, ns.
+
+Two sources may alternate in every step.
+"""
 
 POSE_NS = NS_PER_S
-"""Longest time for which the entry `continues` waits for a pose. Without a link there is none."""
+"""Longest time, ns, for which the entry `continues` is delayed until a pose is known.
+
+Without a link to the board no pose arrives.
+"""
 
 SET_NS = 5 * NS_PER_S
-"""Difference between wall clock and monotonic clock that counts as a clock step, ns."""
+"""Change of the wall clock against the monotonic clock that counts as a clock step, ns."""
 
 WAITS_NS = NS_PER_S
-"""Time for which a sender must send speeds in vain before the timeline has an entry about it.
+"""Time, ns, for which a sender must send speeds without effect before it gets an entry.
 
-A sender that takes over from another one overlaps with it for a shorter time.
+When one sender takes over from another one, both send for a shorter time than this.
 """
 
 SILENT_NS = NS_PER_S
-"""Pause after which a sender begins anew to wait."""
+"""Pause of a sender, ns, after which its waiting time restarts at 0."""
 
 MAX_IDENTITY_BYTES = 256
-"""Largest length of a line with which a microcontroller names itself. The firmware's has 150."""
+"""Largest length of a line with which a microcontroller names itself, bytes.
+
+The firmware's line has 150 bytes.
+"""
 
 MAX_WAITING = 16
 """Largest number of senders that are watched. A stranger may send under any number of names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
-"""A number, but not a digit of a name.
+"""Pattern that finds a number, but not a digit in a name.
 
 Reasons that differ only in numbers, such as a duration, count as one reason.
 """
@@ -66,14 +75,20 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     seconds: Annotated[float, Meta(ge=-FURTHEST_S, le=FURTHEST_S)]
     """Wall-clock time, s since 1970."""
     name: str
-    """Name of the event, or a name that only the timeline uses.
+    """Name of the event, or one of the names that only the timeline uses:
 
-    The names of the timeline are `link_late` for a `link_stale` that this computer caused,
-    `link_heard` for a further event about a link that is already lost, `reason` for a change of the
-    reason without a change of the mode, `waits` for a sender that must wait while another one
-    drives, `board` for the words of a microcontroller about itself and its last reset, `clock` for
-    a clock that was set, `continues` for the first step of a recording that continues another one,
-    `cut` for a recording without an ordinary end, and `start`, `drive`, `gap` and `end`.
+    - `start`: the daemon starts.
+    - `continues`: the recording continues an earlier one.
+    - `drive`: a drive has ended, or is under way as the recording ends.
+    - `link_late`: an event `link_stale` that this computer caused.
+    - `link_heard`: a further event about a link that is already lost.
+    - `reason`: the reason has changed, but the mode has not.
+    - `waits`: a sender must wait while another one drives.
+    - `board`: a microcontroller has named itself and its last reset.
+    - `clock`: the wall clock was set.
+    - `gap`: steps are missing.
+    - `end`: the daemon received the request to end.
+    - `cut`: the recording has no ordinary end.
     """
     text: str
     level: str = "info"
@@ -97,14 +112,17 @@ def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
 
 
 class LinkLosses:
-    """Detects the further events about a link that is already lost."""
+    """Detects repeated events about a link that is already lost."""
 
     def __init__(self) -> None:
         self._names: set[str] = set()
-        """Names of the events about the lost link since the link was last up."""
+        """Names of the events about a lost link since the link was last up."""
 
     def repeated(self, name: str) -> bool:
-        """Take an event, and return whether it repeats one about the same loss of the link."""
+        """Register an event by its name.
+
+        Returns whether it repeats an event about the same loss of the link.
+        """
         if name == "link_up":
             self._names.clear()
         if name not in ("link_down", "link_booting", "link_stale", "link_late"):
@@ -115,18 +133,21 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Detects that the robot does the same for another reason, which no event reports."""
+    """Detects that the reason changes while the mode stays the same, without an event about it."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
-        """Mode and reason that the timeline has, the reason without its numbers."""
+        """The last mode and reason that the timeline shows. In the reason `#` replaces numbers."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry, or of the last event that the link is lost."""
+        """Monotonic time of the last entry, or of the last event about a lost link, ns."""
         self._sender = ("", "")
-        """Source of the last step that had one, and its last sender."""
+        """The last source that the robot followed, and the last sender on that source."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the reason changed and the mode did not. The events come before it."""
+        """Yield an entry if the reason changed and the mode did not.
+
+        In the timeline the events of the step come before this entry.
+        """
         mode, text, _, source = step.recorded.status
         now, reason = step.inputs.now, NUMBER.sub("#", text)
         for command in step.inputs.commands:
@@ -136,7 +157,7 @@ class ReasonChanges:
             return
         reported = mode != self._mode or any(event.text == text for event in step.recorded.events)
         if reported and mode == "waiting":
-            # A link that was lost for less than a second has one reason, which its event reports.
+            # If a link was lost for less than a second, the event about the loss is sufficient.
             self._reported_ns = now.mono_ns
         elif not reported and mode != "driving":
             if now.mono_ns - self._reported_ns < REASON_NS:
@@ -153,9 +174,9 @@ _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
 class BoardIdentity:
     """Detects the line with which a microcontroller names itself.
 
-    The board sends it when it has started, and when the daemon asks. The robot reports it only if
-    the link was up. A board that starts slowly loses the link first, so only its own words say why
-    it was silent.
+    The board sends this line after its start, and when the daemon asks for it. The robot reports
+    the line as an event only if the link was up. If a board starts slowly, the link is lost before
+    the line arrives. Then only the line explains why the board was silent.
     """
 
     def __init__(self) -> None:
@@ -171,7 +192,7 @@ class BoardIdentity:
             data = self._data + read.data
             begin = data.find(IDENTITY[:1])
             if begin < 0:
-                # Most reads.
+                # Most reads contain no such line.
                 self._data = b""
                 continue
             self._data = data[begin:][-MAX_IDENTITY_BYTES:]
@@ -192,9 +213,9 @@ class _Waiting(Struct):
     """A sender that sends speeds while the robot follows another one."""
 
     since_ns: int
-    """Monotonic time of its first speed in vain, ns."""
+    """Monotonic time of the first speed that the robot did not follow, ns."""
     last_ns: int
-    """Monotonic time of its last speed in vain, ns."""
+    """Monotonic time of the last speed that the robot did not follow, ns."""
     reported: bool = False
 
 
@@ -210,7 +231,7 @@ class WaitingSenders:
         """Monotonic time of the last entry."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry for each sender that has waited for `WAITS_NS`, once until it ends."""
+        """Yield an entry for each sender that has waited for `WAITS_NS`: one for each wait."""
         for event in step.recorded.events:
             if event.name == "commander":
                 # If the log combined several changes, `by` has several names.
@@ -257,10 +278,11 @@ class WaitingSenders:
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return why a source waits for the followed one.
+        """Return why the source `waiting` waits for the source `followed`.
 
-        Returns "" if it does not wait: the robot refuses the commands of an unknown source, and
-        those of a source with the higher priority that it does not follow.
+        Returns "" if the source `waiting` does not wait, because the robot refuses its commands.
+        That is so if one of the sources is unknown, or if the source `waiting` has the higher
+        priority and the robot still does not follow it.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -276,23 +298,26 @@ class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
     def __init__(self, config: Config | None = None) -> None:
-        """Take the sources' priorities from `config`; without it no entry is `waits`."""
+        """Prepare for the first step.
+
+        `config` has the priorities of the sources. If it is None, there are no `waits` entries.
+        """
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
         self._began_ns: int | None = None
         """Monotonic time at which the present drive began, ns; None between drives."""
         self._distance_m = 0.0
-        """Distance of the present drive."""
+        """Distance of the present drive, m."""
         self._sources: list[str] = []
         """The sources that commanded the present drive, in the order in which they began."""
         self._since = ""
-        """Words for a drive that began before the first step; "" for any other drive."""
+        """Words in the entry of a drive that began before the first step; "" for other drives."""
         self._now: Instant | None = None
         """Time of the last step."""
         self._shutting_down = False
         self._continued: Step | None = None
-        """First step of a recording that continues another one, until its entry is made."""
+        """First step of a recording that continues another one; None once its entry is made."""
         self._losses = LinkLosses()
         self._board = BoardIdentity()
         self._reasons = ReasonChanges()
@@ -357,7 +382,7 @@ class TimelineWriter:
         if abs(ahead_ns) < SET_NS:
             return
         way = "forward" if ahead_ns > 0 else "back"
-        # The monotonic clock stands while the computer is suspended.
+        # The monotonic clock does not advance while the computer is suspended.
         slept = ", or this computer was suspended" if ahead_ns > 0 else ""
         text = (
             f"the clock of this computer was set {way} by {lasting(abs(ahead_ns) / NS_PER_S)}"
@@ -388,8 +413,9 @@ class TimelineWriter:
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
         """Yield the entries after the last step.
 
-        They are the drive that goes on there, if there is one, and `ending`, which says how the
-        recording ended other than by an ordinary end of the daemon (`Recording.ending`).
+        They are an entry for a drive that is still under way, and an entry with `ending`.
+
+        `ending` is `Recording.ending`: how the recording ended, or "" if the daemon ended normally.
         """
         yield from self._continues()
         if self._now is None:
@@ -421,18 +447,18 @@ INCIDENTS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Words for the events in a summary.
+"""Maps the name of an event to its word in a summary.
 
-`link_up` has no words. It is in the table because it ends the loss of a link.
+`link_up` has no word. It is in the table because it ends the loss of a link.
 """
 
 
 SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
-"""A stop, a bumper hit or a fault in a summary."""
+"""Pattern that finds a stop, a bumper hit or a fault in a summary."""
 
 
 def is_serious(text: str) -> bool:
-    """Return whether a summary has a stop or a fault."""
+    """Return whether the summary `text` counts a stop, a bumper hit or a fault."""
     # A client may have a name that looks like a fault.
     return SERIOUS.search(text.partition(" (stopped by ")[0]) is not None
 
@@ -440,15 +466,15 @@ def is_serious(text: str) -> bool:
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
     """Summarize the events of a recording in a few words.
 
-    The summary counts each kind of incident and names the clients that stopped the robot. It begins
-    with "start" if `starts` is true, because the recording begins with the daemon's start.
+    The summary counts each kind of incident and names the clients that stopped the robot. If the
+    recording includes the daemon's start, `starts` is true and the summary begins with "start".
     """
     counts: Counter[str] = Counter()
     stopped: list[str] = []
     losses = LinkLosses()
     for event in events:
         word = INCIDENTS.get(event.name)
-        # A wheel that counts again is the end of a wheel fault, and no warning.
+        # A `wheel_fault` of level `info` reports the end of a fault: the wheel counts again.
         ended = event.name == "wheel_fault" and event.level == "info"
         if losses.repeated(event.name) or not word or ended:
             continue

@@ -17,8 +17,8 @@ one dict each took more than 3 s of processor time. A few bytes allocated more t
 changed the class of the robot for the whole process. The commands that read a recording have no
 limits of time or memory that would stop such an attack.
 
-A part that the bytes have referred to cannot grow any more. Therefore no part contains itself, and
-the depth and the size are exact.
+Once the bytes refer to an earlier part, that part cannot grow any more. Therefore no part contains
+itself, and the depth and the size of every part are exact.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ import msgspec
 from msgspec import Struct
 
 MAX_BYTES = 1 << 20
-"""Largest size of a pickled robot. A robot takes 12 000 to 40 000 bytes, or a few times as much
-with many command senders.
+"""Largest size of a pickled robot, bytes.
+
+A robot takes 12 000 to 40 000 bytes, or a few times as much with many command senders.
 """
 
 MAX_OPCODES = 1 << 17
@@ -49,8 +50,9 @@ Without this limit a few bytes could copy the same part again and again.
 """
 
 MAX_KEY = 2**61 - 1
-"""Integers used as keys are smaller than this number. Their hashes all differ, so forged keys
-cannot collide.
+"""Bound on the absolute value of an integer that is used as a key.
+
+Below this bound every integer except -1 is its own hash, so that forged keys cannot collide.
 """
 
 MAX_DEPTH = 50
@@ -63,7 +65,7 @@ MAX_KEY_PARTS = 4
 """Largest number of elements of a tuple that is used as a key."""
 
 FindClass = Callable[[str, str], type]
-"""Function that returns a class from the names of its module and of itself.
+"""Function that takes the name of a module and the name of a class, and returns the class.
 
 It raises `ValueError` for a class that is not a part of a robot.
 """
@@ -72,13 +74,13 @@ ARGUMENTS = {
     "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE",
     "SHORT_BINBYTES", "BINBYTES",
 }  # fmt: skip
-"""Opcodes that push their argument."""
+"""Opcodes that push their argument onto the stack."""
 
 VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-"""Opcodes that push a constant."""
+"""Opcodes that push a constant onto the stack, each with the constant."""
 
 CONTAINERS: dict[str, type] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
-"""Opcodes that push a new, empty container."""
+"""Opcodes that push a new, empty container onto the stack, each with its type."""
 
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 """Opcodes that make a tuple of the top values, each with the number of these values."""
@@ -123,7 +125,10 @@ class _Entry:
         """True once an opcode has referred to the value. Then it cannot grow any more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Add the depth and size of new parts; raise `ValueError` if a limit is exceeded."""
+        """Update the depth and the size for new parts of this value.
+
+        Raises `ValueError` if a limit is exceeded, or if the value is closed.
+        """
         if self.closed:
             raise ValueError("a part of it contains itself, or grows while it is built")
         for part in parts:
@@ -151,7 +156,7 @@ class _Machine:
         """Number of values copied so far."""
 
     def result(self) -> object:
-        """Return the only value that is left on the stack."""
+        """Return the only value on the stack; raise `ValueError` if there is not exactly one."""
         if len(self._stack) != 1 or self._marks:
             raise ValueError("it is damaged: it ends in the middle")
         return self._stack[0].value
@@ -195,7 +200,7 @@ class _Machine:
         self._stack.append(entry)
 
     def _top(self, count: int) -> list[_Entry]:
-        """Pop the last `count` values."""
+        """Pop and return the last `count` values of the stack."""
         if len(self._stack) < count:
             raise IndexError("its stack is empty")
         taken = self._stack[-count:]
@@ -203,14 +208,17 @@ class _Machine:
         return taken
 
     def _marked(self) -> list[_Entry]:
-        """Pop all values behind the last mark."""
+        """Remove the last mark. Pop and return all values above it."""
         mark = self._marks.pop()
         taken = self._stack[mark:]
         del self._stack[mark:]
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """Count the values of `entry`, which are copied to make a part."""
+        """Add the size of `entry`, whose values are copied into a new part, to the copied values.
+
+        Raises `ValueError` if there are more than `MAX_COPIED`.
+        """
         self._copied += entry.size
         if self._copied > MAX_COPIED:
             raise ValueError("it has more parts than any robot")
@@ -333,7 +341,7 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
     "NEWOBJ": _Machine.make_bare,
     "BUILD": _Machine.set_attributes,
 }
-"""The methods that execute opcodes. `_Machine.do` handles the opcodes of the other tables."""
+"""Maps an opcode to the method that executes it. The tables above have the simpler opcodes."""
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
@@ -348,9 +356,9 @@ def _keys(entries: Sequence[_Entry]) -> None:
 
 
 def _is_part(kind: Any) -> bool:
-    """Return whether objects of a class have only attributes, and need no code of the class.
+    """Return whether an object of the class `kind` consists of nothing but its attributes.
 
-    Such an object can be made without its constructor.
+    Such an object can be rebuilt without its constructor and without other code of the class.
     """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")

@@ -2,12 +2,12 @@
 
 All modules of this package are pure, except `page.drawn`, which replays the recording.
 
-- `report_data` takes the steps one by one and keeps the data to draw. It thins the data while they
-  arrive (`acsard.core.thinning`), so a day takes no more memory than a minute.
-- `command_sources` keeps the part of these data that shows which source drove.
+- `report_data` collects the data to draw, step by step. It thins the data while they arrive
+  (`acsard.core.thinning`), so a day takes no more memory than a minute.
+- `command_sources` collects the part of these data that shows which source drove.
 - `report_text` describes the recording in words.
-- `figures` draws it, with the elements of `plot_elements`.
-- `page` assembles the file.
+- `figures` draws the data, with the elements of `plot_elements`.
+- `page` assembles the HTML file.
 
 The caller passes the code of the library plotly as an argument. Each text of unknown origin, such
 as a name or the text of an event, must pass `page.escaped` or `plot_elements.label`.

@@ -14,9 +14,9 @@ from acsard.core.values import NS_PER_S, Command, Outputs, Twist
 from acsard.recording.recorded_steps import Step
 
 STATES = ("refused", "waits", "sends", "drives")
-"""States of a source that is not silent. If short spans must be merged, the first of them wins.
+"""States of a source that is not silent. If short spans must be merged, the first of these wins.
 
-`sends` means that the robot accepts the source's commands, but stands for another reason.
+In the state `sends` the robot accepts the source's commands, but does not drive for another reason.
 """
 
 MOVES = ("ready", "driving")
@@ -47,7 +47,7 @@ class CommandSources:
         self._newest: dict[tuple[str, str], Command] = {}
         """The last command of each source and sender, the newest last."""
         self._counted: Counter[str] = Counter()
-        """The robot's numbers of refused commands after the last step, for each reason."""
+        """Number of commands that the robot had refused after the last step, for each reason."""
         self._refused: dict[str, tuple[float, str]] = {}
         """For each refused source: the time until which it counts as refused, s, and the reason."""
 
@@ -56,7 +56,10 @@ class CommandSources:
         return source if source in self._timeouts else OTHERS
 
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
-        """Take the commands of a step at `t`, s. Return whether the refused sources changed."""
+        """Process the commands of a step at time `t`, s. `robot` is the robot after the step.
+
+        Returns whether a refusal of a source was added or extended.
+        """
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
             self._newest.pop((command.source, command.sender), None)

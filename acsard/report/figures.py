@@ -1,4 +1,4 @@
-"""Draws the data of a report: the path of the robot, and all else over time.
+"""Draws the data of a report: the path of the robot, and all other data over time.
 
 Times in the pictures are local times in ms since 1970, because plotly knows no time zones.
 """
@@ -34,7 +34,7 @@ from acsard.report.plot_elements import (
 from acsard.report.report_data import Mark, Marks, ReportData
 
 ROW_PX, AXIS_PX = 54, 68
-"""Height of a row of bands, and additional height for the time axis."""
+"""Height of a row of bands, and additional height for the time axis, px."""
 
 
 class Line(NamedTuple):
@@ -48,49 +48,60 @@ class Line(NamedTuple):
     width: float = 1.6
     """Line width, px."""
     values: Sequence[float] = ()
-    """Values that the page shows when the user points at the curve; () for those of the points."""
+    """Values that the page shows when the user points at the curve.
+
+    If it is (), the page shows the values of `points`.
+    """
 
 
 GAP_PX = 30
-"""Height of the gap above each part of a picture, for the title of the part."""
+"""Height of the gap above each part of a picture, px. The gap holds the title of the part."""
 
 LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
-"""Smallest span of the speeds' scales, m/s and rad/s, for a robot that stands all the time."""
+"""Smallest span of the speed scales, m/s and rad/s, for a robot that never moves."""
 
 BENEATH = 3.4
-"""Width of a curve that another curve nearly covers, px. Its colour shows on both sides."""
+"""Width of a curve that another curve nearly covers, px.
+
+Its colour stays visible on both sides of the other curve.
+"""
 
 
 class Clip(NamedTuple):
     """A time during which a curve is outside of its diagram, and is drawn at the edge."""
 
     t: float
-    """Time at which it leaves the diagram, s."""
+    """Time at which the curve leaves the diagram, s."""
     edge: float
-    """Value at the edge at which it is drawn."""
+    """Value of the edge at which the curve is drawn."""
     value: float
-    """Its value furthest from the edge."""
+    """The value of the curve that is furthest from the edge."""
 
 
 MARKS_APART = 0.02
-"""Smallest distance of two marks of a curve that leaves its diagram, as a share of the width."""
+"""Smallest distance of two marks of a curve that leaves its diagram.
+
+It is a fraction of the diagram's width.
+"""
 
 HEADROOM = 0.5
-"""Room for commanded speeds beyond the limited and measured ones, as a share of their span. A
-command that the robot follows after a ramp stays visible; one of 99 m/s does not flatten the rest.
+"""Room for commanded speeds above and below the limited and measured speeds.
+
+It is a fraction of the span of the limited and measured speeds. A command that the robot reaches
+after a ramp stays visible. A command of 99 m/s does not flatten the other curves.
 """
 
 
 def clipped(
     points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
 ) -> tuple[list[Point], list[Clip]]:
-    """Keep a curve within the scale of other curves.
+    """Limit a curve to the scale of other curves. Return it, and the times when it is outside.
 
     Args:
         points: the curve; NaN interrupts it.
         others: the curves that determine the scale, with `HEADROOM`.
-        least: smallest span of the scale, for a robot that stands.
-        gap: a curve that leaves the diagram again within this time, s, is marked once.
+        least: smallest span of the scale, for a robot that does not move.
+        gap: if the curve leaves the diagram again within this time, s, it gets no second mark.
     """
     values = [0.0, *(p.value for curve in others for p in curve if math.isfinite(p.value))]
     room = HEADROOM * max(max(values) - min(values), least)
@@ -115,7 +126,7 @@ class Part(NamedTuple):
     title: str
     lines: list[Line]
     beyond: Sequence[Clip] = ()
-    """Places at which the first curve leaves the diagram."""
+    """The times at which the first curve of `lines` is outside of the diagram."""
 
 
 Row = tuple[str, list[Span]]
@@ -395,7 +406,7 @@ class TimeFigures:
         return Figure("sources", title, caption, _keys(styles), height, traces, axes)
 
     def _bars(self, style: BandStyle, spans: list[tuple[int, Span]]) -> Trace:
-        """Draw the spans of one style; the first part of each pair is the number of the row."""
+        """Draw the spans of one style. Each pair in `spans` is the number of a row and a span."""
         kind, colour = style.kind, style.colour
         # The border line keeps even a very short band visible.
         marker: dict[str, Any] = {"color": colour, "line": {"color": colour, "width": 1}}
@@ -462,7 +473,10 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw parts of `px` height above each other, with one time axis and one legend."""
+        """Draw the parts one below the other, with one time axis and one legend.
+
+        `px` is the height of one part.
+        """
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}
@@ -509,7 +523,11 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Return plotly's text for the point under the pointer, with `values` if there are any."""
+    """Return plotly's settings of the text that it shows at the pointer.
+
+    The text has the name of the curve, the time, and one of `values`. If there are no `values`, it
+    has the y coordinate of the point.
+    """
     shown = "customdata" if values else "y"
     text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
     return {"hovertemplate": text} | ({"customdata": numbers(values)} if values else {})

@@ -2,8 +2,8 @@
 
 No text of unknown origin can become code in it. Each text passes `escaped`. The pictures are JSON
 without any `<`, in a block that browsers do not execute. As a second barrier, the security policy
-of the page allows only its two scripts, which it names with their hashes, and forbids to load
-anything.
+of the page allows only the page's two scripts, which it identifies by their hashes. It also forbids
+the page to load anything.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ addEventListener("afterprint", () => paper(false));
 
 
 MAX_OPEN = 40
-"""Largest number of events with which the list of events is open at first."""
+"""The page first shows the list of events open if it has at most this number of events."""
 
 
 def escaped(text: str) -> str:
@@ -137,7 +137,8 @@ def page(
 ) -> str:
     """Return the report as the text of one HTML file.
 
-    `library` is the code of plotly, and `offset_s` the offset of the local time from UTC, s.
+    `library` is the code of plotly, `clock` formats the times, and `offset_s` is the offset of the
+    local time from UTC, s.
     """
     figures = TimeFigures(data, offset_s).all()
     title = escaped(f"{origin.robot}, {clock(data.began or 0.0, True)}")
@@ -177,10 +178,16 @@ def page(
 def drawn(
     recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
-    """Replay a part of a recording; return the text of the file and notes about the recording.
+    """Replay a part of a recording, and return the text of its report and the notes in it.
 
-    `progress` is called with the wall-clock time reached, in ns. Raises `RecordingError` if nothing
-    was recorded in that time.
+    Args:
+        recording: the recording.
+        library: the code of plotly.
+        span: the part of the recording to draw.
+        progress: called with the wall-clock time that the replay has reached, ns since 1970.
+
+    Raises:
+        RecordingError: the part has no step.
     """
     about, replayed = recording.about, DisplayReplay(recording)
     began = about.wall_ns / NS_PER_S
@@ -190,7 +197,7 @@ def drawn(
             progress(step.inputs.now.wall_ns)
         data.step(step, outputs, robot)
         if data.over:
-            # Read the rest, so that the notes count every damaged place.
+            # Read the rest of the recording, so that the notes count every damaged place.
             deque(recording.messages(), maxlen=0)
             break
     if data.began is None:

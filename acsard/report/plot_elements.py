@@ -37,11 +37,11 @@ SOURCE_COLOURS = (
 """Colours of the driving sources. Neighbours in this list are easy to distinguish."""
 
 PATTERNS = ("", "/", "x", ".", "-")
-"""Fill patterns of the bands. When all colours are used, they repeat with the next pattern."""
+"""Fill patterns of the bands. When all colours are used, the colours repeat with a new pattern."""
 
 
 def source_style(number: int) -> tuple[str, str]:
-    """Return the colour and the pattern of the n-th driving source."""
+    """Return the colour and the pattern of a driving source; `number` counts them from 0."""
     beyond, place = divmod(number, len(SOURCE_COLOURS))
     return SOURCE_COLOURS[place], PATTERNS[beyond % len(PATTERNS)]
 
@@ -76,7 +76,7 @@ class Figure(NamedTuple):
     layout: dict[str, Any]
     """Plotly's description of axes, margins and notes."""
     timed: bool = True
-    """True if the x axis is the time. If the user zooms one such picture, the page zooms all."""
+    """True if the x axis is the time. The page zooms all pictures with a time axis together."""
 
 
 def label(text: str) -> str:
@@ -92,7 +92,7 @@ def numbers(values: Iterable[float]) -> dict[str, str]:
 
 
 def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
-    """Return a curve or marks through these points; `look` has their attributes in plotly."""
+    """Return a curve, or marks, at these points. `look` has the attributes that plotly knows."""
     return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
 
 
@@ -118,7 +118,10 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """Return a heading in a picture: `x` is a share of its width, `y` a value of its y axis."""
+    """Return a heading in a picture.
+
+    `x` is a fraction of the picture's width from 0 to 1, and `y` is a value on its y axis.
+    """
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
         "yanchor": "middle", "showarrow": False, "font": {"size": 13},

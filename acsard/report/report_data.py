@@ -31,9 +31,10 @@ LINKS = ("down", "stale", "booting", "up")
 """States of the link. If short spans must be merged, the first of these states wins."""
 
 MAX_EVENT_TEXT = 1000
-"""Largest length of the text of an event, because a recording may come from a stranger.
+"""Largest number of characters that are kept of an event's text.
 
-The entry `continues` with the reason of a fault has 308 characters.
+A recording from a stranger may have longer texts. An entry `continues` with the reason of a fault
+has 308 characters.
 """
 
 FIRST, LAST = 30, 30
@@ -41,7 +42,7 @@ FIRST, LAST = 30, 30
 
 
 class Mark(Struct, frozen=True):
-    """An event, with the place of the robot."""
+    """An event, with the place of the robot at that time."""
 
     t: float
     """Time since the first collected step, s."""
@@ -55,7 +56,7 @@ class Mark(Struct, frozen=True):
     place: Place | None
     """Place according to odometry; None before the first pose."""
     seconds: float
-    """Wall-clock time, s since 1970, of the clock that the robot had then."""
+    """Wall-clock time of the event by the robot's clock at that moment, s since 1970."""
 
     @property
     def words(self) -> str:
@@ -73,12 +74,12 @@ class Marks:
         self._count = 0
         """Number of calls of `add`."""
         self.counts: Counter[str] = Counter()
-        """Number of events of each name. A repeated event counts as often as it occurred."""
+        """Number of events of each name. A mark for several equal events counts that often."""
         self.left_out = 0
         """Number of events that were dropped."""
 
     def add(self, mark: Mark) -> None:
-        """Add an event. If there are too many of its name, drop one from their middle."""
+        """Add an event. If there are too many events of its name, drop one from their middle."""
         self.counts[mark.name] += mark.count
         self._count += 1
         row = (self._count, mark)
@@ -106,9 +107,9 @@ class Driven(Struct):
 class Lateness:
     """Delay of each period's step, relative to the step with the smallest delay.
 
-    The recording has the number of missed periods, so the number of each period is known. Its due
-    time is then known except for a constant offset. The step with the smallest delay gives this
-    offset.
+    The recording has the number of missed periods, so the number of each period is known. The time
+    at which a period was due is then known except for a constant offset. The step with the smallest
+    delay gives this offset.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -117,7 +118,7 @@ class Lateness:
         self._number = 0
         """Number of the last period."""
         self._ahead = 0
-        """Number of lines since then that were sent at once, in place of a later period's line."""
+        """Number of lines since the last period that were sent before the period they belong to."""
         self._began_ns: int | None = None
         self._earliest = math.inf
         """Smallest delay, ns."""
@@ -125,11 +126,11 @@ class Lateness:
         """Number of periods without a step."""
 
     def at_once(self) -> None:
-        """Register a line that was sent at once, in place of the next period's line."""
+        """Register a line that was sent at once, instead of in the next period."""
         self._ahead += 1
 
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
-        """Take the step of a period.
+        """Process the step of a period.
 
         `t` (s) and `now_ns` (monotonic, ns) are its time, and `missed` is the number of periods
         since the previous tick that had no step. `known` is False if the recording lacks steps
@@ -171,7 +172,7 @@ class LineCount:
         self.curve, self.total = Curve(), 0
 
     def add(self, t: float, count: int) -> None:
-        """Add the lines of the second around `t`."""
+        """Add the number of lines in the second around the time `t`, s."""
         self.curve.add(t, count)
         self.total += count
 
@@ -194,14 +195,17 @@ class SerialCounts:
         self._outstanding: int | None = None
         """Smallest number of unanswered lines at any step of this second.
 
-        At another step the answer to the newest line may just not have arrived yet. The smallest
-        number counts only the lines whose answers are lost.
+        At other steps the answer to the newest line may still be under way. Therefore only the
+        smallest number tells how many answers are lost.
         """
         self._lost: int | None = None
         """Largest `_outstanding` of all earlier seconds."""
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
-        """Take a step at `t`, s, whether it sent a line, and the robot's counters after it."""
+        """Process a step at time `t`, s.
+
+        `sent` is true if the step sent a line. `counters` are the robot's counters after the step.
+        """
         received = self._now = _received(counters)
         if self._second is None:
             self._second, self._before, self._base = int(t), received, sum(received)
@@ -214,7 +218,10 @@ class SerialCounts:
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
-        """Finish a second. The next step may be many seconds later."""
+        """Finish the present second. The next step may be many seconds later.
+
+        `received` is the number of good and dropped lines since the daemon's start.
+        """
         t = float(self._second or 0) + 0.5
         good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
         outstanding = self._outstanding or 0
@@ -233,7 +240,10 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the number of accepted and dropped lines. An implausible line could be read, too."""
+    """Return the number of accepted and dropped lines.
+
+    The counter `lines` includes the implausible lines, which count as dropped.
+    """
     bad = sum(count for name, count in counters.items() if name.startswith("line_"))
     return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
@@ -271,9 +281,9 @@ class ReportData:
         self.seconds = self.metres = 0.0
         """Duration of the collected steps, and distance that the robot drove in them."""
         self.driven: dict[str, Driven] = {}
-        """For each source, how the source drove the robot."""
+        """Maps each source to the time and the distance for which it drove the robot."""
         self.fastest = Twist()
-        """Highest measured speed of each axis, without sign."""
+        """Largest absolute value of the measured speed of each axis, m/s and rad/s."""
         self.steps = self.missing = 0
         """Number of collected steps, and of steps that are missing between them."""
         self._timeline = TimelineWriter(config)
@@ -287,7 +297,7 @@ class ReportData:
         self._jumps = True
         """True if the next pose does not continue the path, because a request set the pose."""
         self._sampled = self._sent = -math.inf
-        """Time of the last sample of the status, and of the last line that was sent."""
+        """Time of the last sample of the status, and of the last line that was sent, s."""
         self._status: tuple[str, ...] = ()
 
     @property
@@ -296,7 +306,7 @@ class ReportData:
         return self._wall > self._window[1]
 
     def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
-        """Take a recorded step, its replayed outputs, and the replayed robot after the step."""
+        """Add a recorded step, its replayed outputs, and the replayed robot after the step."""
         now = step.inputs.now
         if self._number is None:
             self._mono_ns, self._wall_ns = now.mono_ns, now.wall_ns
@@ -322,7 +332,7 @@ class ReportData:
         self._number = step.number
 
     def end(self, ending: str = "") -> None:
-        """Finish the data. `ending` says how the recording ended unless the daemon ended it."""
+        """Finish the data. `ending` is as in `TimelineWriter.end`."""
         t = self.seconds
         for entry in self._timeline.end(ending) if self.began is not None else ():
             self.marks.add(self._mark(entry, t))
@@ -405,7 +415,10 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Sample the status if it or the refused sources changed, or the last sample is old."""
+        """Sample the status if it has changed, or if the last sample is older than `SAMPLE_S`.
+
+        Also sample it if `refused` is true, because the refused sources have changed.
+        """
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:
             return

@@ -20,7 +20,10 @@ from acsard.daemon.late_causes import cause_in
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
-"""Function from a time in s since 1970, and whether to add the date, to local time in words."""
+"""Function that formats a time in s since 1970 as local time.
+
+Its second argument is true to format the time with its date.
+"""
 
 MAX_REASONS = 8
 """Largest number of rows in the table of reasons."""
@@ -60,7 +63,7 @@ OF_THE_BOARD = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""The events of stops that the board caused, in words."""
+"""Maps the event of each stop that the board caused to words."""
 
 
 def differences(config: Config) -> list[Setting]:
@@ -118,10 +121,10 @@ def _names(marks: list[Mark]) -> str:
 
 
 def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
-    """Return why sources did not drive: source, state, reason, and duration in s.
+    """Return why sources did not drive: rows of source, state, reason, and duration in s.
 
-    The longest durations come first, at most `MAX_REASONS`. Reasons that differ only in numbers
-    count as one, with the text of the one that lasted longest.
+    The row with the longest duration comes first. There are at most `MAX_REASONS` rows. Reasons
+    that differ only in numbers share a row, which has the text of the longest one.
     """
     durations: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in data.sources.bands.items():
@@ -138,7 +141,7 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
 
 
 def _first_of_each(marks: list[Mark], clock: Clock) -> str:
-    """Return each distinct text with the time of its first occurrence."""
+    """Return each distinct text of the marks with the time of its first occurrence."""
     first: dict[str, Mark] = {}
     for mark in marks:
         first.setdefault(mark.text, mark)
@@ -147,7 +150,7 @@ def _first_of_each(marks: list[Mark], clock: Clock) -> str:
 
 
 def _late(marks: Iterable[Mark], clock: Clock) -> str:
-    """Return the causes of late periods, with the time of each, or "" if no event names one."""
+    """Return the causes of late control periods with their times; "" if no event names a cause."""
     late = [
         replace(mark, text=cause)
         for mark in marks
@@ -197,7 +200,7 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     for name, title in {"fault": "Faults", "stop": "Stops", **titles}.items():
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        # Few boards report what these stops need, so they have a row only if they happened.
+        # Few boards can report the stops in `OF_THE_BOARD`, so only stops that happened have a row.
         if count or name not in OF_THE_BOARD:
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial

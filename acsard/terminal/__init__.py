@@ -1,5 +1,6 @@
 """Prints the output of the tools, and asks questions of the person beside the robot.
 
-`output.py` has tables and output that fits a terminal. `prompt.py` has the protocol by which
-`acsard calibrate` and `acsard mcu check` ask: at a terminal, through a program, or nobody at all.
+`output.py` has tables and output that fits a terminal. `prompt.py` has the interface through which
+`acsard calibrate` and `acsard mcu check` ask a person: at a terminal, through another program, or
+not at all.
 """

@@ -1,10 +1,12 @@
-"""`--json-lines`: a program, such as the robot's page, shows the prompts to a person.
+"""The prompt for `--json-lines`: another program, such as the robot's page, asks the person.
 
-Texts and questions are written to standard output as JSON objects, one per line, which the page's
-server relays, and describes for programs (`web/openapi.py`). Answers, key presses and signs of life
-are read from standard input. The end of the input interrupts the subcommand as Ctrl-C does. So does
-a silence of the program while something may move: the program sends as long as it is in contact
-with the person. deploy/web/README.md describes the fields.
+This module writes texts and questions to standard output as JSON objects, one per line. It reads
+answers, key presses and signs of life from standard input. The program must send a line again and
+again while it is in contact with the person. The end of the input interrupts the subcommand as
+Ctrl-C does, and so does a silence of the program while something may move.
+
+deploy/web/README.md describes the fields. The page's server relays the lines, and `web/openapi.py`
+describes them for other programs, with the docstrings of their classes.
 """
 
 from __future__ import annotations
@@ -31,14 +33,16 @@ from acsard.terminal.prompt import Ask
 T = TypeVar("T")
 
 HEARD_S = 0.9
-"""Longest silence of the program while something may move, s. Zeros then follow within a second of
-its last line.
+"""Longest silence of the asking program while something may move, s.
 
-The program sends a line every 0.1 s, if only `{}`. TCP resends a lost packet after 0.2 s, and again
-after another 0.4 s. A line that is lost twice therefore arrives in time, and a STOP that is lost
-three times would be as late. On a computer that is too busy for this, the leg has ended before,
-because the daemon was silent for 0.5 s (calibration/guided/leg_driver.py). When a person drives by
-hand, each command is a sign of life, and the source's timeout applies.
+After a longer silence the subcommand sends zeros, so they follow the program's last line within a
+second. The program sends a line every 0.1 s, even if the line is only `{}`. TCP resends a lost
+packet after 0.2 s, and again after another 0.4 s, so a line that is lost twice still arrives in
+time. A STOP that is lost three times would be as late as these zeros.
+
+On a computer that is too busy for this limit, the leg has ended earlier, because the daemon was
+silent for 0.5 s (calibration/guided/leg_driver.py). This limit is not for driving by hand: there
+each command is a sign of life, and the timeout of the command source applies.
 """
 
 LISTEN_S = 0.05
@@ -181,9 +185,9 @@ class JsonPrompt:
         )
 
     def keys(self, wait_s: float) -> str:
-        """Return a key if one was pressed since the last answer or call, else "".
+        """Return " " if a key was pressed since the last answer or call, else "".
 
-        Waits up to `wait_s` s for one.
+        Waits up to `wait_s` s for a key press.
         """
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)
@@ -193,7 +197,8 @@ class JsonPrompt:
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file.
 
-        Returns whether it was done. The question is asked only if the file can be changed.
+        Returns whether the keys were written. The question is asked only if the file can be
+        changed. `config` is the path of the file, or None to search for it.
         `trouble` is a reason not to write, or "".
         """
         try:
@@ -212,7 +217,7 @@ class JsonPrompt:
         return wanted == "write"
 
     def _choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
-        """Ask for one of the answers, and repeat the question after any other one."""
+        """Ask for one of the answers, and repeat the question after any other answer."""
 
         def chosen(value: str | float | None) -> str:
             if value not in answers:

@@ -1,6 +1,6 @@
-"""Prints tables and sentences: within the width of a terminal, in its colours, or plain elsewhere.
+"""Prints tables and sentences: on a terminal within its width and in colours, elsewhere plain.
 
-No text is read as markup. A stranger's text must be made printable before.
+The text is never read as markup. The caller must make texts from other programs printable first.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 WHOLE = 10_000
-"""Width in characters within which no row of a table is wrapped, so that it can be copied."""
+"""Width in characters that wraps no row of a table, so that a row can be copied."""
 
 SENTENCES = 100
 """Width in characters of output that has sentences."""
@@ -28,7 +28,11 @@ def table(
     right: Collection[int] = (),
     gap: int = 2,
 ) -> Table:
-    """Return rows as a table in columns; those in `right` are right-aligned."""
+    """Return rows as a table in columns.
+
+    `heads` are the headings, `right` are the numbers of the right-aligned columns, and `gap` is the
+    number of spaces between two columns.
+    """
     cells = list(rows)
     made = Table(
         box=None, show_header=bool(heads), header_style="", pad_edge=False, padding=(0, gap, 0, 0)
@@ -47,7 +51,10 @@ def has_screen() -> bool:
 
 
 def show(*parts: RenderableType, most: int = WHOLE) -> None:
-    """Print each part on lines of its own, with whole rows or at most `most` characters wide."""
+    """Print each part on lines of its own, at most `most` characters wide.
+
+    With `WHOLE` no row is wrapped, even if it is wider than the terminal.
+    """
     console = _console(sys.stdout)
     if console.is_terminal and most < WHOLE:
         console.print(Group(*parts), width=min(most, console.width))
@@ -71,7 +78,7 @@ def plain(*parts: RenderableType, width: int = WHOLE) -> str:
 
 
 def _console(file: TextIO, width: int | None = None) -> Console:
-    """Return a console that takes no text for markup, for an emoji or for a number to highlight."""
+    """Return a console that prints a text as it is, without markup, emoji or highlighting."""
     return Console(
         file=file,
         width=width,

@@ -1,6 +1,6 @@
-"""The protocol of a prompt, and the signals that end a subcommand that asks.
+"""The interface of a prompt, and the signals that end a subcommand that asks a person.
 
-Change its three forms together: `TerminalPrompt`, `NoPrompt` and `JsonPrompt`.
+Change the implementations of the interface together: `TerminalPrompt`, `NoPrompt` and `JsonPrompt`.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ class NobodyError(AcsardError):
 
 
 class Ask(Struct, frozen=True):
-    """A number within bounds that the person reads off."""
+    """A question for a number within bounds, such as a tape measurement, with its `unit`."""
 
     words: str
     unit: str
     least: float
     most: float
     usual: float | None = None
-    """The number that Enter alone stands for, or None."""
+    """The number that an empty answer stands for, or None if there is none."""
     name: str = ""
     """The name by which a measurement refers to the answer."""
 
     def number(self, text: str) -> float:
-        """Return the number that was typed.
+        """Return the number in an answer, which may have a decimal comma.
 
         Raises `ValueError` with a description of valid numbers.
         """
@@ -50,9 +50,9 @@ class Ask(Struct, frozen=True):
 
 
 class Prompt(Protocol):
-    """Interface of a prompt.
+    """Interface of a prompt. A leg is a part of a guided drive in which the robot moves.
 
-    Every question raises `KeyboardInterrupt` if the person leaves.
+    Every question raises `KeyboardInterrupt` if the person quits.
     """
 
     def begin(self, subject: str, *, simulated: bool) -> None:
@@ -62,7 +62,7 @@ class Prompt(Protocol):
         """Show a text that stays visible."""
 
     def doing(self, text: str) -> None:
-        """Show the present activity until the next one."""
+        """Show this text about the present activity until the next call."""
 
     def progress(self, share: float) -> None:
         """Show which share of the leg or of the check is done, 0 to 1."""
@@ -74,24 +74,25 @@ class Prompt(Protocol):
         """Show the result. From now on nothing moves."""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Offer to write these keys into the configuration file; return whether it was done.
+        """Offer to write these keys into the configuration file; return whether they were written.
 
-        `trouble` is a reason not to write, or "".
+        `config` is the path of the file, or None to search for it. `trouble` is a reason not to
+        write, or "".
         """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Return one of the answers, or None if no person watches the robot."""
+        """Ask, and return one of the answers, or None if no person watches the robot."""
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Show the text, and wait until the person lets the leg begin.
+        """Show the text, and wait until the person starts the leg.
 
         `by_key` says that a key press is the intended end of the leg.
         """
 
     def number(self, ask: Ask) -> float:
-        """Return the number that the person read off.
+        """Ask, and return the number that the person measured.
 
-        Raises `NobodyError` if nobody can measure.
+        Raises `NobodyError` if there is no person who can measure.
         """
 
     def keys(self, wait_s: float) -> str:
@@ -109,8 +110,8 @@ Ctrl-Z is included because a suspended program would leave a wheel turning.
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
     """End the block on a signal as on Ctrl-C, so that zeros are sent; ignore further signals.
 
-    Print `says` if the block ends so. With `exits`, a signal other than Ctrl-C raises `SystemExit`
-    with its exit code.
+    Print `says` if a signal ends the block. With `exits`, a signal other than Ctrl-C raises
+    `SystemExit` with the exit code of that signal.
     """
     before = [signal.getsignal(number) for number in SIGNALS]
 

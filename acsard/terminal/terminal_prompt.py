@@ -1,4 +1,4 @@
-"""The prompt at a terminal, and the one without a person.
+"""The prompt at a terminal, and the prompt without a person.
 
 Questions and texts go to standard error, so that the findings and the result on standard output can
 be redirected.
@@ -88,7 +88,8 @@ class Screen:
 class NoPrompt(Screen):
     """Prompt without a person.
 
-    It confirms what the command line allows, starts every leg, sees nothing and measures nothing.
+    It confirms each request that has only one answer, and starts every leg. It answers no question
+    that needs an observer, and gives only the default for a measured number.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:

@@ -18,7 +18,7 @@ class Feed:
 
     def __init__(self, robot: Client) -> None:
         self._robot = robot
-        # The first query also fails with the usual message if no daemon answers.
+        # If no daemon answers, this first query fails with the usual message.
         self._info = self._ask_info()
         self._watch = Watch(robot, time.monotonic())
         self._past: deque[tuple[float, RobotState]] = deque()
@@ -43,7 +43,7 @@ class Feed:
             self._take(state, now)
 
     def poll(self) -> None:
-        """Take the states that arrived since the last call."""
+        """Store the newest of the states that arrived since the last call, if any."""
         now = time.monotonic()
         for state in self._watch.look(now)[-1:]:
             self._take(state, now)
@@ -53,7 +53,7 @@ class Feed:
             self._past.clear()
             self._refresh_info()
         self._past.append((now, state))
-        # Rates are averaged over a second; over less they would jump.
+        # Rates are averaged over a second. Over a shorter time they would jump.
         while len(self._past) > 2 and now - self._past[1][0] >= 1.0:
             self._past.popleft()
 

@@ -1,7 +1,7 @@
 """The parts of a narrow screen: the same figures as on a wide one, but below each other.
 
-This module is pure. Continued lines are indented. The figures since the start come last, because a
-screen with few lines cuts them off.
+This module is pure. Continued lines are indented. The figures since the start of the daemon come
+last, so a screen with few lines cuts them off first.
 """
 
 from __future__ import annotations
@@ -57,7 +57,10 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return priority and age of each source, with its reason below, in about `room` lines."""
+    """Return priority and age of each source, and below them why it does not drive.
+
+    There are about `room` lines. If the sources do not fit, the last line names the others.
+    """
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)
     while left:
@@ -119,7 +122,10 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
-    """Wrap a sentence between words. The first line is indented unless it starts with a label."""
+    """Wrap a sentence between words, with lines indented by `inset` cells.
+
+    A first line that starts with a label is not indented.
+    """
     first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
     wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset

@@ -1,8 +1,8 @@
 """One screen of `acsard top`: turns a robot's state into lines of coloured text. This module is
 pure.
 
-Lines are cut to the width and their number to the height, so no message can break the layout. If
-space is short, empty lines are left out first, then sources.
+Each line is cut to the width of the terminal, and the number of lines to its height, so no message
+can break the layout. If space is short, empty lines are left out first, then sources.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MOST_SOURCES = 32
 
 
 def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
-    """Return the screen as lines of at most `width` cells, at most `height` of them (None: all)."""
+    """Return the screen as at most `height` lines (None: no limit) of at most `width` cells."""
     width = max(20, min(WIDEST, width))
     head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
     if seen.state is not None:
@@ -74,8 +74,8 @@ def _header(seen: ScreenData, width: int) -> Text:
 def _mode(seen: ScreenData, width: int) -> list[Text]:
     """Return the mode as a badge with the reason next to it.
 
-    A wide screen always uses two lines, so that a long reason does not move the rest. A narrow
-    screen uses as many lines as the reason needs.
+    A wide screen always uses two lines, so that a long reason does not move the lines below.
+    A narrow screen uses as many lines as the reason needs.
     """
     state = seen.state
     if state is None:
@@ -90,7 +90,7 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return the warnings in one line if the screen is wide: a single one with its details."""
+    """Return the warnings, in one line on a wide screen. A single warning has its details."""
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
     wide = width >= narrow_screen.BELOW
@@ -101,7 +101,7 @@ def _warnings(state: RobotState, width: int) -> list[Text]:
 
 
 def _split(words: str, room: int) -> tuple[str, str]:
-    """Split the words into the part that fits and the rest, between words if possible."""
+    """Split a text, between words if possible, after at most `room` characters."""
     if len(words) <= room:
         return words, ""
     at = words.rfind(" ", 0, room + 1)

@@ -25,7 +25,7 @@ MODES = {
     "stopped": "bold white on red",
     "fault": "bold white on red",
 }
-"""Colours of the modes, in the words of the library rich."""
+"""Colours of the modes, as styles of the library rich."""
 
 
 class ScreenData(Struct, frozen=True):
@@ -42,18 +42,18 @@ class ScreenData(Struct, frozen=True):
     """Number of consecutive messages on the state's key that could not be decoded."""
     hint: str = ""
     silent: bool = False
-    """Whether the robot counts as silent, so that the shown data is old."""
+    """True if the robot is silent, so the shown data is old."""
     passed: float = 0.0
-    """Seconds from `before` to `state` by the local clock. The stamps differ from it by more than
-    the network delay only if the robot's clock was set."""
+    """Seconds from `before` to `state` on the local clock. The difference of their stamps deviates
+    from it by more than the network delay only if the robot's clock was set."""
 
 
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def clean(text: str) -> str:
-    """Return the text without control, invisible and zero-width characters."""
-    # A screen shows fewer characters than this.
+    """Return the text with control, invisible and zero-width characters replaced."""
+    # No screen shows more than 256 characters of a text.
     return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:256]))
 
 
@@ -66,7 +66,7 @@ def count(number: int) -> str:
 
 def rate(later: int, earlier: int, seconds: float) -> str:
     """Format the rate of a counter in 7 characters, or "-/s" if it is unknown."""
-    # After a clock change or a restart of the daemon, no rate is better than a wrong one.
+    # After a clock change or a restart of the daemon, a wrong rate must not be shown.
     if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
         return "-/s".rjust(7)
     hz = (later - earlier) / seconds
@@ -105,7 +105,7 @@ def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
 
 
 def flow(parts: Sequence[Text], width: int, inset: int = 0) -> list[Text]:
-    """Put as many parts in a line as fit; continued lines begin with `inset` blanks."""
+    """Put as many parts in a line as fit. Lines after the first begin with `inset` blanks."""
     lines: list[Text] = []
     for part in parts:
         if lines and lines[-1].cell_len + 2 + part.cell_len <= width:

@@ -1,4 +1,4 @@
-"""The parts of a wide screen below the mode: each is a list of lines that starts with a rule.
+"""The parts of a wide screen below the mode. Each is a list of lines that starts with a rule.
 
 This module is pure.
 """
@@ -22,7 +22,7 @@ WIDEST = 116
 """Maximum width in cells; longer lines are harder to read."""
 
 SHORT_WORDS, LONG_WORDS = 21, 56
-"""Width of the explanation of each figure; the long form is used from `WIDEST` on."""
+"""Widths of the explanation of each figure, cells. The long form is used from `WIDEST` on."""
 
 MOST_REASONS, MOST_PORT = 16, 34
 
@@ -32,14 +32,12 @@ FIGURES = {
     "period_lateness": ("period due → step", "from the due time (first missed one) to the step"),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
-    "command_to_wire": (
-        "arrival → first line",
-        "from a driving source's command to its first line",
-    ),
+    "command_to_wire": ("arrival → first line", "from a command to the first line it causes"),
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
-"""Short and long words for each `latencies.Name`. An arrow leads from one moment to another."""
+"""Short and long explanation of each `latencies.Name`. An arrow leads from the first moment of the
+interval to the last."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
@@ -68,7 +66,7 @@ def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
 
 
 def wheel(speed: float, scale: float, cells: int) -> Text:
-    """Return direction, speed and bar in `10 + cells` cells."""
+    """Return the direction, the speed (rad/s) and a bar of `cells` cells, full at `scale` rad/s."""
     if speed == 0.0 or not math.isfinite(speed):
         sign, style = "·", "dim"
     else:
@@ -93,7 +91,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def hidden(left: Sequence[SourceState]) -> str:
-    """Return a line that names the sources that do not fit."""
+    """Return a line that names the sources `left`, which do not fit."""
     names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
     return f"  and {count(len(left))} more: {names}"
 
@@ -104,7 +102,7 @@ def drives(source: SourceState, state: RobotState) -> bool:
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return the reason why a source does not drive, in words."""
+    """Return what a source waits for before it drives, or "nothing" with an explanation."""
     if source.waits_for:
         return clean(source.waits_for)
     if drives(source, state):
@@ -171,7 +169,7 @@ def certificate(state: RobotState) -> Text:
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
     """Return a function that formats the rate and the total of a counter."""
     # Stamps are exact. If they differ from the local clock by more than a network's delay, the
-    # robot's clock was set, and the local clock decides.
+    # robot's clock was set, so the local clock is used.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
     if abs(seconds - seen.passed) > 0.2:
         seconds = seen.passed
@@ -194,7 +192,7 @@ def board(state: RobotState) -> str:
 
 
 def overrun(state: RobotState) -> Text:
-    """Return the number of samples that the bus dropped; empty if there were none."""
+    """Return the number of samples that the bus dropped, or an empty text if it dropped none."""
     lost = state.counters.get("bus_overrun", 0)
     return Text(f"bus overrun {count(lost)}" if lost else "", "yellow")
 
@@ -206,20 +204,20 @@ def _gyro(does: str) -> Text:
 
 
 def _port(info: Info) -> str:
-    """Return the serial port; of a long path only the last part."""
+    """Return the serial port, or only the last part of its path if the path is long."""
     port = clean(info.port)
     return port if len(port) <= MOST_PORT else port.rpartition("/")[2][:MOST_PORT]
 
 
 def missed(state: RobotState, before: RobotState) -> Text:
-    """Return the number of missed periods, in yellow while it grows."""
+    """Return the number of missed periods, in yellow if it is larger than in `before`."""
     missed = state.counters.get("missed_periods", 0)
     grows = missed > before.counters.get("missed_periods", 0)
     return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
 
 
 def _refusals(state: RobotState, before: RobotState) -> list[Text]:
-    """Return the rejections by reason, and the last refusal in words."""
+    """Return the numbers of rejections by reason, and the last refusal in words."""
     kinds = [
         Text(f"{kind} ").append_text(Text(", ").join(parts))
         for kind, parts in refused(state, before)
@@ -230,7 +228,10 @@ def _refusals(state: RobotState, before: RobotState) -> list[Text]:
 
 
 def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
-    """Return the rejections by kind and reason, with growing ones in yellow."""
+    """Return the numbers of rejections by kind and reason.
+
+    A number that is larger than in `before` is yellow.
+    """
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]

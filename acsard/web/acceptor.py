@@ -1,17 +1,17 @@
 """Accepts TCP connections, and limits them before they cost memory.
 
-No other module counts them. A connection goes through these states:
+No other module counts connections. A connection goes through these states:
 
 1. silent: only a socket and a place in `Sockets`. TLS starts with the first byte, so a silent
    connection costs a file and no memory;
 2. waiting, if `HANDSHAKES_AT_ONCE` others are in the TLS handshake, or if its network has begun too
-   many lately;
+   many handshakes lately;
 3. starting: in the TLS handshake, for at most `HANDSHAKE_S`, or `HURRIED_S` if others wait;
 4. open: aiohttp reads its requests.
 
-If there is no room, `Sockets` names the connection that must go. The first request must arrive
-within `REQUEST_S`. aiohttp answers bytes that are not an HTTP request with a bare line, and logs a
-traceback for each; `Reader` answers them with words, and counts them.
+If all places are taken, `Sockets` names the connection to close. The first request must arrive
+within `REQUEST_S`. By itself, aiohttp answers bytes that are not an HTTP request with a bare line,
+and logs a traceback each time. `Reader` answers them with an explanation, and counts the refusal.
 """
 
 from __future__ import annotations
@@ -39,26 +39,28 @@ from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, s
 from acsard.web.metrics import Counts
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
-"""Time limit for a TLS handshake, and maximum number of handshakes at once."""
+"""Time limit for a TLS handshake, s, and maximum number of handshakes at once."""
 
 HURRIED_S = 0.3
-"""Time limit for a TLS handshake of the most crowded network while others wait. Clients that fall
-silent in their handshakes must not keep a phone waiting for `HANDSHAKE_S`."""
+"""Time limit, s, for a TLS handshake of the network with the most handshakes, while other
+connections wait for theirs. Clients that fall silent in their handshakes must not keep a phone
+waiting for `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit from the accept to the head of the first request; the connection is cut after that."""
 
 UNREAD_S = 5.0
-"""Time limit for a client that does not read its answers, or whose network is lost. The kernel ends
-the connection when sent data have not been acknowledged, or the client's window has been closed,
-for so long."""
+"""Time limit, s, for a client that does not read its answers, or whose network is lost. The kernel
+ends the connection if the client has not acknowledged sent data for this long, or has kept its
+receive window closed for this long."""
 
 READ_BYTES = 16384
 """Size of asyncio's read buffer per TLS connection: one TLS record. Its default of 256 KiB is the
 larger part of the memory of an idle connection."""
 
 PAUSE_S = 0.05
-"""Pause of one listening address after the process has reached its limit of open files."""
+"""Time, s, for which a listening address accepts no connection after the process has reached its
+limit of open files."""
 
 Factory = Callable[[], "Reader"]
 
@@ -77,12 +79,13 @@ class Acceptor:
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
-        """The connections that wait for their handshake by network, in turns."""
+        """The connections that wait for their handshake, by network. After a start, the network of
+        the started connection moves to the end."""
         self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
         """The connections in the TLS handshake, with the time of its start, oldest first."""
         self._again: asyncio.TimerHandle | None = None
-        """The next call of `_next`."""
+        """Timer of the next call of `_next`, or None if no call is scheduled."""
         self._ended: set[_Connection] = set()
         """The connections whose token had ended at the last call of `tidy`."""
 
@@ -92,14 +95,14 @@ class Acceptor:
         `secure` is None for plain HTTP.
         """
         sslproto.SSLProtocol.max_size = READ_BYTES
-        # No browser sends a request before it has the last answer. 32 of them, as aiohttp allows,
-        # have megabytes of headers.
+        # A browser sends no request before it has the answer to the last one. aiohttp would queue
+        # 32 requests, whose headers can take megabytes.
         web_protocol.MAX_MSG_QUEUE_SIZE = 1
         self._listeners.append(opened)
         self._resume(opened, secure, make)
 
     def close(self) -> None:
-        """Accept no more connections, and cut those that have not sent a request."""
+        """Accept no more connections, and cut those whose client is not known (see `admitted`)."""
         loop = asyncio.get_running_loop()
         for opened in self._listeners:
             loop.remove_reader(opened)
@@ -110,19 +113,22 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """Cancel the time limit of this connection, because a request with this body begins."""
+        """Cancel the time limit of a connection on which a request with this body has begun."""
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
-        """Keep this connection when others have to go, because its client is known."""
+        """Record that `who` is the client of this connection.
+
+        When places run out, connections without a known client are closed first.
+        """
         if (one := _connection(transport)) is not None:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut the connections whose token is not one of these; the page calls this once a second.
+        """Cut the connections whose token is not in `valid`. `Page.tidy` calls this once a second.
 
-        A connection is cut at the second such call, because a WebSocket is told the reason first.
+        A connection is cut at the second such call, because a WebSocket gets the reason first.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -151,9 +157,10 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Give up the oldest stranger's file, and accept again after a moment.
+        """Close a connection to free its file, and accept connections again after `PAUSE_S`.
 
-        A stranger on the robot itself goes only if no connection from another machine can go.
+        A connection from the robot itself is closed only if `Sockets` allows closing none from
+        another machine.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
@@ -164,17 +171,17 @@ class Acceptor:
     # The connections call the methods below.
 
     def crowded(self, one: _Connection) -> None:
-        """Count and cut a connection that has lost its place."""
+        """Cut a connection that has no place or sends endless headers, and count the refusal."""
         self._counts.refuse("crowded", one.peer)
         one.cut()
 
     def slow(self, one: _Connection) -> None:
-        """Count and cut a connection whose time is up."""
+        """Cut a connection that has exceeded a time limit, and count the refusal."""
         self._counts.refuse("slow", one.peer)
         one.cut()
 
     def wait(self, one: _Connection) -> None:
-        """Start the TLS handshake of a connection when there is room."""
+        """Queue a connection for its TLS handshake, which starts when the limits allow it."""
         self._waiting.setdefault(one.network, {})[one] = None
         if self._again is None:
             self._next()
@@ -187,13 +194,13 @@ class Acceptor:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Note the end of a handshake, and start the next one."""
+        """Record the end of this connection's handshake, and start the next one."""
         self._starting.pop(one, None)
         if self._again is None:
             self._next()
 
     def _next(self) -> None:
-        """Start the handshake of a connection that waits, if one may start, and come back."""
+        """Start one waiting handshake if the limits allow it, and schedule the next call."""
         loop, self._again = asyncio.get_running_loop(), None
         if not self._waiting:
             return
@@ -210,14 +217,18 @@ class Acceptor:
                 self._waiting[network] = same  # behind the others
             self._starting[one] = loop.time()
             one.start()
-        # A handshake occupies the server for 1 ms or two, and a stop must not wait for 32 in a row.
+        # A handshake occupies the server for 1 to 2 ms, and a stop must not wait for 32 in a row.
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a handshake may start, after the oldest one was cut if it is too slow."""
+        """Return whether a handshake may start.
+
+        If the limit is reached, make room by cutting a handshake that is older than `HURRIED_S`.
+        """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
-        # The most crowded network loses a handshake, so a slow client of another one keeps its own.
+        # The most crowded network loses a handshake, so a slow client of another network keeps
+        # its own.
         networks = Counter(one.network for one in self._starting)
         most = max(networks.values())
         oldest, begun = next(
@@ -249,13 +260,13 @@ class _Connection(asyncio.Protocol):
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
         self._head = 0
-        """Bytes of the next request's head."""
+        """Number of bytes received of the next request's head."""
         self._body: StreamReader | None = None
         """The body of the last request."""
         self._inner: Reader | None = None
 
     def enter(self) -> None:
-        """Take a place, and wait for the first byte."""
+        """Acquire a place and wait for the first byte; cut the connection if no place is free."""
         gone = self.pool.enter(self.network, self)
         if gone is self:
             self._acceptor.crowded(self)
@@ -285,7 +296,7 @@ class _Connection(asyncio.Protocol):
             self._acceptor.wait(self)
 
     def start(self) -> None:
-        """Start the TLS handshake, or HTTP at once."""
+        """Start the TLS handshake; for plain HTTP, open the connection at once."""
         self._task = self._loop.create_task(self._open())
 
     async def _open(self) -> None:
@@ -299,7 +310,7 @@ class _Connection(asyncio.Protocol):
                 ssl_shutdown_timeout=1.0 if secure else None,
             )
         except OSError as error:
-            # The frames hold the error, and with it the memory of TLS until the next collection.
+            # The error's frames would keep the memory of TLS until the next garbage collection.
             traceback.clear_frames(error.__traceback__)
             if isinstance(error, ConnectionAbortedError):
                 self._acceptor.slow(self)  # `HANDSHAKE_S` is over
@@ -325,7 +336,7 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Cancel the limits of a request's head, because a request with this body begins."""
+        """Cancel the limits for a request's head, because a request with `body` has begun."""
         self._head, self._body = 0, body
         self._cancel_timer()
 
@@ -334,7 +345,7 @@ class _Connection(asyncio.Protocol):
             self._timer.cancel()
 
     def _leave(self) -> None:
-        """Give back the place."""
+        """Cancel the timer, and release the place in the pool."""
         self._cancel_timer()
         self.pool.leave(self)
 
@@ -394,9 +405,9 @@ class Reader(RequestHandler):
 
     @property
     def reads_head(self) -> bool:
-        """Whether the next bytes are a request's head, because no request waits.
+        """Whether the next bytes belong to the head of a request.
 
-        No request follows that for a WebSocket.
+        This is false while a parsed request is queued, and for a WebSocket.
         """
         return not self._upgraded and not self._messages
 
@@ -407,9 +418,9 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """Answer unreadable bytes.
+        """Answer bytes that are not a valid HTTP request.
 
-        Errors of the application (status 500 and above) stay with aiohttp.
+        aiohttp answers errors of the application (status 500 and above) itself.
         """
         if status >= 500:
             return super().handle_error(request, status, exc, message)

@@ -1,9 +1,9 @@
-"""Admission of requests, from the socket to the handler of a row in the table.
+"""Admission of requests, between the socket and the handler of a row in the table of routes.
 
 Each request passes `Admission` in this order: the client's place (`callers.py`), the origin of the
 web page that sent it, its token, its request rate, and the role that the row asks for. Only then
-does the handler see the request, and with it the caller's identity (a `Who`). A path that no row
-has takes a token as well, so a stranger does not learn which paths exist.
+does the handler see the request, and with it the caller's identity (a `Who`). A path without a row
+requires a token as well, so a stranger does not learn which paths exist.
 """
 
 from __future__ import annotations
@@ -57,17 +57,19 @@ WORDS = {
 }
 
 WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
-"""The identity of the caller, in each request to a row that is not open to everybody."""
+"""Key of the caller's identity in a request. A request to a row that is open to everybody has no
+identity."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 READ_EVERY_S = 0.005
-"""Shortest interval between two looks at the file of tokens. Each one starts a thread, for which
-the whole server waits: a flood of requests with a thread each delayed a stop by 200 ms."""
+"""Shortest interval between two reads of the token file, s. Each read starts a thread, and the
+whole server waits while a thread starts. A flood of requests with one thread each delayed a stop by
+200 ms."""
 
 
 class Lookups:
-    """Reads the file of tokens for all requests that arrive meanwhile."""
+    """Shares each read of the token file among all requests that arrive before the read starts."""
 
     def __init__(self, vault: Vault) -> None:
         self._vault, self._lock = vault, asyncio.Lock()
@@ -75,7 +77,7 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the tokens of a file that is read after this call, so revoked ones are not valid.
+        """Return the tokens from the file, read after this call, so no revoked token is among them.
 
         Raises `TimeoutError` if the disk does not answer.
         """
@@ -104,11 +106,11 @@ class Admission:
         counts: Counts,
         rules: WebConfig,
     ) -> None:
-        """Store how clients are known.
+        """Store the rules by which clients are admitted.
 
-        `names` are the host names and addresses, in lower case, by which other machines reach the
-        robot. `rules` name the role of a client on the robot itself, and the origins of other web
-        pages that may send requests.
+        `robot` is the id of this page's robot. `names` are the host names and addresses,
+        in lower case, by which other machines reach the robot. `rules` name the role of a client on
+        the robot itself, and the origins of other web pages that may send requests.
         """
         self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
@@ -119,7 +121,7 @@ class Admission:
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
-        """Return the application that serves these rows; their handlers get `page`."""
+        """Return the application that serves these rows; `page` is passed to each handler."""
         app = web.Application(middlewares=[self._serve], client_max_size=MAX_BYTES)
         app.on_response_prepare.append(secured)
         app.on_response_prepare.append(self._shared)
@@ -132,7 +134,8 @@ class Admission:
     async def owner(self, peer: str, shown: Sequence[str]) -> Who:
         """Return the owner of the first valid token in `shown`.
 
-        Raises `RefusedError`, and `TimeoutError` if the disk does not answer within `READ_S`.
+        `peer` is the client's IP address. Raises `RefusedError`, and `TimeoutError` if the disk
+        does not answer within `READ_S`.
         """
         if not any(shown):
             raise RefusedError(
@@ -159,7 +162,7 @@ class Admission:
                 await self._pace_stranger(request)
                 return self._preflight(request)
             waits = await self._admit(request, self._rows.get(request.match_info.route))
-            # A stop is sent at once, and its answer waits.
+            # Of a POST only the answer waits, so a stop is sent to the robot at once.
             if waits and request.method != "POST":
                 await asyncio.sleep(HOLD_S)
             answer = await handler(request)
@@ -192,14 +195,15 @@ class Admission:
             return problem(error.status, WORDS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Let a request without a valid token wait if its network sends many of them."""
+        """Delay a request without a valid token by `HOLD_S` if its network sends too many."""
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Return whether the request or its answer must wait; raise `RefusedError`.
+        """Check a request; return whether it, or its answer, must wait because of its rate.
 
-        Store the identity of the caller unless the row is open.
+        `row` is None for a path that does not exist. The identity of the caller is stored in the
+        request unless the row is open to everybody. Raises `RefusedError`.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -208,8 +212,8 @@ class Admission:
         if request.method not in ("GET", "HEAD") if is_open else not listed:
             require_own_origin(said)
         if is_open:
-            # The files of the page arrive on several connections, which must not be displaced
-            # before the first of them has asked for more.
+            # A browser loads the files of the page over several connections. If they show a valid
+            # token, they must not be displaced before one of them requests a row that needs it.
             shown = [] if here else tokens_shown(request, self._robot)
             if who := next(filter(None, map(self._vault.known, shown)), None):
                 self._acceptor.admitted(request.transport, who)
@@ -218,7 +222,7 @@ class Admission:
             return False
         who = replace(self._local, address=said.peer)
         if not here:
-            # A cookie belongs to the robot's own page.
+            # A cookie belongs to the robot's own page, so a listed page must send a token itself.
             shown = tokens_sent(request) if listed else tokens_shown(request, self._robot)
             who = await self.owner(said.peer, shown)
         request[WHO] = who
@@ -232,7 +236,7 @@ class Admission:
         return fast
 
     def _too_fast(self, who: Who, row: Route | None) -> bool:
-        """Count a request; return whether it is beyond the rate of its row."""
+        """Count a request; return whether it exceeds the rate of its row (None: `REQUESTS`)."""
         if not who.token:
             return False  # clients on the robot itself have no rate limit
         rate = row.rate if row else REQUESTS
@@ -243,7 +247,7 @@ class Admission:
         return by_listed_page(asked_of(request), self._origins)
 
     def _preflight(self, request: web.Request) -> web.Response:
-        """Tell a browser that a page of a listed origin may send its request."""
+        """Return the CORS answer that lets a page of a listed origin send its request."""
         place(asked_of(request), self._names | {own_address(request)})
         return web.Response(
             status=204,
@@ -255,7 +259,7 @@ class Admission:
         )
 
     async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Let a page of a listed origin read the answer."""
+        """Add the CORS headers that let a page of a listed origin read the answer."""
         if self._origins:
             vary = response.headers.get("Vary", "")
             response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"
@@ -300,12 +304,15 @@ def own_port(request: web.Request) -> int:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens that a program sent, or a browser's cookies, the likeliest first."""
+    """Return the tokens of a request, the likeliest to be valid first.
+
+    They are those in its headers or, without any, those in the browser's cookies for `robot`.
+    """
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the bearer token, or for a WebSocket those in the names of its subprotocols."""
+    """Return the bearer token or, without one, the tokens in the subprotocols of a WebSocket."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

@@ -1,8 +1,8 @@
 """The answers of the page's server: JSON, files, problems, and the headers of all of them.
 
-A file is served from `acsard/web/page` by its plain name only. `index.html` has STOP's script and
-the style in itself, so that STOP arrives with the page: another file may be late, or never arrive.
-The policy of the page allows these two by their hashes.
+A file is served from `acsard/web/page` by its plain name only. `index.html` is sent with the script
+of the STOP button and the style sheet inside it, so STOP works even if another file is late or
+never arrives. The content security policy of `index.html` allows these two by their hashes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from acsard.web.callers import Reason
 from acsard.web.routes import JSON, Problem
 
 READ_S = 10.0
-"""Time limit for reading from a disk."""
+"""Time limit for reading from a disk, s."""
 
 PIECE = 32768
-"""Bytes that are handed to the network at once."""
+"""Size of the pieces in which a large body is written to the network, bytes."""
 
 STATUS: dict[Reason, int] = {
     "no_token": 401,
@@ -53,7 +53,8 @@ POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy. A refused request may have a foreign Host, which must not be echoed."""
+"""Content security policy. `{connect}` stands for the WebSocket URLs of the page's host. A refusal
+names none, because a refused request may have a foreign `Host`, which must not be echoed."""
 
 
 class TroubleError(AcsardError):
@@ -75,9 +76,12 @@ def problem(status: int, text: str) -> web.Response:
 
 
 def sent(request: web.Request, file: File) -> web.Response:
-    """Return a page file, or 304 if the browser has it. Compress it if the client supports gzip."""
+    """Return the answer with a file of the page, or a 304 if the browser has the file already.
+
+    The file is compressed if the client accepts gzip.
+    """
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
-    # Also with 304, because the browser then replaces the policy that it has kept with the file.
+    # A 304 has the policy too, because the browser then replaces the one stored with the file.
     headers["Content-Security-Policy"] = _policy(request, file.policy)
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)
@@ -90,7 +94,7 @@ def sent(request: web.Request, file: File) -> web.Response:
 async def sent_in_pieces(
     request: web.Request, body: bytes, headers: Mapping[str, str], within: float
 ) -> web.StreamResponse:
-    """Send a large body without a copy of it; cut the connection after `within` s."""
+    """Send a large body without copying it; cut the connection if that takes over `within` s."""
     if request.method == "HEAD":
         return web.Response(body=body, headers=headers)
     answer = web.StreamResponse(headers=headers)
@@ -114,7 +118,7 @@ def takes_gzip(request: web.Request) -> bool:
 
 
 async def secured(request: web.Request, response: web.StreamResponse) -> None:
-    """Add the security headers to an answer. A file and a report have their own policy."""
+    """Add the security headers to an answer. A file or a report keeps its own policy."""
     response.headers.update(HEADERS)
     policy = _policy(request) if response.status < 400 else POLICY.format(connect="")
     response.headers.setdefault("Content-Security-Policy", policy)
@@ -122,7 +126,7 @@ async def secured(request: web.Request, response: web.StreamResponse) -> None:
 
 
 def _policy(request: web.Request, more: str = "") -> str:
-    """Return the policy for an admitted request, with the directives `more`.
+    """Return the content security policy for an admitted request, followed by `more` directives.
 
     Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out.
     """
@@ -149,8 +153,8 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""The files that another one contains when it is sent, each with the element that loads it in the
-source, and the name of the element that contains it."""
+"""The files that are sent inside another file. Each has the HTML element that loads it in the
+source of the other file, and the name of the element that contains it in the sent file."""
 
 
 class File(Struct, frozen=True):
@@ -162,7 +166,7 @@ class File(Struct, frozen=True):
     """The gzip form of the body, or None if it is not shorter."""
     tag: str
     policy: str
-    """Directives of the content security policy for the files that this one contains."""
+    """Directives of the content security policy for the files inside this one."""
     stamp: tuple[tuple[int, int], ...]
 
 
@@ -193,7 +197,7 @@ class Files:
 
 
 def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read the first file with the others in it."""
+    """Read the first of `paths`, and put the other files into it as `INLINED` says."""
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""
     for part in parts:

@@ -1,8 +1,8 @@
-"""The page's server: what it answers on each path, and the table of all paths.
+"""The request handlers of the page's server, and the table of all its paths (`ROUTES`).
 
 A request comes to a handler here after `Admission` has found its row in `ROUTES` and admitted the
-caller. A handler raises `RefusedError` for a request that is the caller's fault, which is counted,
-and `TroubleError` for one that cannot be fulfilled now.
+caller. If a request fails through the caller's fault, the handler raises `RefusedError`, which is
+counted. If it cannot be fulfilled now, the handler raises `TroubleError`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
-"""Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
+"""Time limit for a body of a few hundred bytes, s. A client that withholds its body occupies a
 connection."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
@@ -111,7 +111,8 @@ class Page:
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
-        """The files of the page, and when each was read or compared, by the event loop's clock."""
+        """The files of the page by name. Each has the time at which it was last compared with the
+        disk, s on the event loop's clock."""
         self._viewers: set[Viewer] = set()
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
@@ -131,15 +132,15 @@ class Page:
     async def tidy(self) -> None:
         """Drop expired work; the server calls this once a second.
 
-        This ends each connection whose token has expired, was revoked or cannot be looked up on
-        disk within `READ_S`, a WebSocket with the reason. It gives up a report that no client waits
-        for.
+        A connection is ended if its token has expired, was revoked, or cannot be read from the
+        disk within `READ_S`. A WebSocket gets the reason first. A report that no client waits for
+        is given up.
         """
         self._reports.tidy()
         try:
             counting = await in_thread(self._vault.counting, READ_S)
         except NoThreadError:
-            return  # the disk was not asked, so no token is in doubt
+            return  # the disk was not read, so all tokens stay valid
         except TimeoutError:
             counting = frozenset()
         for viewer in list(self._viewers):
@@ -161,7 +162,7 @@ class Page:
     async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
         now = asyncio.get_running_loop().time()
         file, read = self._sent.get(name, (None, 0.0))
-        # A look at the disk starts a thread, for which the whole server waits.
+        # Access to the disk starts a thread, and the whole server waits while a thread starts.
         if file is None or now > read + 1.0:
             if file is not None:
                 self._sent[name] = file, now  # until the disk has answered
@@ -272,7 +273,10 @@ class Page:
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Wait for a camera picture that the client has not seen, and return it."""
+        """Wait for a camera picture that the client has not seen; return it, or 304 without one.
+
+        The header `If-None-Match` has the number of the last picture that the client has seen.
+        """
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.mono_ns()
         number = int(seen) if seen.isdecimal() and len(seen) < 16 else 0
@@ -331,7 +335,10 @@ class Page:
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
-    """Return the changeable settings in the order of `config`, a value of the key `config`."""
+    """Return the settings that can be changed at run time, in the order of `config`.
+
+    `config` is a decoded value of the bus key of that name.
+    """
     return [
         Setting(key, value, told.what, WHEN[told.when], **_allowed(key))
         for key, value in flat(config)

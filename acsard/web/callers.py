@@ -3,11 +3,11 @@
 This module is pure.
 
 A client on the robot itself needs no token and has the role in `web.local`. However, any web page
-in a browser there may open `ws://localhost`, or point a host name of its own at 127.0.0.1. So
-`Host` must be a loopback name, and `Origin`, if the browser sends it, must be this page. A client
-from another machine must use HTTPS, a host name that the robot has, and a token. Requests through a
-proxy are refused: a proxy on the robot that rewrites `Host` would give every client behind it the
-role of the robot itself.
+in a browser on the robot may open `ws://localhost`, or may point its own host name at 127.0.0.1. So
+`Host` must be a loopback name. `Origin`, if the browser sends it, must be that of the robot's own
+page or one in `web.origins`. A client from another machine must use HTTPS, a host name that the
+robot has, and a token. Requests through a proxy are refused: a proxy on the robot that rewrites
+`Host` would give every client behind it the role of a client on the robot itself.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ COOKIE = "__Host-acsard"
 Domain, and for all paths."""
 
 PROTOCOL, TOKEN = "acsard", "acsard.token."
-"""Subprotocol of the WebSocket, and prefix of one that carries a token."""
+"""Name of the WebSocket's subprotocol, and prefix of a subprotocol name that carries a token."""
 
 MOST_TOKENS = 8
 """Maximum number of tokens of one request that are checked. Each one is compared with all valid
@@ -72,7 +72,10 @@ class Who(Struct, frozen=True):
         return has(self.role, least)
 
     def require(self, least: Role, what: str) -> None:
-        """Raise `RefusedError` unless the client has at least the role that `what` needs."""
+        """Raise `RefusedError` unless the client has at least the role `least`.
+
+        `what` names the refused action in the text of the error.
+        """
         if not self.may(least):
             raise RefusedError("role", f"{what} is {self.barred(least)}: {MAY[self.role]}")
 
@@ -99,9 +102,10 @@ class Asked(Struct, frozen=True):
 
 
 def place(asked: Asked, names: Collection[str]) -> Place:
-    """Return whether a request is local or remote, or raise `RefusedError`.
+    """Return "here" if the client is on the robot and asks for a loopback name, otherwise "away".
 
-    `names` are the robot's names and addresses in lower case.
+    `names` are the robot's names and addresses in lower case. Raises `RefusedError` for a request
+    through a proxy, for plain HTTP that is not "here", and for a host that is not in `names`.
     """
     if asked.proxied:
         raise RefusedError(
@@ -135,9 +139,8 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    `origins` are in lower case. The robot's own page is never a listed one, because the robot does
-    not look at the cookie of a listed page: a robot whose own origin is listed too could not be
-    stopped by its page.
+    `origins` are in lower case. The result is False for the robot's own page, even if its origin
+    is listed: the cookies of a listed page are ignored, so the page could not stop its own robot.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False
@@ -149,16 +152,16 @@ def _own_origin(asked: Asked) -> str:
 
 
 def tokens_offered(protocols: str) -> list[str]:
-    """Return the first tokens in a `Sec-WebSocket-Protocol` header.
+    """Return the tokens in a `Sec-WebSocket-Protocol` header, at most `MOST_TOKENS`.
 
-    A script in a browser can set no other header of a WebSocket.
+    A script in a browser can set no other header of a WebSocket, so it sends its token there.
     """
     offered = (one.strip() for one in protocols.split(","))
     return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MOST_TOKENS]
 
 
 def cookie_name(robot: str, port: int) -> str:
-    """Return the cookie name of this page.
+    """Return the name of the cookie for the page of this robot at this port.
 
     The name contains the robot and the port, because a browser sends a host's cookies to all of its
     ports and keeps only one cookie of each name.
@@ -167,9 +170,10 @@ def cookie_name(robot: str, port: int) -> str:
 
 
 def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
-    """Return the cookie tokens that may be valid for this page, the likeliest first.
+    """Return the tokens in cookies that may be valid for the page of this robot at this port.
 
-    The page's own cookie comes first. Cookies of the same robot at other ports follow.
+    The page's own cookie comes first, because it is the likeliest to be valid.
+    Cookies of the same robot at other ports follow.
     """
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
     names = [name for name in cookies if name.rpartition("-")[0] == ours]
@@ -192,7 +196,7 @@ def unmapped(address: str) -> str:
 
 
 def network_of(address: str) -> str:
-    """Return the name under which an address is counted: an IPv6 address by its /64 network.
+    """Return the name under which the limits count an address: for IPv6, its /64 network.
 
     One machine may use any number of addresses of its /64 network.
     """

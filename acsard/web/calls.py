@@ -1,7 +1,8 @@
 """Service calls and queries to the robot.
 
-Each one blocks a thread of its own and their number is limited, so a stop never waits behind them.
-The stops of one client to one robot are merged: each is answered by one that was sent after it.
+Each call blocks a thread of its own, and the number of calls is limited, so a stop never waits
+behind other calls. If one client sends several stops to one robot in quick succession, they are
+merged: each gets the reply to a stop that was sent to the robot after it arrived.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Limits on concurrent requests of all viewers together. Stops have a separate limit; further stops
-would only stop the same robot again."""
+"""Maximum number of concurrent requests of all viewers together, and of concurrent stops of the
+page's own robot. Stops beyond their limit share one request, because they stop the same robot."""
 
 ELSEWHERE_AT_ONCE = 8
 """Limit on concurrent stops of other robots that wait for an answer. A stop beyond the limit is
 still sent to its robot, but without waiting for the answer."""
 
 MERGE_S = 0.02
-"""Shortest interval between two stops of one client to one robot. A stop within it is sent at its
-end, together with all others of that interval."""
+"""Shortest interval between two stops of one client to one robot, s. All stops that arrive within
+the interval are merged into one, which is sent at its end."""
 
 ANSWER_S = 8.0
-"""Time limit for an answer from the bus. The bus client gives up sooner, so the caller gets its
+"""Time limit for an answer from the bus, s. The bus client gives up sooner, so the caller gets its
 error message."""
 
 T = TypeVar("T")
@@ -58,7 +59,7 @@ class Ending(NamedTuple):
 
 
 class Calls:
-    """The requests that are under way, within the limits above."""
+    """Sends service calls and queries to robots, within the limits of this module."""
 
     def __init__(
         self,
@@ -66,8 +67,10 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Store the robots, `ends`, which ends the server's check or calibration, and `sees`, which
-        says whether a page shows the robot with this id.
+        """Store the connection and the callbacks.
+
+        `ends` ends the check or calibration that this server runs. `sees` returns whether a page
+        shows the robot with a given id.
         """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
@@ -82,7 +85,8 @@ class Calls:
     ) -> ServiceReply:
         """Call a service on behalf of `who` and return the reply.
 
-        `robot` is the id of another robot, on which only `stop` may be called. Raises
+        `verb` is the name of the service, and `payload` has its arguments. `robot` is the id of
+        another robot, on which only `stop` may be called, or "" for the page's own robot. Raises
         `RefusedError`.
         """
         require(who, verb)
@@ -91,8 +95,8 @@ class Calls:
             _require_stop(verb, other)
         if verb != "stop" or other:
             return await self._called(who, verb, payload, other)
-        # A check holds the serial port and turns the wheels, so the daemon cannot stop them: end
-        # the check too.
+        # A check holds the serial port and turns the wheels, so the daemon cannot stop the wheels:
+        # end the check too.
         ending, reply = await asyncio.gather(self._ends(), self._called(who, verb, payload, other))
         if not ending.words:
             return reply
@@ -127,9 +131,10 @@ class Calls:
         return reply
 
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
-        """Return the encoding and the payload of the last value of a key, asked for as JSON.
+        """Query the last value of a key as JSON, and return its encoding and its payload.
 
-        Raises `MendableError` if there is no connection, no answer, or no free slot.
+        `robot` is the robot's id, and `name` is the key below it. Raises `MendableError` if there
+        is no connection, no answer, or no free slot.
         """
         client = self._robots.client
         if client is None:
@@ -139,9 +144,10 @@ class Calls:
     async def _stop(
         self, robot: str, client: Client, who: Who, request: Callable[[], ServiceReply]
     ) -> ServiceReply:
-        """Stop another robot.
+        """Stop another robot, and return its reply.
 
-        Slots are limited, so a robot id that does not exist cannot block other callers.
+        The slots for waiting are limited, so robot ids that do not exist cannot block other
+        callers. Without a free slot, the stop is sent without waiting for the reply.
         """
         with self._elsewhere.held() as free:
             if free:
@@ -175,21 +181,22 @@ class Calls:
 
 
 class Merged:
-    """The stops of each client to each robot, at most one every `MERGE_S`.
+    """Sends the stops of each client to each robot, at most one every `MERGE_S`.
 
-    No stop is lost. The stops within that time share one that is sent at its end.
+    No stop is lost: the stops that arrive within that time share one, which is sent at its end.
     """
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """The names of which a stop was sent within the last `MERGE_S`. The event is its end."""
+        """An event for each name whose last stop was sent less than `MERGE_S` ago. The event is set
+        when that time is over."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
-        """The stop of each name that waits for that end."""
+        """Per name, the task that waits for the event in `_rests` and then sends a stop."""
 
     async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
         """Return the reply to a stop that is sent after this call began.
 
-        `name` stands for the client and the robot.
+        `name` stands for the client and the robot. `stop` sends a stop.
         """
         if name in self._next:
             return await asyncio.shield(self._next[name])
@@ -206,7 +213,7 @@ class Merged:
         asyncio.get_running_loop().call_later(MERGE_S, lambda: self._rests.pop(name).set())
 
     async def _later(self, name: Hashable, rest: asyncio.Event, stop: Stop) -> ServiceReply:
-        # If the event loop is late, `rest` may have ended and be forgotten before this task starts.
+        # If the event loop is late, `rest` may be set and gone from `_rests` before this starts.
         await rest.wait()
         del self._next[name]  # later callers share the next stop
         self._rest(name)
@@ -214,7 +221,7 @@ class Merged:
 
 
 class Stops:
-    """Stop requests, of which at most `STOPS_AT_ONCE` run at the same time.
+    """Sends stop requests, at most `STOPS_AT_ONCE` at the same time.
 
     All further callers share one request that is sent later.
     """
@@ -224,7 +231,7 @@ class Stops:
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """Return the robot's reply to this request.
+        """Send a stop with `call`, and return the robot's reply.
 
         If too many stops are under way, return the reply to a shared request that is sent after
         this call began.

@@ -3,8 +3,8 @@
 Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads it while
 clients ask for pictures, and only the newest picture is kept: a client with a slow network gets
 fewer pictures, and no old ones. Each client that reads slowly keeps a picture in memory, so the
-number of those is limited. A picture that equals the one before byte for byte is not new, because
-some servers repeat the last picture when their camera is lost.
+number of pictures that are being sent is limited. A picture that equals the one before byte for
+byte is not new, because some servers repeat the last picture when their camera is lost.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Longest wait for a picture that the client has not seen."""
+"""Longest wait for a picture that the client has not seen, s."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
-"""Time limits for the connection to the camera's server, and for its next byte."""
+"""Time limits for the connection to the camera's server, and for the next byte from it, s."""
 
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
 """Maximum size of a picture and of the header lines before it, bytes. A JPEG of 1920 x 1080 pixels
@@ -37,7 +37,8 @@ SENDS, SENDS_OF_TOKEN = 8, 2
 """Limits on the pictures that are being sent: in all, and per token."""
 
 SEND_S = 5.0
-"""Time limit for sending a picture; the connection is cut after that. A page waits no longer."""
+"""Time limit for sending a picture, s. The connection is cut after that, because the page in the
+browser does not wait any longer either."""
 
 _LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
 
@@ -54,18 +55,19 @@ class Parts:
     """Cuts a `multipart/x-mixed-replace` stream into its parts."""
 
     def __init__(self, boundary: str) -> None:
-        """Start; `boundary` is the parameter of the stream's content type.
+        """Store `boundary`, a parameter of the stream's content type.
 
-        Some servers write the two dashes into it that only precede it in the stream.
+        In the stream, two dashes precede the boundary. Some servers include them in the parameter.
         """
         self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
-        """Return the last part that is complete with these bytes, or None.
+        """Add received bytes; return the newest part that they complete, or None.
 
         Raises:
-            ValueError: A part is too long, or its header lines are.
+            ValueError: A part has more than `MAX_PICTURE` bytes, or no header lines end within
+                `MAX_HEAD` bytes.
         """
         self._buffer += data
         newest = None
@@ -108,9 +110,10 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Return the newest picture once its number differs, or None if that takes too long.
+        """Return the newest picture as soon as its number differs from `number`.
 
-        Raises `TroubleError` if the robot has no camera, or its stream cannot be read.
+        Return None if there is no such picture within `WAIT_S`. Raises `TroubleError` if the robot
+        has no camera, or its stream cannot be read.
         """
         if not self._url:
             raise TroubleError(404, "this robot has no camera: web.camera names its MJPEG stream")
@@ -128,7 +131,10 @@ class Camera:
 
     @asynccontextmanager
     async def sending(self, token: str) -> AsyncIterator[None]:
-        """Hold a place for sending a picture; raise `TroubleError` if none becomes free in time."""
+        """Hold a place for sending a picture to a client with this token.
+
+        Raises `TroubleError` if no place becomes free within `WAIT_S`.
+        """
         try:
             async with asyncio.timeout(WAIT_S):
                 while not self._sends.enter(token):

@@ -1,4 +1,4 @@
-"""The robots that the bus or router knows, one row each, tracked while a viewer looks at them."""
+"""The robots on the bus or router, one row each, tracked while a viewer has subscribed to them."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ class Fleet:
     def sees(self, robot: str) -> bool:
         """Return whether a viewer sees that this robot exists.
 
-        It sees the robot's liveliness token in the fleet, or its state.
+        A viewer sees the robot's liveliness token in the fleet, or the robot's state.
         """
         states = self._robots.streams.followed(robot, STATE)
         here = self._tracked is not None and self._tracked.here(robot)
         return here or bool(states and states.number)
 
     def _look(self) -> None:
-        """Start the next call that waits for the bus, unless one is under way."""
+        """Subscribe to the robots or query those that are due, unless a bus call is under way."""
         tracked, client = self._tracked, self._robots.client
         if not self._joined or client is None or self._busy:
             return
@@ -93,7 +93,7 @@ class Fleet:
         try:
             self._tracked = await in_thread(declare, DECLARE_S, lambda late: late.end())
         except UNREADY:
-            return  # the next viewer that looks retries
+            return  # the next call of `_look` retries
         self._tidy()
 
     def _tidy(self) -> None:

@@ -1,10 +1,10 @@
-"""Runs a board check or a calibration for a browser, as a child process of the same command.
+"""Runs a board check or a calibration for a browser, as a child process (`acsard` itself).
 
 Only one runs at a time. The child's lines (`--json-lines`, see terminal/json_prompt.py) go to the
 connection that started it, and only that connection may send answers and key presses. If the
-connection ends, the child is interrupted as by Ctrl-C, so it still sends its zeros to the board.
-The child also watches its standard input and does not outlive this server. Nothing is queued: a
-reply goes to the open question once, or is refused.
+connection ends, the child is interrupted as by Ctrl-C, so it still sends zero speeds to the board.
+The child also watches its standard input, so it does not outlive this server. Replies are not
+queued: a reply goes to the open question once, or is refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
 PATIENCE_S = 6.0
-"""Time for the child to send zeros and exit after an interrupt, before it is killed."""
+"""Time for the child to send zero speeds and exit after an interrupt, before it is killed, s."""
 
 NO_DEVICE = (
     "No serial port is visible from here. Is the board plugged in? If the page runs as a "
@@ -107,21 +107,25 @@ class Guide:
         return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
 
     def join(self, viewer: object, say: Say) -> None:
-        """Add a viewer, and report to it the running command, or that nothing runs.
+        """Add a viewer, and report to it the running check or calibration, or that nothing runs.
 
-        A page that was disconnected when the child ended needs the second report.
+        The report that nothing runs is for a page that was disconnected when the child ended.
+        `say` sends a message to the viewer.
         """
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
 
     def leave(self, viewer: object) -> None:
-        """Remove a viewer whose connection has ended, and interrupt a child that it started."""
+        """Remove a viewer whose connection has ended, and interrupt the child that it started."""
         self._viewers.pop(viewer, None)
         if (errand := self._of(viewer)) is not None:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start a child. Return "" or the reason for a refusal."""
+        """Start the requested child for a viewer. Return "" or the reason for a refusal.
+
+        `by` is the name of the viewer's user, which is reported to all viewers.
+        """
         if self._errand is not None:
             return (
                 f"{self._errand.name} already runs ({self._errand.by}); only one can run at a time"
@@ -132,16 +136,16 @@ class Guide:
         return ""
 
     def reply(self, viewer: object, reply: Reply) -> str:
-        """Pass an answer to the child. Return "" or the reason for a refusal."""
+        """Pass a viewer's answer to the child. Return "" or the reason for a refusal."""
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
             return f"the question {reply.reply} is not open"
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
-        """Pass on a key press, or interrupt the child.
+        """Pass a viewer's key press to the child, or interrupt the child.
 
-        The child may already have ended, so this never fails.
+        This never fails, because the child may already have ended.
         """
         if (errand := self._of(viewer)) is None:
             return
@@ -164,7 +168,7 @@ class Guide:
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
     def heard(self, viewer: object) -> None:
-        """Relay a sign of life from the viewer to the child that it started."""
+        """Relay a sign of life from a viewer to the child that this viewer started, if any."""
         if (errand := self._of(viewer)) is not None:
             errand.relay()
 
@@ -231,7 +235,10 @@ def boards(configured: str) -> list[Board]:
 
 
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
-    """Return the arguments after `acsard`. Raises `FrameError` if the request is not allowed.
+    """Return the arguments of the `acsard` command for a request to begin.
+
+    `ports` are the serial ports that may be checked. Raises `FrameError` if the request is not
+    allowed.
 
     No text from the browser becomes an option by itself. The options are fixed here, and each value
     is either one of a known set or a plain key.
@@ -277,7 +284,7 @@ class _Errand:
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
-        """Return a message for `viewer`, which says that this guided drive is running."""
+        """Return the message that tells `viewer` which check or calibration is running."""
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
@@ -296,7 +303,7 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """Send an answer to the open question; return False if that is another question."""
+        """Send the child an answer to its open question; return False for any other question."""
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg
@@ -304,16 +311,16 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """End the current leg like a key press at a terminal.
+        """End the current leg of the drive, as a key press at a terminal does.
 
-        Only the first press of a leg counts.
+        Further presses in the same leg are ignored.
         """
         if self._rides:
             self._rides = False
             self._write({"key": True})
 
     def relay(self) -> None:
-        """Send a sign of life: the operator who can stop the robot is still connected."""
+        """Send the child a sign of life: the operator who can stop the robot is still connected."""
         if self._relayed.take(clock.mono_ns()):
             self._write({})
 
@@ -326,7 +333,7 @@ class _Errand:
             self._interrupt()
 
     def kill(self) -> None:
-        """Kill the child at once, without letting it send zeros."""
+        """Kill the child at once, without letting it send zero speeds."""
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
 

@@ -1,8 +1,8 @@
 """The plotted values of the last minute, for a page that has just been opened. This module is pure.
 
 All values except the commanded speeds come from the state, which the server receives anyway. The
-commanded speeds arrive a hundred times a second, so the server subscribes to them only while a
-viewer does.
+commanded speeds arrive a hundred times a second, so the server receives them only while a viewer
+has subscribed to them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WIDTH = MEASURED + 5
 MS = 1e-3
 
 Column = Sequence[float | None]
-"""Values of one line, oldest first; None where the value is unknown."""
+"""Values of one line of a plot, oldest first; None where the value is unknown."""
 
 
 class Plotted(Struct, frozen=True):
@@ -53,7 +53,8 @@ class Plotted(Struct, frozen=True):
     """Commanded forward speed after limits, m/s; known only while a viewer follows `cmd_vel_out`
     here."""
     wished_angular: Column
-    """Commanded turn rate after limits, rad/s; known under the same condition."""
+    """Commanded turn rate after limits, rad/s; known only while a viewer follows `cmd_vel_out`
+    here."""
     wheels: Sequence[Column]
     """Measured wheel speeds in rad/s: front right, front left, rear left, rear right."""
     late_p99: Column
@@ -65,7 +66,7 @@ class Plotted(Struct, frozen=True):
 
 
 class Minute:
-    """The rows of the last minute; all times are of a monotonic clock."""
+    """The rows of the last minute. All times are ns on a monotonic clock."""
 
     def __init__(self) -> None:
         self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=ROWS)

@@ -1,7 +1,7 @@
 """The limits of the page per client. This module is pure.
 
-The rates are those of messages, commands, requests, TLS handshakes and wrong tokens. The places are
-those of TCP connections, WebSockets and subscriptions.
+The rates of messages, commands, requests, TLS handshakes and wrong tokens are limited, and so are
+the numbers of TCP connections, WebSockets and subscriptions.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ six in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
 """Maximum number of TCP connections without a valid token from one network, and of connections that
-one token keeps from being displaced."""
+count under one token. Further connections of that token are treated as if they had none."""
 
 SOCKETS_OF_BROWSER = 7
-"""Number of connections that a token always keeps: those of one browser."""
+"""Number of connections of a token that are never displaced: those of one browser."""
 
 SOCKETS_LEAST = 16
 """Connections from other machines that are accepted even if the limit of open files is very low."""
 
 OWN_FILES = 128
-"""Files of the process beside those of its connections: it has 20 open when nobody is connected. A
-report and a calibration need more for a while."""
+"""Number of open files that are reserved for other purposes than connections. The process has 20
+open without a connection, and needs more for a while for a report and a calibration."""
 
 UNREAD_BYTES = 32768
-"""Bytes that wait for a client that does not read, above which its next request waits, and its
-WebSocket gets no new values. asyncio's limit for a TLS connection is 512 KiB."""
+"""Limit on the bytes that wait for a client that does not read. Above it, the client's next request
+waits, and its WebSocket gets no new values. asyncio's limit for a TLS connection is 512 KiB."""
 
 OVERRUNS = 600
-"""Number of messages beyond the rate limit that ends a connection."""
+"""Number of messages beyond the rate limit after which a connection is ended."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
 """Limits on WebSockets from other machines: in all, per address, per token, and per token and
@@ -58,44 +58,46 @@ REQUESTS = Rate(50.0, 200.0)
 """Limit on HTTP requests per token. The page's static files are exempt."""
 
 STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.0)
-"""Rates of a token's stops, pictures of the camera and new WebSockets from one network, beyond
-which its requests wait. Three pages show a camera with 60 pictures a second."""
+"""Limits on the rates of stops, camera pictures and new WebSockets, for each token in one network.
+Requests beyond them wait. Three pages show a camera with 60 pictures a second."""
 
 STRANGERS = Rate(30.0, 150.0)
-"""Rate of the requests without a token from one network, beyond which they wait. A phone loads
-the page by 16, so the burst serves eight phones behind one address at once."""
+"""Limit on the rate of requests without a valid token from one network. Requests beyond it wait. A
+phone loads the page with 16 requests, so the burst serves eight phones behind one address."""
 
 HANDSHAKES = Rate(30.0, 100.0)
-"""Rate of the TLS handshakes of one network, beyond which they wait. A browser needs six."""
+"""Limit on the rate of TLS handshakes of one network. Handshakes beyond it wait. A browser needs
+six."""
 
 HOLD_S = 0.5
-"""Time for which a request beyond a rate waits. A refusal costs the server as much as an answer, so
-a client that asks without end must wait for either."""
+"""Time for which a request beyond a rate waits, s. A refusal costs the server as much as an answer,
+so a client that sends requests without end must wait for either."""
 
 MESSAGES = Rate(200.0, 400.0)
-"""Limit on messages per WebSocket. The burst allowance covers the messages a client sends when its
-network returns."""
+"""Limit on messages per WebSocket. The burst allowance covers the messages that a client sends when
+its network returns."""
 
 COMMANDS = Rate(60.0, 120.0)
-"""Limit on the commands of one token, or of one local WebSocket. A finger sends 20 a second. The
-daemon accepts 1000 a second of this server, so 24 WebSockets that sent 180 each made it drop half
-of a driver's commands."""
+"""Limit on the commands of one token, or of one local WebSocket. A finger on the stick sends 20 a
+second. The daemon accepts 1000 a second from this server. Without the limit, 24 WebSockets that
+sent 180 commands a second each made the daemon drop half of a driver's commands."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
-"""Limit on the stops of one token to other robots that no page shows and that have never answered a
-stop here. They may not exist. Any other robot is stopped whenever a client asks."""
+"""Limit on the stops of one token to robots that may not exist: no page shows them, and they have
+never answered a stop from this server. Stops to any other robot have no limit."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
-"""Limits on wrong tokens: from one address, and in all."""
+"""Limits on wrong tokens: from one network (see `callers.network_of`), and in all."""
 
 
 C = TypeVar("C", bound=Hashable)
 
 
 def sockets_for(files: int) -> int:
-    """Return the maximum number of connections from other machines for a limit of open files.
+    """Return the maximum number of connections from other machines.
 
-    A connection needs two files while it fetches a recording.
+    `files` is the limit on the open files of the process. A connection needs two files while it
+    fetches a recording.
     """
     return max(SOCKETS_LEAST, min(SOCKETS, (files - OWN_FILES) // 2 - SOCKETS_HERE))
 
@@ -116,15 +118,16 @@ class Sockets(Generic[C]):
         self._networks: dict[C, str] = {}
         """The network of each connection."""
         self._known: dict[C, str] = {}
-        """The token of each connection that is kept."""
+        """The token of each connection that counts under a token."""
         self._shown: dict[C, str] = {}
-        """The last valid token of each connection, kept or not."""
+        """The last valid token of each connection, even if it does not count under that token."""
         self._tokens: Counter[str] = Counter()
 
     def enter(self, network: str, one: C) -> C | None:
-        """Take a place; return the connection to close for it, or None if there was room.
+        """Give the new connection `one` a place.
 
-        If no connection may be displaced, return `one` itself, which then has no place.
+        Return the connection to close in exchange, or None if a place was free. If no connection
+        may be displaced, return `one` itself, which then has no place.
         """
         own = self._strangers.get(network, {})
         gone = None
@@ -138,7 +141,10 @@ class Sockets(Generic[C]):
         return gone
 
     def displaced(self) -> C | None:
-        """Take the place of the connection that has to go first, and return it, if there is one."""
+        """Remove the connection that has to be closed first, and return it.
+
+        Return None if no connection may be displaced.
+        """
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
             gone = next(iter(self._strangers[network]))
@@ -151,9 +157,9 @@ class Sockets(Generic[C]):
         return gone
 
     def prove(self, one: C, token: str) -> None:
-        """Note that a connection has shown a valid token; "" stands for the robot itself.
+        """Record that a connection has shown a valid token; "" stands for the robot itself.
 
-        The last token counts, because a browser may get another one.
+        A later token replaces an earlier one, because a browser may get another token.
         """
         network, before = self._networks.get(one), self._known.get(one)
         if network is None:
@@ -169,7 +175,7 @@ class Sockets(Generic[C]):
         self._tokens[token] += 1
 
     def leave(self, one: C) -> None:
-        """Give the place back, if the connection has one."""
+        """Release the place of a connection, if it has one."""
         network = self._networks.pop(one, None)
         self._shown.pop(one, None)
         if network is None:
@@ -181,7 +187,10 @@ class Sockets(Generic[C]):
         self._fewer(token)
 
     def ended(self, valid: Collection[str]) -> list[C]:
-        """Return the connections whose token is not one of these; the robot itself needs none."""
+        """Return the connections whose token is not in `valid`.
+
+        Connections from the robot itself have no token and are not returned.
+        """
         return [one for one, token in self._shown.items() if token and token not in valid]
 
     def strangers(self) -> list[C]:
@@ -216,7 +225,7 @@ class Seats:
         return ""
 
     def enter(self, address: str, token: str) -> str:
-        """Take a place; return "" or the reason for a refusal."""
+        """Acquire a place for a connection; return "" or the reason for a refusal."""
         if full := self.missing(address, token):
             return full
         for places, name, _ in self._places(address, token):
@@ -224,12 +233,12 @@ class Seats:
         return ""
 
     def leave(self, address: str, token: str) -> None:
-        """Give the place back."""
+        """Release the place of a connection."""
         for places, name, _ in self._places(address, token):
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return each limit for a connection, the name it counts under, and the refusal text."""
+        """Return each limit for a connection, the name that is counted, and the refusal text."""
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
@@ -258,10 +267,13 @@ class Shares:
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one
         self._held: defaultdict[Hashable, Counter[str]] = defaultdict(Counter)
-        """Per resource, the number of times that each holder entered it."""
+        """Per resource, the number of times that each holder has acquired it."""
 
     def enter(self, holder: str, thing: Hashable) -> bool:
-        """Acquire a resource, again if it is held already; return False if the limits forbid it."""
+        """Acquire a resource for a holder; return False if the limits forbid it.
+
+        A holder may acquire the same resource several times, and must release it as often.
+        """
         holders = self._held.get(thing)
         if holders is None and len(self._held) >= self._most:
             return False
@@ -271,7 +283,7 @@ class Shares:
         return True
 
     def leave(self, holder: str, thing: Hashable) -> None:
-        """Release a resource once."""
+        """Release a resource that the holder has acquired once."""
         holders = self._held[thing]
         holders[holder] -= 1
         if not holders[holder]:

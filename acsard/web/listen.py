@@ -16,7 +16,7 @@ TRIES = 20
 """Number of ports that are tried, starting with the requested one."""
 
 EVERYWHERE_4, EVERYWHERE_6 = "0.0.0.0", "::"
-"""Wildcard addresses: all IPv4 addresses, and all addresses of this machine."""
+"""Wildcard addresses: all IPv4 addresses of this machine, and all its IPv4 and IPv6 addresses."""
 
 
 class Listen(Struct, frozen=True):
@@ -67,10 +67,11 @@ def listens(text: str) -> Listen:
 
 
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
-    """Return the URLs to write on an invitation, the likeliest first, or none without HTTPS.
+    """Return the URLs to write on an invitation, the likeliest to work first.
 
-    `tls` is the directory of the robot's certificate, already checked by `require_certificate`. IP
-    addresses come before names, because not every phone resolves mDNS names.
+    The list is empty if no address is HTTPS. `tls` is the directory of the robot's certificate,
+    already checked by `require_certificate`. IP addresses come before names, because not every
+    phone resolves mDNS names.
     """
     found: list[str] = []
     older_ports = _older_ports(listen)
@@ -92,7 +93,7 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
 
 
 def opened_by(one: Listen, tls: str) -> list[str]:
-    """Return the URLs that open this address, as on an invitation if it is HTTPS."""
+    """Return the URLs that open this address; for HTTPS, those of an invitation."""
     return invitations([one], tls) if one.secure else [one.url]
 
 
@@ -118,14 +119,14 @@ def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socke
 
 
 def _older_ports(listen: Sequence[Listen]) -> set[int]:
-    """Return the ports that an IPv4 address has. A `::` socket takes those for IPv6 only."""
+    """Return the ports of the IPv4 addresses. A `::` socket uses such a port for IPv6 only."""
     return {one.port for one in listen if ":" not in one.host}
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open one socket.
+    """Open a socket at one address, and return the address with its port, and the socket.
 
-    `both` lets `::` accept IPv4 too, when no other address here has this port.
+    `both` lets `::` accept IPv4 too. It is true if no IPv4 address has this port.
     """
     ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()

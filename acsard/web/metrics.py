@@ -1,6 +1,6 @@
-"""The counters of the page's server, for its log and, with the robot's, for `/metrics`.
+"""The counters of the page's server, for its log and for `/metrics`.
 
-`/metrics` has the Prometheus text format 0.0.4.
+`/metrics` adds the robot's figures, and has the Prometheus text format 0.0.4.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def text(
 ) -> str:
     """Return all metrics in the text format of Prometheus.
 
-    Robot metrics come from the last state, and only while `heard` is true.
+    Robot metrics come from `state`, the robot's last state. They are included only if `heard` is
+    true, which means that messages from the daemon arrive. `viewers` is the number of WebSockets.
+    `counts` and `refused` come from `Counts`.
     """
     lines: list[str] = []
 

@@ -1,8 +1,8 @@
 """The page's interface for programs as an OpenAPI 3.1 document. This module is pure.
 
 The paths, their permissions and their bodies come from the table of routes. The schemas come from
-msgspec for the page's own messages, and from `json_schema.SCHEMAS` for those of the bus. A row, a
-key or a field that is new there appears in the document by itself.
+msgspec for the page's own messages, and from `json_schema.SCHEMAS` for those of the bus. A new row,
+key or field appears in the document without a change here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from acsard.web.socket_messages import KINDS
 Described = dict[str, Any]
 
 Refs = dict[Any, Described]
-"""A reference to the schema of each type."""
+"""Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
 """Names of the schemas of all messages that the WebSocket accepts, and of all that it sends."""
@@ -44,7 +44,7 @@ LINES = (
     json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
     json_prompt.Found, json_prompt.Result,
 )  # fmt: skip
-"""Types of the content of `guide`."""
+"""Types of the content of the field `guide` in a message to the client."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
 """Type of each key that can be subscribed to."""
@@ -55,7 +55,7 @@ def _ref(name: str) -> Described:
 
 
 def _raw(schema: Described) -> Any:
-    """Return the type of a field that is JSON already and has this schema."""
+    """Return the type of a field that holds encoded JSON with this schema."""
     return Annotated[msgspec.Raw, Meta(extra_json_schema=schema)]
 
 
@@ -82,7 +82,7 @@ ERRORS = {
     "429": "Too many requests, or too many wrong tokens.",
     "default": "Any other failure.",
 }
-"""Errors of every path. The body says why, in words."""
+"""Errors of every path, by HTTP status. The body of the answer has the reason, in words."""
 
 
 def document(version: str, routes: Sequence[Route]) -> Described:
@@ -117,7 +117,7 @@ def document(version: str, routes: Sequence[Route]) -> Described:
 
 
 def _operation(row: Route, refs: Refs) -> Described:
-    """Return the description of one row."""
+    """Return the OpenAPI operation of one row; `refs` has the schemas of its bodies."""
     errors = {status: Body(what, Problem) for status, what in ERRORS.items()}
     answers = {str(status): body for status, body in row.gives.items()} | errors
     told: Described = {
@@ -160,7 +160,7 @@ def _needed(kind: type | str) -> bool:
 
 
 def _messages() -> Described:
-    """Return the schemas of the bus's messages, with each nested type beside them as `Type.Part`.
+    """Return the schemas of the bus's messages, and of each nested type under the name `Type.Part`.
 
     Most readers of OpenAPI documents cannot resolve a schema with `$defs` of its own.
     """
@@ -174,7 +174,10 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return a schema with its `$defs` references pointed to the document's components."""
+    """Return a schema whose `$defs` references point to the document's components instead.
+
+    `before` is the prefix of the names of these components.
+    """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
     if not isinstance(node, dict):
@@ -187,8 +190,8 @@ def _flat(node: Any, before: str) -> Any:
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
     """Return the schemas of `kinds` and their nested types, and a reference to each kind.
 
-    All kinds are described by one call, because msgspec then gives two types of the same name
-    different ones.
+    All kinds are described by one call, because msgspec then gives different names to two types
+    that have the same name.
     """
     unique = list(dict.fromkeys(kinds))
     refs, parts = msgspec.json.schema_components(
@@ -201,9 +204,9 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    """Return the schemas of all messages in either direction, and of `guide`.
+    """Return the schemas of all WebSocket messages in either direction, and of `Guided`.
 
-    Their kind is the field that only they have, so they are alternatives without a tag.
+    Each message has a field that no other one has, so the alternatives need no tag.
     """
     guided = msgspec.defstruct(
         GUIDED,

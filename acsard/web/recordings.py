@@ -1,4 +1,4 @@
-"""The recordings in the black box's directory, as the page lists, sends and draws them."""
+"""Lists and sends the recordings in the black box's directory, and draws reports of them."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ POLICY = (
     "'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-"""Security policy of a report. Without `allow-same-origin` the report has an opaque origin. The
-report's own policy names the allowed scripts by their hashes, and the browser enforces both
+"""Content security policy of a report. Without `allow-same-origin` the report has an opaque origin.
+The report's own policy names the allowed scripts by their hashes, and the browser enforces both
 policies."""
 
 NICE = 19
 
 DRAW_S = 600.0
-"""Time limit of a drawing: a full file of the black box, one to four hours, takes minutes on a
-small computer."""
+"""Time limit for drawing a report, s. A full file of the black box, one to four hours, takes
+minutes on a small computer."""
 
 ALONE_NS = 60 * NS_PER_S
-"""A running drawing is given up if no client has asked for its progress for this long."""
+"""The drawing of a report is given up if no client has asked for its progress for this long."""
 
 KEEP_NS = 900 * NS_PER_S
 """A finished report is dropped if no client has opened it or asked for it for this long."""
 
 BYTES = 32 << 20
-"""Maximum size of a report; a typical one has 5 to 8 MB."""
+"""Maximum size of a report, bytes; a typical one has 5 to 8 MB."""
 
 MEMORY = 256 << 20
 """Limit of the child's data memory, bytes."""
@@ -76,7 +76,10 @@ class Recording(Struct, frozen=True):
 
 
 class BlackBox:
-    """The recordings of the page's robot. Every method raises `TroubleError`."""
+    """The recordings of the page's robot.
+
+    Every method raises `TroubleError` if the recordings are not available.
+    """
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
@@ -92,7 +95,7 @@ class BlackBox:
     async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
         """Return the path of a recording, and a value that changes when it grows or is replaced.
 
-        Raises `RefusedError` if it is not listed.
+        Raises `RefusedError` if `name` is not the file name of a listed recording.
         """
         place = self._place()
 
@@ -131,7 +134,7 @@ def rows(directory: Path) -> list[Recording]:
 
 
 def _files(directory: Path) -> list[Path]:
-    """Return the recordings, or none until the recorder has made its directory."""
+    """Return the paths of the recordings, or none until the recorder has made the directory."""
     try:
         return listed(directory)
     except FileNotFoundError:
@@ -155,7 +158,7 @@ def _row(path: Path) -> Recording:
 
 
 def _begun(path: Path) -> float | None:
-    """Return the start time in the file name, in seconds since 1970."""
+    """Return the start time in the file name, s since 1970, or None if the name has none."""
     try:
         told = time.strptime(path.name.partition("-")[2].partition(".")[0], STAMP)
     except ValueError:
@@ -202,30 +205,30 @@ class _Drawing:
 
 
 class Reports:
-    """The newest report; one is drawn at a time, in a child process.
+    """Draws one report at a time, in a child process, and keeps the newest report.
 
     The child runs `acsard recording report` at the lowest priority. Its time, memory and output are
     bounded. It is killed when this server ends or no client asks for the report any more. The
     finished report is kept compressed in memory until another one is drawn or nobody has asked for
     it for `KEEP_NS`; no file is written.
 
-    A report contains text of unknown origin (names, sentences). Three measures contain it. The
-    report escapes the text. Its own policy allows exactly two scripts and no loading. `POLICY`
-    gives the report an opaque origin, so a script in it could reach neither the cookie nor the
-    interface of this page.
+    A report shows text of unknown origin (names, sentences), which may be malicious. There are
+    three defences. The report escapes the text. Its own policy allows exactly two scripts and loads
+    nothing. `POLICY` gives the report an opaque origin, so a script in it could reach neither the
+    cookie nor the interface of the robot's page.
     """
 
     def __init__(self, command: Sequence[str] = ()) -> None:
-        """Draw by `acsard recording report`, or by another command."""
+        """Set the command that draws a report; without one, `acsard recording report`."""
         self._command = command or acsard("recording", "report", "--supervised")
         self._one: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
 
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
-        """Return the progress of the report of this recording, and start drawing it if needed.
+        """Return the progress of the report of a recording, and start drawing it if needed.
 
-        `stamp` must change when the recording changes. A failed or outdated report is drawn again
-        only after a client has seen its result.
+        `path` is the recording's file, and `stamp` must change when the recording changes. A failed
+        or outdated report is drawn again only after a client has received its result.
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
@@ -242,9 +245,9 @@ class Reports:
         return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """Return the finished report of this recording, compressed by gzip, or None.
+        """Return the finished report of a recording, compressed by gzip, or None.
 
-        This keeps the report for another `KEEP_NS`.
+        `name` is the recording's file name. The call keeps the report for another `KEEP_NS`.
         """
         one = self._one
         if one is None or one.path.name != name or not one.packed:
@@ -323,9 +326,9 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Read the child's error output.
+    """Read the child's error output until it ends, and return its explanation of a failure.
 
-    Lines of digits are percents, other lines explain a failure.
+    A line of digits is the progress in percent, which sets `one.percent`.
     """
     assert child.stderr is not None
     said = ""

@@ -27,17 +27,18 @@ from acsard.web.metrics import Counts
 from acsard.web.streams import DECLARE_S, UNREADY, Stream, Streams
 
 LOOK_S = 0.1
-"""Interval at which the newest state is checked."""
+"""Interval at which received states are processed, s."""
 
 AGAIN_S = 1.0
-"""Delay before the next attempt to reach a daemon that does not answer."""
+"""Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Interval of queries for the daemon's version and limits: after an answer, and until the first
-answer."""
+"""Intervals of the queries for the daemon's version and limits, s: after an answered query, and
+after an unanswered one."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
-"""Age and number of the points of a path at most, and the distance of two points at least."""
+"""Limits of a driven path: maximum age of a point, s; maximum number of points; minimum distance
+between two points, m."""
 
 T = TypeVar("T")
 
@@ -62,19 +63,20 @@ class About(Struct, frozen=True):
 
 
 def _path() -> Track:
-    # No robot can drive the last distance, 1 m, between two states: the pose was set.
+    # The last argument is a distance, 1 m. No robot drives so far between two states, so a larger
+    # step means that the pose was set.
     return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
 
 
 class _Asking:
-    """A client for a watch on the event loop. A query runs in a thread, because it may block."""
+    """The client of a `Watch` on the event loop. A query runs in a thread, because it may block."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key unless the last query is still under way."""
+        """Query a key unless the last query is still under way; `take` is called with the reply."""
         if self._asked is None or self._asked.done():
             self._asked = asyncio.create_task(self._ask(name, take))
 
@@ -87,9 +89,9 @@ class Robots:
     """Keeps the connection to the daemon, and the data that a newly opened page needs at once."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Prepare the connection.
+        """Prepare the connection, which `connect` opens.
 
-        `about` comes from the local configuration until the daemon answers.
+        `about` has the facts from the local configuration, used until the daemon answers.
         """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
@@ -130,7 +132,10 @@ class Robots:
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the robot's recent path in m, odom, and the true path of a simulator."""
+        """Return the points (x, y) of the recent paths, m.
+
+        "path" is the robot's path in the odom frame, and "truth" is the true path of a simulator.
+        """
         return {
             name: [(round(place.x, 3), round(place.y, 3)) for place in path.places()]
             for name, path in self._paths.items()
@@ -191,7 +196,7 @@ class Robots:
             self._minute.add(now_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """Return the commanded twist if it is recent and a viewer of this server follows it."""
+        """Return the commanded twist if a viewer follows it here and it is recent, else None."""
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
         # A commanded twist that is older than this is not plotted.

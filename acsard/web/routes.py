@@ -1,8 +1,8 @@
-"""The rows of the page's table: the meaning, the role, the input and the output of each path.
+"""The rows of the table of routes: the meaning, the role, the input and the output of each path.
 
 This module is pure. `app.ROUTES` is the table. Dispatch, admission, the request rate, the answers
-404 and 405 and the OpenAPI document follow it, so a path that is not in the table does not exist.
-The rows of the robot's keys and services are made here from the bus's own tables.
+404 and 405 and the OpenAPI document use it, so a path that is not in the table does not exist. The
+rows of the robot's keys and services are made here from the bus's own tables.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ RECORDINGS: Role = "operator"
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
-"""Pattern of a path parameter. A parameter that is not listed is any text without a slash."""
+"""Patterns of path parameters. Any other parameter matches any text without a slash."""
 
 _PARAMETER = re.compile(r"{(\w+)}")
 
@@ -52,9 +52,9 @@ class Body(Struct, frozen=True):
     what: str
     """Description for the OpenAPI document."""
     kind: Any = ""
-    """Its type, or the name of a message of the bus; "" for any value."""
+    """Type of the body, or the name of a message of the bus; "" for any value."""
     media: str = JSON
-    """Its media type; "" for an answer without a body."""
+    """Media type of the body; "" for an answer without a body."""
 
 
 class Route(Struct, frozen=True):
@@ -65,7 +65,7 @@ class Route(Struct, frozen=True):
     path: str
     """The path as OpenAPI writes it: `{name}` is a parameter."""
     least: Role | None
-    """Least role that may use it; None lets everybody in, without a token."""
+    """Least role that may use the row; None opens it to everybody, without a token."""
     handler: Handler
     summary: str = ""
     """Description for the OpenAPI document; "" leaves the row out of it."""
@@ -76,13 +76,13 @@ class Route(Struct, frozen=True):
     gives: Mapping[int, Body] = {}
     """The answers by HTTP status. Every error is a `Problem`."""
     rate: Rate = REQUESTS
-    """Limit on its requests per token, shared by all rows of this rate."""
+    """Limit on the requests per token, shared by all rows that have this rate."""
     waits: bool = False
     """True makes a request beyond the rate wait instead of refusing it.
 
     A stop must always go through: it is sent at once, and its answer waits. A page that reconnects
-    must not be kept out by another program that uses the same token elsewhere. So the rate is that
-    of the token in one network.
+    must not be kept out by another program that uses the same token elsewhere. So the rate then
+    applies to a token in one network.
     """
 
     @property
@@ -98,13 +98,13 @@ class Route(Struct, frozen=True):
 
 
 def asked(topic: Topic) -> bool:
-    """Return whether the topic has a value that a program may request."""
+    """Return whether the topic has a last value that a program may query."""
     own = topic.direction in ("out", "query") and "<key>" not in topic.key
     return own and topic.query in ROLES
 
 
 def values(handler: Handler) -> Iterator[Route]:
-    """Yield the row of each key whose last value a program may request."""
+    """Yield the row of each key whose last value a program may query."""
     for topic in filter(asked, TOPICS):
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
         gives = {200: Body("The last value.", topic.type if topic.type in SCHEMAS else "")}
@@ -115,7 +115,7 @@ def services(handler: Handler) -> Iterator[Route]:
     """Yield the row of each service."""
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():
-        # The daemon decodes the payload, so the daemon's words refuse it.
+        # The daemon decodes the payload, so a refusal has the daemon's message.
         takes = Which if verb == "stop" else SERVICES[verb].payload or None
         gives = {
             200: Body("It was done.", "ServiceReply"),

@@ -42,7 +42,7 @@ FIELD_BYTES, FIELDS = 8190, 64
 sends the cookies of all ports of the host in one header, so a lower limit could lock it out."""
 
 LEAVE_S = 0.3
-"""Time limit at shutdown for the zero commands of viewers that were driving."""
+"""Time limit at shutdown for the zero commands of viewers that were driving, s."""
 
 
 class Wanted(Struct, frozen=True):
@@ -65,7 +65,7 @@ class Wanted(Struct, frozen=True):
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
     """Serve until a signal arrives; `announce` is called once with the bound addresses.
 
-    Raises `MendableError`s.
+    Raises a `MendableError` if the server cannot start or cannot continue.
     """
     # A command or a stop waits at most this long while another thread holds the interpreter.
     sys.setswitchinterval(0.0005)
@@ -74,10 +74,10 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
     if wanted.supervised:
         end_with_parent(signal.SIGTERM)
-        # The daemon, which started this server, must come first.
+        # The daemon, which started this server, must have priority over it.
         os.nice(5)
     counts = Counts()
-    # Take note of the files before they are read, so that no change of them is missed.
+    # Record the state of the certificate files before they are read, so no change is missed.
     files = CertificateFiles(*files_in(wanted.tls))
     secure, names = _certified(wanted)
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
@@ -111,7 +111,10 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
 
 
 async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
-    """Work until asked to leave, or until a task ends that must not end."""
+    """Run the background tasks until `leaving` is set, or until one of them ends.
+
+    If a task fails, its error is raised.
+    """
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(parts.robots.run()),
@@ -144,7 +147,7 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent, and leave when it closes standard input."""
+    """Send signs of life to the parent, and set `leaving` when it closes standard input."""
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def look() -> None:
@@ -161,7 +164,7 @@ async def _held(leaving: asyncio.Event) -> None:
 
 
 def _connected(address: Address) -> Client:
-    """Return a client that is connected to the daemon; blocks."""
+    """Return a client that is connected to the daemon. The call blocks."""
     session = client_session(address.endpoint, address.tls)
     return Client(session, address.robot_id, PROGRAM, address.tls, address.endpoint)
 
@@ -187,7 +190,8 @@ def _about(wanted: Wanted) -> About:
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
     """Return the TLS context and the names of this machine, apart from its loopback names.
 
-    Without an HTTPS address both are empty. Raises a `MendableError` if a certificate is missing.
+    Without an HTTPS address, return None and an empty set. Raises a `MendableError` if a
+    certificate is missing.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()
@@ -212,12 +216,12 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """Use each new certificate for the connections after it, and add its names to `names`."""
+    """Use each new certificate for later connections, and add its names to `names`."""
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():
             continue
-        # If the files have changed once more, the next look finds those.
+        # If the files change again while they are read, the next round finds the new ones.
         with suppress(OSError, ValueError):
             _load(context, directory)
             names |= _names(directory)

@@ -1,9 +1,9 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
-Each message is one JSON object. The kind of an incoming one is the one field of `KINDS` that it has
-(`subscribe`, `cmd`, `call`, ...). A message of no kind, of two kinds, or with an unknown field is
-refused as a whole. An outgoing one is identified by its first field. Messages of subscribed keys
-are built in socket_sender.py instead, because their values are already JSON.
+Each message is one JSON object. The kind of an incoming message is the only field of `KINDS` that
+it has (`subscribe`, `cmd`, `call`, ...). A message of no kind, of two kinds, or with an unknown
+field is refused as a whole. An outgoing message is identified by its first field. Messages of
+subscribed keys are built in socket_sender.py instead, because their values are already JSON.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
 because the zero command after a release carries a later stamp than the last command."""
 
 PROGRAM = "app"
-"""Source of a command that names none. The page names `teleop`, the source of a person."""
+"""Command source of a command that names none. The page in the browser names `teleop` instead."""
 
 Short = Annotated[str, Meta(max_length=80)]
 Device = Annotated[str, Meta(max_length=200)]
@@ -48,7 +48,7 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all frames; it rejects unknown fields."""
 
     least: ClassVar[Role] = "viewer"
-    """Least role that may send it. The role for a call depends on the service."""
+    """Least role that may send the frame. The role that a call needs depends on the service."""
 
     @property
     def kind(self) -> str:
@@ -90,7 +90,7 @@ class Command(_Frame, frozen=True):
     steady: bool = False
     """True if the clock of `stamp` is never adjusted, like the browser's `performance.now()`."""
     source: Short = PROGRAM
-    """The command source, one of the robot's."""
+    """Name of one of the robot's command sources."""
 
     @property
     def stamp_ns(self) -> int:
@@ -154,7 +154,7 @@ _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
 
 
 def decode(text: str) -> Frame:
-    """Return the frame in a message. Raises `FrameError`."""
+    """Return the frame in a JSON text. Raises `FrameError`."""
     about = "message"
     try:
         meant = [name for name in _heads.decode(text) if name in KINDS]
@@ -252,7 +252,7 @@ class Row(Struct, frozen=True):
     version: str
     """Version of the daemon; "" until it is reported."""
     warnings: Sequence[str] = ()
-    """What is wrong with the robot although it may be ready, in words."""
+    """Warnings of the robot, in words. A robot with warnings may still be ready."""
     place: Sequence[float] | None = None
     """x and y in m, and yaw in rad, in the odom frame; None before the first state."""
     battery: str = ""

@@ -1,4 +1,4 @@
-"""The outgoing side of one WebSocket: its subscribed keys, and the messages that it gets.
+"""The outgoing side of one WebSocket: its subscribed keys, and the messages that it sends.
 
 The newest value of each key is sent when it is due, and answers are sent at once.
 
@@ -29,8 +29,8 @@ from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import KEYS, UNREADY, Stream
 
 REPORTS = Rate(1.0)
-"""Rate of the reported refusals of one kind of message with the same reason. All refusals are
-counted."""
+"""Limit on the rate at which refusals are reported to the client, per kind of message and reason.
+All refusals are counted."""
 
 
 class Following:
@@ -39,7 +39,8 @@ class Following:
     def __init__(self, robot: str, name: str, own: str, period: float) -> None:
         """Prepare the constant part of the key's messages.
 
-        `own` is the id of the page's own robot; messages of that robot carry no id.
+        `own` is the id of the page's own robot. Messages of that robot carry no id. `period` is the
+        shortest interval between two messages, s.
         """
         self.robot, self.name, self.period = robot, name, period
         told = {"key": name} if robot == own else {"key": name, "robot": robot}
@@ -60,14 +61,14 @@ class Outgoing:
         self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
         """Subscribed keys by (robot, key)."""
-        # The oldest of many waiting answers are dropped.
+        # If more messages than this wait, the oldest are dropped.
         self._out: deque[bytes] = deque(maxlen=200)
         self._news = asyncio.Event()
         self._reports = Buckets(REPORTS)
         self._closing = False
 
     def say(self, message: object) -> None:
-        """Queue a message; it is sent as soon as the client reads."""
+        """Queue a message, which is sent as soon as the client reads earlier data."""
         self._out.append(msgspec.json.encode(message))
         self._news.set()
 
@@ -87,7 +88,8 @@ class Outgoing:
     async def pump(self, look_around: Callable[[float], float]) -> None:
         """Send until cancelled or until the connection closes.
 
-        `look_around(now)` is called in each round and returns the time of its next call.
+        `look_around(now)` is called in each round, and returns the time of its next call. Both
+        times are s on the event loop's clock.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -106,7 +108,7 @@ class Outgoing:
             pass  # closing; `Viewer.run` notices
 
     async def close(self, why: str) -> None:
-        """Tell the client to end the connection; `why` is at most 120 characters.
+        """Send a close frame with the reason `why`, at most 120 characters.
 
         The client gets a second to answer. If the connection were cut at once, many programs
         would report a lost network instead of the reason.
@@ -141,9 +143,9 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send the value if it is due and new.
+        """Send the value of a key if it is due and new.
 
-        Return its next due time by the event loop's clock.
+        Return the time at which the next value is due, s on the event loop's clock.
         """
         stream = one.stream
         if stream is None:
@@ -189,7 +191,7 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key or change its rate. The viewer receives the reason for a refusal."""
+        """Subscribe to a key, or change its rate. After a refusal, the viewer gets the reason."""
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)
@@ -227,7 +229,7 @@ class Keys:
     def unsubscribe(self, frame: Unsubscribe) -> None:
         """End the subscription to a key, if there is one."""
         name = frame.robot or self._robots.id, frame.unsubscribe
-        # Remove it now, because the client may subscribe again in the next message.
+        # Remove the key now, because the client may subscribe again in the next message.
         one = self._out.following.pop(name, None)
         if one is not None:
             self._give_back(one)

@@ -32,8 +32,8 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""The state is published all the time, so the last one is not queried. For another robot, a
-router's storage would answer with the last state of a robot that has been off for a week."""
+"""Key of a robot's state. The last state of another robot is not queried, because a router's
+storage would answer with it even if that robot has been off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """Errors of a stuck bus or a closed session; a later attempt may succeed."""
@@ -57,7 +57,7 @@ class Stream:
 
     @property
     def at_ns(self) -> int:
-        """Arrival time of the newest message, monotonic clock."""
+        """Arrival time of the newest message, ns on the monotonic clock."""
         return self._newest[2]
 
     def take(self, sample: zenoh.Sample) -> None:
@@ -85,16 +85,16 @@ class Stream:
 
 
 class Streams:
-    """The streams with at least one user; a stream ends with its last user."""
+    """The streams with at least one user. The last user's release ends the subscription."""
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
         self.shares = Shares(STREAMS, STREAMS_OF_ONE)
-        """Holders of streams of other robots; the caller enters before `follow` and leaves after
-        `leave`."""
+        """The holders of streams of other robots. The caller acquires a share before `follow`, and
+        releases it when it ends the subscription."""
 
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """Return the subscribed stream of a key.
+        """Return the subscribed stream of a robot's key, and add a user to the stream.
 
         Raises an error of `UNREADY` if the bus is not ready.
         """
@@ -113,11 +113,11 @@ class Streams:
         return stream
 
     def followed(self, robot: str, key: str) -> Stream | None:
-        """Return the stream if it has a user, otherwise None."""
+        """Return the stream of a robot's key if it has a user, otherwise None."""
         return self._streams.get((robot, key))
 
     async def leave(self, robot: str, key: str) -> None:
-        """Release a stream; the last user's release ends the subscription."""
+        """Remove a user from a stream; without users, the subscription ends."""
         stream = self._streams.get((robot, key))
         if stream is None:
             return
@@ -129,7 +129,7 @@ class Streams:
             try:
                 await in_thread(stream.declared.undeclare, DECLARE_S)
             except (TimeoutError, zenoh.ZError):
-                pass  # the bus is stuck or closed; samples go nowhere
+                pass  # the bus is stuck or closed, so no samples arrive
 
     async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
         client = own.like(robot)
@@ -146,7 +146,7 @@ class Streams:
             if not asks:
                 return heard
             try:
-                # A key that is published seldom has a value at once.
+                # The query gives a value at once, even if the key is published seldom.
                 client.ask(key, of_it(stream.answered))
             except zenoh.ZError:
                 heard.undeclare()

@@ -58,18 +58,18 @@ class Vault:
         """Use the token file in `directory` for the robot with this id."""
         self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
-        """Change stamp of the file and its tokens, in one value because several threads replace
-        it."""
+        """Change stamp of the file, and its tokens. They are one value, because several threads
+        replace it."""
 
     def known(self, text: str) -> Who | None:
-        """Return the owner of a token by the last reading of the file, without a look at the disk.
+        """Return the owner of a valid token without access to the disk, or None.
 
-        The page's server reads the file once a second.
+        The answer depends on the last read of the file. The server reads it once a second.
         """
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the seconds until a token expires, 0 if it is unknown."""
+        """Return the seconds until the token with this digest expires, 0 if it is unknown."""
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
@@ -188,7 +188,7 @@ def place() -> Path:
 
 
 def owner_in(tokens: Sequence[Token], text: str) -> Who | None:
-    """Return the owner of a token, or None if it is not one of these or has expired."""
+    """Return the owner of the token `text`, or None if it has expired or is not in `tokens`."""
     if not text or len(text) > 200:
         return None
     digest, found = _digest(text), None

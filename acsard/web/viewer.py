@@ -1,4 +1,4 @@
-"""One WebSocket: a page in a browser or a program, and a sender of commands in its own right.
+"""Serves one WebSocket of a page or a program, which sends commands as a sender of its own.
 
 Incoming messages are handled at once and never wait for outgoing ones, so a client that does not
 read can still drive and stop. Outgoing values are the newest ones at the requested rate; they are
@@ -58,20 +58,20 @@ ACTIONS: dict[str, Role] = {
 """The least role for each action of which the page shows a control."""
 
 HEARTBEAT_S = 10.0
-"""Ping interval. The connection ends if the client has not answered after half of it."""
+"""Ping interval, s. The connection ends if a ping is not answered within half of it."""
 
 CALLS_AT_ONCE = 8
 
 FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
-"""Key of the fleet's rows, their interval, and the time that the robots have to appear before the
-first report. Without it each look at the robots began with an empty list."""
+"""Key of the fleet's rows, their interval, s, and the delay of the first report, s. Without the
+delay, the first report would be empty, because no robot has been found yet."""
 
 
 class ViewerCommands:
     """Puts the newest velocity command of each viewer on the bus.
 
-    A command is sent once, with the stamp of its sender, or it is dropped. The server repeats
-    nothing and makes up nothing, except one zero command for a sender that was driving and
+    A command is sent once, with the stamp of its sender, or it is dropped. The server repeats no
+    command and creates none, except one zero command for a sender that was driving and
     disconnected. `client` returns the connection to the bus, or None while it is lost.
     """
 
@@ -79,16 +79,17 @@ class ViewerCommands:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """The server must exit when its thread is dead: no viewer can drive then, and no zero
-        command is sent."""
+        """Queue of commands, with the thread that sends them. The server must exit if this thread
+        has died, because no viewer can drive then, and no zero command is sent."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
     ) -> bool:
-        """Queue a command in place of an older one of the same commander.
+        """Queue a command, in place of an older one of the same commander that still waits.
 
-        Return False if its owner, a token or a local viewer, sends too many. A zero after a speed
-        is queued in any case.
+        `owner` is the token or the local viewer whose commands are counted, and `source` is the
+        command source. Return False, and queue nothing, if the owner exceeds `COMMANDS`. A zero
+        after a speed is queued nevertheless.
         """
         now_ns = clock.mono_ns()
         ends = wish.twist == REST and commander.drives(now_ns)
@@ -144,8 +145,8 @@ class Viewer:
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
-        """Public name that `state.sender` has while this viewer drives. The page never learns the
-        secret part."""
+        """Public name that `state.sender` has while this viewer drives. The secret part of the
+        sender's id is never sent to the client."""
         self._socket = socket
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
@@ -155,7 +156,7 @@ class Viewer:
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
         self._stamp_ns = -1
-        """Stamp of the last command."""
+        """Stamp of the last command, ns since 1970; -1 before the first."""
         self._gone, self._about = "", parts.robots.about
         self._fleet_due: float | None = None
 
@@ -192,7 +193,7 @@ class Viewer:
 
     def _take(self, message: aiohttp.WSMessage) -> None:
         if self._ended:
-            return  # only the answer to the close matters now
+            return  # after the close frame, messages are ignored
         if message.type == aiohttp.WSMsgType.ERROR:  # aiohttp closes the connection after this
             self._counts.refuse("too_big", self.who.origin)
             return
@@ -219,7 +220,7 @@ class Viewer:
             self.end("too many messages")
 
     def _ping(self, message: aiohttp.WSMessage) -> None:
-        """Answer a ping of the protocol. Pings and pongs count as messages."""
+        """Answer a ping of the WebSocket protocol. The rate limit counts pings and pongs too."""
         if not self._bucket.take(clock.mono_ns()):
             self._overruns += 1
             if self._overruns >= OVERRUNS:
@@ -264,8 +265,8 @@ class Viewer:
             return
         stamp_ns = frame.stamp_ns
         if stamp_ns == self._stamp_ns and not frame.moves:
-            # Some clocks stand still for a while. A zero command with an equal stamp is still a
-            # genuine release.
+            # Some clocks do not advance for a while. A zero command with the stamp of the last
+            # command is still a genuine release, so it gets a later stamp.
             stamp_ns += 1
         if stamp_ns <= self._stamp_ns:
             self._out.refuse(
@@ -281,9 +282,9 @@ class Viewer:
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        """Send a zero command to each source by which the robot may still follow this viewer.
+        """Send a zero command from each source under which the robot may still follow this viewer.
 
-        They are the last commands that are sent for this viewer.
+        No further commands are sent for this viewer.
         """
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
@@ -302,7 +303,7 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message that came too fast. Answer each call, because a program waits for it."""
+        """Refuse a message beyond a limit. Answer each call, because a program waits for it."""
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
             self._out.say(socket_messages.Answer(frame.id, False, text))
@@ -357,7 +358,10 @@ class Viewer:
         self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Report changes of reachability, facts and fleet; return the time of the next look."""
+        """Report changes of the robot's reachability and facts, and the rows of the fleet.
+
+        Return the time of the next call. It and `now` are s on the event loop's clock.
+        """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone
             if self._gone:

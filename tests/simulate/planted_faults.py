@@ -813,7 +813,8 @@ FAULTS = (
         "a sender that pushes against the obstacle drives on at the release of the bumper",
         ROBOT,
         "            self._arbiter.require_neutral(now_ns)\n"
-        "            # Without the commands so far nothing is left to follow.\n"
+        "            # `require_neutral` has discarded all commands, so the new choice has no "
+        "twist.\n"
         "            self._choice = self._arbiter.choose(now_ns)\n",
         "            self._choice = Choice()\n",
     ),

@@ -1,13 +1,13 @@
-"""The error budget of a drive: how large the odometry error of each single cause is.
+"""The error budget of a drive: how large the odometry error by each single cause is.
 
 The errors of one cause are propagated alone through the error model of the odometry
 (`core/motion/uncertainty.py`). The recorded drive is repeated until the robot has driven 100 m,
-which gives the position error, and until it has turned by 360 deg to one side, which gives the
-heading error.
+which gives the position error. It is also repeated until the robot has turned by 360 deg to one
+side, which gives the heading error.
 
-The errors of each step of the drive are measured if the feedback lines show them. They show those
-of time, quantisation, gaps and contradicting wheels, and the gyro noise that the odometry assumes.
-All other errors are those that `[odometry]` declares.
+The feedback lines show the errors of time, quantisation, gaps and contradicting wheels, and the
+gyro noise that the odometry assumes. These errors are measured for each step of the drive. All
+other errors are those that `[odometry]` declares.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from acsard.core.values import REST, PoseCovariance
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""Where the size of an error comes from: feedback lines, `[odometry]`, or no source."""
+"""The source of an error's size: feedback lines, settings of `[odometry]`, or none."""
 
 METRES = 100.0
 """Distance after which the position error is given, m."""
@@ -44,14 +44,17 @@ LEAST_LINES = 20
 """Minimum number of feedback lines of a drive."""
 
 STEP_S = 0.1
-"""Length of a step of the drive, s."""
+"""Minimum length of a step of the drive, s."""
 
 MOST_STEPS = 20_000
 """Maximum number of steps until 100 m are driven. The steps of a slow drive are longer."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""Steps straight ahead (m) and on the spot (rad), for the errors of a robot that stands."""
+"""A step of 0.05 m straight ahead and a step of 0.05 rad on the spot, both without errors.
+
+They replace the recorded steps if the robot stood.
+"""
 
 
 NOISE = (
@@ -68,7 +71,7 @@ PARAMETERS = (
 
 
 class Share(Struct, frozen=True):
-    """The error of one cause alone; None if this drive does not show it."""
+    """The errors by one cause alone. An error is None if this drive does not show it."""
 
     cause: Cause
     mm_per_100_m: float | None
@@ -84,6 +87,7 @@ class Budget(Struct, frozen=True):
     seconds: float
     """Duration of the drive, s."""
     metres: float
+    """Sum of the distances ahead and back, m."""
     turned: float
     """Sum of the turns to both sides, deg."""
     lines: int
@@ -101,26 +105,29 @@ class Budget(Struct, frozen=True):
     gyro: bool
     """True if the heading comes from a gyro."""
     still: bool
-    """True if the robot hardly moved, so that only the errors of the settings are given."""
+    """True if the robot hardly moved. Only the errors that settings declare are given then."""
     at_rest: tuple[float, float]
     """Standard deviations (m/s, rad/s) of the twist because wheel speeds have two decimals."""
     shares: tuple[Share, ...]
     multiplier: float = 1.0
     """Configured ratio of effective track to wheel separation."""
     learned: float | None = None
-    """The same ratio as implied by the gyro, averaged over the drive so far; None if unknown."""
+    """Ratio of effective track to wheel separation that the gyro implies; None if unknown.
+
+    It is an average over the drive so far.
+    """
     learned_std: float = 0.0
     """Standard deviation of `learned`."""
     learned_used: bool = False
-    """True if odometry uses `learned` when it has only the wheels to measure a turn."""
+    """True if the odometry uses `learned` while only the wheels measure the turn."""
     coarse: bool = False
-    """Whether the wheel speeds jump as those of coarse encoders whose counts nobody knows."""
+    """True if the wheel speeds jump like those of coarse encoders of unknown counts."""
 
     def largest(self, *bases: Basis) -> Share | None:
-        """Return the share with the largest position error, among the shares with these bases.
+        """Return the share with the largest position error, among the shares with one of `bases`.
 
-        If no position error is greater than 0, return the share with the largest heading error. If
-        no heading error is greater than 0 either, return None.
+        If no position error is greater than 0, the share with the largest heading error is
+        returned, or None if no heading error is greater than 0 either.
         """
         known = [share for share in self.shares if share.basis in bases]
         for size in (_millimetres, _degrees):
@@ -141,7 +148,7 @@ class Budget(Struct, frozen=True):
 
 
 class Received(Struct, frozen=True):
-    """The drive of a robot, as the bus showed it."""
+    """The messages about a drive that this program received from the bus."""
 
     lines: list[Line]
     """The feedback lines."""
@@ -158,13 +165,13 @@ class Received(Struct, frozen=True):
     deviation: float = 0.0
     """Relative standard deviation of `learned`."""
     used: bool = False
-    """True if odometry uses `learned` when it has only the wheels to measure a turn."""
+    """True if the odometry uses `learned` while only the wheels measure the turn."""
     coarse: bool = False
-    """Whether the wheel speeds jump as those of coarse encoders whose counts nobody knows."""
+    """True if the wheel speeds jump like those of coarse encoders of unknown counts."""
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
-    """Return the error budget of a drive, with the position error after `metres`.
+    """Return the error budget of a drive, with the position error after `metres` m.
 
     `config` is the configuration of the daemon.
     """
@@ -211,7 +218,10 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
 
 
 def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
-    """Yield the error of each cause alone."""
+    """Yield the errors by each cause alone.
+
+    `counts` are the encoder counts per wheel turn, 0 if unknown.
+    """
     odometry, plain = model.odometry, driving.plain()
 
     def share(
@@ -252,7 +262,10 @@ class _Model:
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
         self.rolls = self.turns = True
-        """Whether the drive is long enough to extrapolate the error of position or heading."""
+        """Whether the drive is long enough to extrapolate errors.
+
+        `rolls` is for the position error, and `turns` for the heading error.
+        """
         self._metres = metres
 
     @property
@@ -264,12 +277,16 @@ class _Model:
         self, cause: Cause, basis: Basis, ahead: Steps, left: Steps, only: OdometryConfig,
         counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
-        """Return the error of one cause.
+        """Return the errors by one cause.
 
-        The steps `ahead` are repeated until the distance is driven, and the steps `left` until a
-        whole turn is made. `only` has the settings without the errors of other causes. `counts`
-        (encoder counts per wheel turn) and `scale` (relative standard deviation of the gyro's
-        scale) are 0 if they are not the cause.
+        Args:
+            cause: the name of the cause.
+            basis: the source of the size of the errors. If it is "unknown", the errors are None.
+            ahead: the steps that are repeated until the distance is driven.
+            left: the steps to the left that are repeated until a whole turn is made.
+            only: the settings without the errors of other causes.
+            counts: encoder counts per wheel turn; 0 if the encoders are not the cause.
+            scale: relative standard deviation of the gyro's scale; 0 if the gyro is not the cause.
         """
         if basis == "unknown":
             return Share(cause, None, None, basis)
@@ -286,7 +303,10 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Return the pose's covariance after `metres` m or `angle` rad of these steps, repeated."""
+        """Return the pose's covariance after `metres` m or `angle` rad, whichever comes first.
+
+        The steps are repeated until then.
+        """
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
@@ -304,7 +324,7 @@ class _Model:
 
 
 def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
-    """Return the settings with these settings of `NOISE` and `PARAMETERS`, and no other error."""
+    """Return the settings without the errors that they declare, except those named in `kept`."""
     zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
     return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 

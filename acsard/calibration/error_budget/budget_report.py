@@ -22,8 +22,9 @@ MEANING: dict[Cause, str] = {
 
 ADVICE: dict[Cause, str] = {
     "time": "the times of feedback lines are wrong by {late:.1f} ms: set the latency_timer of the "
-    "serial adapter to 1 (the udev rules do that), or let the feedback lines carry the "
-    "microcontroller's clock and encoder counts (mcu.link_check, mcu.encoder_counts)",
+    "serial adapter to 1 (acsard's udev rules do that), or set mcu.link_check and "
+    "mcu.encoder_counts, so that the microcontroller adds its clock and encoder counts to the "
+    "feedback lines",
     "gaps": "{missing} feedback lines were lost, so {unseen:.2f} s of driving were not measured: "
     "look for a loose cable, noise on the wire or a busy machine (`acsard top`), or let the "
     "feedback lines carry encoder counts, which lose no distance (mcu.link_check, "
@@ -67,7 +68,10 @@ def parts(budget: Budget) -> Iterator[RenderableType]:
 
 
 def advice(budget: Budget) -> str:
-    """Return advice on the largest measured cause, and on a declared cause that is larger."""
+    """Return advice on the largest measured cause.
+
+    If a cause by the settings is larger, the advice also covers that cause.
+    """
     if budget.still:
         return (
             "drive the robot, also around curves, while the tool measures: a robot that stands "

@@ -33,26 +33,26 @@ MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 SHARE_COARSE = 0.1
-"""Share of the lines that are those of coarse encoders, from which on the tool says so."""
+"""Fraction of feedback lines with the marks of coarse encoders above which the report says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
-"""Number and fraction of the daemon's feedback lines that may be missing here.
+"""Limits for the daemon's feedback lines that this program did not receive.
 
-The larger limit counts. A few are missing because the counters and the messages do not begin and
-end at the same moment.
+They are a number and a fraction, and the larger one applies. A few lines are always missing,
+because the counters and the messages do not begin and end at the same moment.
 """
 
 SAMPLED = "checked with samples"
-"""Name of the link check whose lines carry the encoder counts, as in `diagnostics`."""
+"""Value of `check` in `diagnostics` if the feedback lines carry encoder counts."""
 
 LOOK_S = 0.05
-"""Time between two looks for messages, s."""
+"""Period in which the message queues are polled, s."""
 
 
 def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
     """Yield the error budget of the drive so far, every `seconds` s.
 
-    Raises `ReplyError` if no feedback lines come, and if a message cannot be read.
+    Raises `ReplyError` if no feedback lines arrive, or if a message cannot be decoded.
     """
     queues = {key: robot.subscribe(key) for key in KEYS}
     _await_line(robot, queues["wheel_states"])
@@ -63,7 +63,7 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
 
 
 def _await_line(robot: Client, lines: Subscription) -> None:
-    """Wait for the first feedback line, after which all keys are published."""
+    """Wait for the first message of a feedback line. From then on, all of `KEYS` are published."""
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
@@ -88,7 +88,7 @@ def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> N
 
 
 class Feed:
-    """Collects the messages of a daemon: `add` each of them, then call `received`."""
+    """Collects the messages of a daemon. Call `add` for each message, and then `received`."""
 
     def __init__(self, config: Config, first: RobotState) -> None:
         """Start the collection. `first` is the daemon's state just before the first message."""
@@ -101,7 +101,7 @@ class Feed:
         self._count = 0
 
     def add(self, message: Message) -> None:
-        """Add a message of one of `KEYS`. The messages of each key must come in their order."""
+        """Add a message of one of `KEYS`. The messages of each key must be in order."""
         if isinstance(message, TwistStamped):
             self._sent.append(message.header.stamp.to_ns())
         elif isinstance(message, Odometry):
@@ -127,7 +127,10 @@ class Feed:
         )
 
     def _coarse(self, last: RobotState) -> bool:
-        """Return whether many lines were those of coarse encoders whose counts nobody knows."""
+        """Return whether many feedback lines have the marks of coarse encoders of unknown counts.
+
+        `last` is the present state of the daemon.
+        """
         now, before = last.counters, self._first.counters
         lines, coarse = (
             now.get(name, 0) - before.get(name, 0) for name in ("lines", "coarse_encoder_lines")
@@ -139,7 +142,7 @@ class Feed:
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
         if odom is None or wheels is None:
             for waiting in (self._odom, self._wheels):
-                if len(waiting) > 100:  # the other message of the oldest one was lost
+                if len(waiting) > 100:  # the counterpart of the oldest message was lost
                     del waiting[next(iter(waiting))]
             return
         del self._odom[stamp_ns], self._wheels[stamp_ns]
@@ -152,7 +155,10 @@ class Feed:
         self._count += 1
 
     def _whole(self, last: RobotState) -> bool:
-        """Return whether nearly every feedback line of the daemon arrived here."""
+        """Return whether this program received nearly every feedback line of the daemon.
+
+        `last` is the present state of the daemon.
+        """
         rates, before = self._config.rates, self._first.counters
         if rates.odom or rates.wheel_states:
             return False
@@ -171,11 +177,11 @@ def _value(diagnostics: DiagnosticArray, key: str) -> str:
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """Return what the diagnostics say about the effective track that the gyro implies.
+    """Return the effective track that the gyro implies, according to the diagnostics.
 
     Returns:
-        The track divided by the configured one, or None if it is unknown; its standard deviation
-        divided by the track; and whether odometry uses the track.
+        The track divided by the configured track (None if it is unknown), the relative standard
+        deviation of the track, and whether the odometry uses the track.
     """
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)

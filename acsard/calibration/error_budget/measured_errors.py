@@ -1,20 +1,21 @@
 """Measures the motion of a drive and the errors of each of its steps from feedback lines.
 
-Two of the errors are late stamps and lost lines. To find them, the times at which the board made
-its lines are estimated. The board makes a line at a fixed period, or as the answer to each line of
-the daemon, so these times form a grid. A line cannot arrive before it was made. The line with the
-smallest delay among its neighbours therefore shows where the grid is. If even this line comes a
-whole period later than expected, a line was lost. The difference between a stamp and its time on
-the grid is the error of the stamp.
+Two of the errors are late stamps and lost lines. To find them, this module estimates the times at
+which the board made its lines. The board makes a line at a fixed period, or as the answer to each
+line of the daemon, so these times form a grid. A line cannot arrive before the board made it. The
+line with the smallest delay among its neighbours therefore shows where the grid is. If even this
+line arrives a whole period later than expected, a line was lost. The difference between a stamp and
+its time on the grid is the error of the stamp.
 
 Rounding is an error because a feedback line carries wheel speeds with two decimals. Independent
 rounding errors have a standard deviation of q / sqrt(12), where q is the quantization step. A wheel
 at a constant speed repeats the same error, so a run of n equal values is one error of n times this
 size. If a wheel passes through a value while it becomes faster or slower, the run is different: the
-errors of its first and second half cancel. Some firmware counts encoder edges in each period and
-reports multiples of the speed of one count. An edge that it misses in one period is counted in the
-next one. Only the rounding of the reported multiple to two decimals adds up then, and this rounding
-is known.
+errors of its first and second half cancel.
+
+Some firmware counts encoder edges in each period and reports multiples of the speed of one count.
+It counts an edge that it misses in one period in the next period. So only the rounding of the
+reported multiple to two decimals adds up, and this rounding error is known.
 
 `Driving` divides a drive into steps, each with the errors of one cause. An error that is
 independent from step to step is given as a variance. An error that has the same sign in each step
@@ -43,20 +44,23 @@ Counts = npt.NDArray[np.int64]
 AHEAD = 30
 """Number of consecutive lines of which at least one is not delayed.
 
-It is the number of lines in 0.3 s, the longest time for which a host stalls.
+At 100 Hz it is the number of lines in 0.3 s, the longest time for which a host stalls.
 """
 
 MISSING = 0.6
-"""Delay of the earliest line, in periods, from which a line was lost."""
+"""Increase of the smallest delay among neighbouring lines, in periods, that shows a lost line."""
 
 FOLLOWED = 0.05
-"""Part of a new delay by which the grid is corrected. At first the period is known to about 1 %."""
+"""Fraction of each smaller change of the delay by which the grid is corrected.
+
+The correction is needed because the period is at first known only to about 1 %.
+"""
 
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
 """Criterion for lines that arrive one by one, not in bursts.
 
-More than the fraction `CLUSTERED` of the intervals differ from their median by less than the
-fraction `ALIKE_TIMES`.
+More than the fraction `CLUSTERED` of the intervals must differ from the median interval by less
+than the fraction `ALIKE_TIMES` of it.
 """
 
 
@@ -72,9 +76,11 @@ class LineTimes(Struct, frozen=True):
 
 
 def line_times(t: Floats, sent: Floats) -> LineTimes:
-    """Estimate the delays of at least 3 lines from their stamps, s, and the daemon's lines, s.
+    """Estimate the delays of at least 3 feedback lines, and the lines that were lost.
 
-    Both kinds of boards are tried, and the estimate with the smaller delays is returned.
+    `t` has the stamps of the feedback lines, and `sent` the times of the daemon's own lines, in s.
+    A board sends feedback lines at a fixed period, or one as the answer to each line of the daemon.
+    Both kinds are tried, and the estimate with the smaller delays is returned.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -84,7 +90,7 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
 
 
 def _even(t: Floats) -> LineTimes:
-    """Estimate the delays of the lines of a board that sends at a fixed period."""
+    """Estimate the delays of lines with the stamps `t`, s, if the board sends at a fixed period."""
     steps = np.diff(t)
     usual, mean = float(np.median(steps)), float(np.mean(steps))
     alike = np.abs(steps - usual) < ALIKE_TIMES * usual
@@ -101,7 +107,10 @@ def _even(t: Floats) -> LineTimes:
 
 
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
-    """Estimate the delays of a board that answers each line; None if too few of these are known."""
+    """Estimate the delays of lines with the stamps `t`, s, if the board answers the daemon's lines.
+
+    `sent` has the times of the daemon's lines, s. Returns None if these times are too few.
+    """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
     at = np.interp(t, sent, np.arange(len(sent)))
@@ -118,7 +127,8 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 def _missing(at: Floats) -> Counts:
     """Return the number of lines that were lost before each line.
 
-    `at` has the number of periods from the first line to the stamp of each line.
+    `at` has the stamp of each line in periods, counted from the first line or from the daemon's
+    first line.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -140,14 +150,21 @@ BLOCK_S = 0.5
 """Time within which errors of stamps are correlated, s. It exceeds the longest stall of a host."""
 
 LEAST_LINES, ALIKE = 20, 0.99
-"""Limits for the fit of the gyro's noise: the smallest number of lines while the robot moves, and
-the cosine of turn and time above which the fit cannot separate them."""
+"""Limits for the fit of the gyro's noise.
+
+`LEAST_LINES` is the minimum number of lines while the robot moves. If the cosine between the
+columns of turn and time is above `ALIKE`, the fit cannot separate both.
+"""
 
 LATEST_S = 0.1
-"""Delay, s, from which a stamp says nothing, so that the motion of its line counts as a gap."""
+"""Limit, s, between the errors of stamps and gaps.
+
+A stamp with a larger delay is not used as an error of a stamp. An interval of at least this length
+in which the pose did not move counts as a gap.
+"""
 
 Wheels = tuple[float, float, float, float]
-"""Values of the four wheels, in the order of `values.WHEELS`."""
+"""Values of the four wheels, in the order of `acsard.core.values.WHEELS`."""
 
 
 class Line(Struct, frozen=True):
@@ -182,15 +199,18 @@ class Motion(Struct, frozen=True):
     yaw_variance: Floats | None
     """Variance that odometry added to the heading with time, rad2; None if it is unknown."""
     late: Floats
-    """Errors because of wrong stamps, rows of (m, rad)."""
+    """Errors of the motion because of wrong stamps, rows of (m, rad)."""
     lateness: float
     """RMS error of the stamps, s."""
     filled: Floats
-    """Variances of gaps that odometry filled, rows of (m2, rad2). Other rows are zero."""
-    unfilled: Floats
-    """Motion in gaps that odometry did not fill, and its variances, rows of (m, rad, m2, rad2).
+    """Variances of the motion in gaps that the odometry filled, rows of (m2, rad2).
 
-    The pose did not move in such a gap. Other rows are zero.
+    The rows of lines without such a gap are zero.
+    """
+    unfilled: Floats
+    """Motion in gaps that the odometry did not fill, and its variances: (m, rad, m2, rad2).
+
+    The pose did not move in such a gap. The rows of lines without such a gap are zero.
     """
     missing: int
     """Number of lines that were lost."""
@@ -199,11 +219,11 @@ class Motion(Struct, frozen=True):
 
 
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
-    """Compute the motion of a drive of at least 3 lines, and its errors.
+    """Compute the motion of a drive of at least 3 feedback lines, and its errors.
 
-    `sent` has the times of the daemon's own lines, s. `whole` says that every line of the daemon
-    arrived here. If not, a missing line may have been lost between the daemon and this program, so
-    it does not count as lost.
+    `sent` has the times of the daemon's own lines, s. `whole` is true if this program received
+    every feedback line that the daemon received. If it is false, a missing line may have been lost
+    between the daemon and this program, so it is not treated as a gap that the odometry filled.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -228,9 +248,9 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 
 
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
-    """Return the growth of the heading's variance with time in each line, rad2.
+    """Return the growth of the heading's variance with time from each line to the next, rad2.
 
-    It is 0 in lines in which the wheels do not turn. The variance of the heading also contains the
+    It is 0 for lines in which the wheels do not turn. The variance of the heading also contains the
     scale error of the gyro, S^2 A^2. S is the relative standard deviation of the scale, and A is
     the turn since the pose was set. A line with the turn dA adds 2 S^2 A dA, which is subtracted
     here. The turn before the first line is unknown, so a least-squares fit estimates it together
@@ -270,7 +290,11 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
 def _gaps(
     t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
 ) -> tuple[Floats, Floats, int, float]:
-    """Return the last four fields of `Motion`, by the odometry's own model of unseen motion."""
+    """Return `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
+
+    The variances come from the odometry's own model of gaps, `Gaps`. `twists` are by the reported
+    speeds, and `rolled` is the motion by the reported positions from each line to the next.
+    """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0
     gaps = Gaps()
@@ -289,8 +313,8 @@ def _gaps(
             seconds = missing * found.period
             unseen += seconds
             lost += missing
-            # Odometry may have filled in another motion than that at the mean of the speeds before
-            # and after the gap.
+            # The odometry may have filled the gap with a motion that differs from the one at the
+            # mean of the speeds before and after the gap.
             off = moved.linear - after.linear * found.period - mean.linear * seconds
             turned = moved.angular - after.angular * found.period - mean.angular * seconds
             along, yaw = gaps.unseen(seconds, before, after)
@@ -302,19 +326,22 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""Part of the feedback lines with equal values from which two wheels have the same errors."""
+"""Minimum fraction of feedback lines in which the speeds of two wheels are equal.
+
+The rounding errors of two such wheels are taken to be the same.
+"""
 
 LEAST_VALUES = 3
-"""Number of different speeds that are needed to find a quantization step."""
+"""Minimum number of different speeds that are needed to find a quantization step."""
 
 
 class Rounding(Struct, frozen=True):
     """Rounding errors. Rows are feedback lines, columns are wheels in `values.WHEELS` order."""
 
     variance: Floats
-    """Variance of the angle that a wheel rolled, rad2. The entries are independent."""
+    """Variance of the angle that a wheel rolled in a line, rad2. The entries are independent."""
     offset: Floats
-    """Known error of the angle that a wheel rolled, rad."""
+    """Known error of the angle that a wheel rolled in a line, rad."""
     alike: Floats
     """Shape (4, 4): 1 for a pair of wheels with the same errors, otherwise 0."""
     quantum: float
@@ -324,7 +351,10 @@ class Rounding(Struct, frozen=True):
 
 
 def rounding(speeds: Floats, period: float) -> Rounding:
-    """Estimate the rounding errors of `speeds`, rad/s. A row is a line, which covers `period` s."""
+    """Estimate the rounding errors of wheel speeds, rad/s.
+
+    `speeds` has a row for each feedback line, which covers `period` s, and a column for each wheel.
+    """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
     alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
@@ -338,10 +368,11 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """Return the variance of each run of equal values of a wheel, in units of q^2 / 12.
+    """Return the variance of each run of equal speeds of a wheel, as a multiple of q^2 / 12.
 
-    The variance is in the row of the run's last value, and the other rows are 0. It is the square
-    of the number of values, or 1 if the wheel passed through the value.
+    q is the quantization step. The variance is in the row of the run's last value, and the other
+    rows are 0. It is the square of the number of values, or 1 if the wheel passed through the value
+    while it became faster or slower.
     """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
@@ -380,14 +411,17 @@ class Steps(Struct, frozen=True):
     """Whether a gyro measured the turns. Otherwise the wheels did."""
 
     def to_the_left(self) -> Steps:
-        """Return the steps with every turn, and the missed part of it, to the left."""
+        """Return the steps with all turns to the left. Missed turns change their sign with them."""
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
         return Steps(rows, self.by_gyro)
 
 
 class Driving:
-    """A drive, divided into steps of about `step_s` s, with the errors of each cause."""
+    """Divides a drive into steps of about `step_s` s. Each method adds the errors of one cause.
+
+    `gyro` is true if a gyro measured the turns.
+    """
 
     def __init__(
         self, lines: list[Line], motion: Motion, rounding: Rounding, kinematics: Kinematics,
@@ -397,10 +431,10 @@ class Driving:
         self._each = max(1, round(step_s / motion.period))
         twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
         self._weights = np.array([[t.linear for t in twists], [t.angular for t in twists]])
-        """Motion of the robot for 1 rad of each wheel: a row of m and a row of rad."""
+        """Motion of the robot if one wheel rolls by 1 rad, shape (2, 4): rows in m and in rad."""
 
     def plain(self) -> Steps:
-        """Return the steps without an error."""
+        """Return the steps without errors."""
         return self._steps()
 
     @property
@@ -409,7 +443,7 @@ class Driving:
         return self._motion.yaw_variance is not None
 
     def turned_by_gyro(self) -> Steps:
-        """Return the steps with the gyro noise that odometry assumes."""
+        """Return the steps with the gyro noise that the odometry assumes."""
         return self._steps(gyro=self._motion.yaw_variance)
 
     def late(self) -> Steps:
@@ -447,7 +481,10 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the missed motion for wheel angles that are wrong by exactly `off`, rad."""
+        """Return the missed motion for wheel angles that are wrong by `off`, rad.
+
+        The rows are (m, rad, m2, rad2). The error `off` is known, so the variances are 0.
+        """
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
 
@@ -455,7 +492,11 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps with these errors. The arguments have one row for each feedback line."""
+        """Return the steps with these errors; None means no error.
+
+        Each argument has one row for each feedback line except the first, with the columns of
+        `Steps.rows`: 2 and 3 (`variances`), 4 to 7 (`missed`), and 8 (`gyro`).
+        """
         moved, count = self._motion, len(self._motion.distance)
         errors = [
             np.zeros((count, width)) if given is None else given.reshape(count, width)

@@ -1,11 +1,13 @@
 """Finds the quantization step of reported wheel speeds.
 
-A firmware that divides counts by its period reports only multiples of q = 2 pi / (counts T), in two
-decimals. The search finds the largest q of which nearly all speeds are multiples. It rejects a q
-that chance could have produced. Speeds that a filter has smoothed are not multiples of any step.
-(A mean over M periods has a step that is M times as fine, as if it counted in M-ths.)
+A firmware may compute speeds from the encoder counts in each period T, s. It then reports only
+multiples of the step q = 2 pi / (N T), in two decimals, where N is the number of counts per wheel
+turn. The search finds the largest q of which nearly all speeds are multiples. It rejects a q that
+chance could have produced. Speeds that a filter has smoothed are not multiples of any step. A mean
+over M periods has a step that is M times as fine.
 
-Some speed V is j q for a whole j, so the candidates are V / j for j = 1, 2 and so on.
+One of the largest speeds is V = j q for a whole number j. So the candidates for q are V / j for
+j = 1, 2 and so on.
 """
 
 from __future__ import annotations
@@ -24,14 +26,16 @@ DEVIATION = 0.01 / math.sqrt(12)
 """Standard deviation of the rounding to two decimals, rad/s."""
 
 STRAYS = 0.005
-"""Share of the speeds that need not be multiples of the step, because of damaged lines."""
+"""Fraction of the speeds that need not be multiples of the step, because of damaged lines."""
 
 BY_CHANCE = 1e-5
 """Highest probability that chance has produced an accepted step."""
 
 STEEP = 1.0
-"""rad/s. A wheel's speed alternates by this much from line to line only because of its encoder, so
-no test against chance is needed."""
+"""Step, rad/s, from which no test against chance is needed.
+
+Only an encoder makes the speed of a wheel alternate this much from line to line.
+"""
 
 
 def quantization_step(speeds: Floats) -> float:
@@ -53,16 +57,20 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Return how many speeds in two decimals are not multiples of `step`.
+    """Return how many speeds in two decimals are not multiples of `step`, rad/s.
 
-    `doubt` is the relative error of `step`.
+    `doubt` is the largest relative error of `step`.
     """
     off = np.abs(speeds - step * np.round(speeds / step))
     return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
 
 
 def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
-    """Return the step near `rough` by least squares, 0 if it fails the closer tests."""
+    """Return the step near `rough`, rad/s, by least squares; 0 if a closer test rejects it.
+
+    `spare` is the number of speeds that need not be multiples of the step. `tries` is the number of
+    candidates tried so far, each of which could fit by chance.
+    """
     whole = np.round(speeds / rough)
     near = np.abs(speeds - whole * rough) <= 2 * ROUNDING
     whole = whole[near]

@@ -4,9 +4,9 @@ A method of calibration consists of questions to ask first and legs to drive in 
 has the table of the methods, and `runner.py` leads a person through one of them. The command line
 and the page import this module to name the methods, so it does not load numpy.
 
-The robot stays within its limits and on a floor of 3 m x 3 m. How far it turns for a command is not
-known before the calibration: the plan must work for an effective track of 1 to 2.5 times the wheel
-separation. A drive stays on the floor in spite of that because it takes one of these forms:
+The robot stays within its limits and on a floor of 3 m x 3 m. The angle that it turns for a command
+is not known before the calibration. So the plan must work for an effective track of 1 to 2.5 times
+the wheel separation. Each drive takes one of these forms, so that it still stays on the floor:
 
 - It goes there and back.
 - It follows a line that a person set the robot on.
@@ -32,7 +32,7 @@ NEEDS: dict[str, str] = {
     "wall": "a straight wall and a tape measure",
     "umbmark": "a tape measure and marks",
 }
-"""Equipment by the name of the method, as `--method` takes it."""
+"""Equipment that a person needs for each method, by the method's name in `--method`."""
 
 SIMULATED = (
     "positions",
@@ -48,19 +48,19 @@ class GuideError(AcsardError):
 
 
 class DisturbedError(GuideError):
-    """A leg was cut short by something that may not happen again, so it can be repeated."""
+    """A leg was cut short for a reason that may not occur again, so the leg can be repeated."""
 
     def __init__(self, why: str, text: str) -> None:
-        """Take the reason alone, and the text for the case that the leg is not repeated."""
+        """Store the reason `why`. `text` is the whole message if the leg is not repeated."""
         super().__init__(text)
         self.why = why
 
 
 class Move(Struct, frozen=True):
-    """A command, and the time for which the tool keeps sending it."""
+    """A command, and the time for which the tool keeps sending this command."""
 
     seconds: float
-    """Time in s."""
+    """Time for which the tool sends the command, s."""
     linear: float = 0.0
     """Linear speed, m/s."""
     angular: float = 0.0
@@ -90,13 +90,13 @@ class Mean(Struct, frozen=True):
     deviation: float
     """Standard deviation of the measurement, m or rad."""
     plus: float = 0.0
-    """Constant to add, m or rad: the whole turns, which the person does not measure."""
+    """Constant to add, m or rad, for example whole turns, which the person does not measure."""
     over: tuple[str, ...] = ()
     """Names of the legs whose motion the measurement covers. () means only the leg itself."""
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn by the distances of two of its points from a line."""
+    """A measurement of the robot's turn by the distances of two points of the robot from a line."""
 
     quantity: Quantity
     near: str
@@ -133,7 +133,7 @@ class Leg(Struct, frozen=True):
     by_key: bool = False
     """Whether the person ends the last move with a key. Its duration is then a timeout."""
     placed: bool = False
-    """Whether a person sets the robot for this leg, so that the measurements begin again here."""
+    """Whether a person places the robot before this leg. Measurements then start at this leg."""
 
     @property
     def seconds(self) -> float:
@@ -155,7 +155,7 @@ FASTEST_WHEEL = 0.5
 REACH = 0.75
 """Distance from the robot's middle to its outermost point, in wheel separations.
 
-Half a wheel radius is added to it.
+Half a wheel radius is added to this distance.
 """
 
 EDGE = 0.1
@@ -168,7 +168,7 @@ LEAST_SPEED, LEAST_TURN = 0.05, 0.2
 """Smallest `limits.linear_speed` (m/s) and `limits.angular_speed` (rad/s) for a guided drive."""
 
 STOPS_IN = 0.1
-"""Distance that the robot may roll on when a leg ends, m."""
+"""Distance that the robot may still roll after a leg has ended, m."""
 
 WIDEST = 2.5
 """Largest ratio of effective track to wheel separation that the plan allows for.
@@ -211,20 +211,28 @@ class Setup(Struct, frozen=True):
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """Return a turn on the spot. `rate` is the turn rate without skidding, rad/s."""
+        """Return a turn on the spot that lasts `seconds` s.
+
+        `rate` is the turn rate that the robot would have without skidding, rad/s, positive to the
+        left. With skidding it turns more slowly.
+        """
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
-        """Return a curve at `rate`, rad/s without skidding; backwards if `metres` is negative."""
+        """Return a curve of the length `metres`, m; a negative length goes backwards.
+
+        `rate` is the turn rate that the robot would have without skidding, rad/s, positive to the
+        left.
+        """
         straight = self.ahead(metres)
         return Move(straight.seconds, straight.linear, self.command(rate))
 
     def turn(self, angle: float, rate: float, track: float) -> Move:
-        """Return a turn on the spot by `angle` as an observer sees it, with skidding included.
+        """Return a turn on the spot by the true angle, which takes account of skidding.
 
         Args:
-            angle: the angle in rad, positive to the left.
-            rate: the wanted turn rate in rad/s; the limits may reduce it.
+            angle: the true angle in rad, positive to the left.
+            rate: the wanted true turn rate in rad/s, positive. The limits may reduce it.
             track: the ratio of effective track to wheel separation.
         """
         command = abs(self.command(rate * track))
@@ -233,10 +241,10 @@ class Setup(Struct, frozen=True):
         return Move(seconds, 0.0, math.copysign(command, angle))
 
     def command(self, rate: float) -> float:
-        """Return the angular command for a turn rate without skidding, both in rad/s.
+        """Return the angular command for the turn rate `rate` without skidding, both in rad/s.
 
-        The command is within the limits. The daemon multiplies it by the configured multiplier of
-        the wheel separation, so it is divided by that multiplier here.
+        The command is within the limits. The daemon multiplies an angular command by the configured
+        multiplier of the wheel separation. So the command is divided by that multiplier here.
         """
         multiplier = self.drive.wheel_separation_multiplier
         most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * multiplier)
@@ -244,10 +252,10 @@ class Setup(Struct, frozen=True):
 
 
 Legs = Callable[[Setup, float], tuple[Leg, ...]]
-"""Function from a setup and the ratio of effective track to wheel separation to the legs.
+"""Function that returns the legs of a method.
 
-The first `turned` measurement shows that ratio. The legs up to this measurement are therefore the
-same for any ratio.
+Its arguments are the setup and the ratio of effective track to wheel separation. The first `turned`
+measurement shows that ratio, so the legs up to this measurement are the same for any ratio.
 """
 
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
@@ -268,7 +276,7 @@ class Method(Struct, frozen=True):
     """The tool of the person's measurements, in words; "" if a sensor measures instead."""
 
     def longest_s(self, setup: Setup) -> float:
-        """Return the driving time in s for the effective track with which it is longest."""
+        """Return the longest driving time, s, over all effective tracks in `TRACKS`."""
         return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACKS)
 
 

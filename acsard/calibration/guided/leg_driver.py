@@ -1,8 +1,8 @@
 """Drives one leg: decides the commands from the daemon's messages and from key presses.
 
-The driver goes through the phases of `Phase`. It sends zeros until the daemon accepts them, then
-the moves of the leg, each for its duration, then zeros until the wheels stand. Any unexpected
-condition halts the leg for good. `halted` then has the reason.
+The driver goes through the phases of `Phase`. It commands zero until the daemon accepts its
+commands, then each move of the leg for its duration, then zero until the wheels stand. An
+unexpected condition halts the leg for good. `LegDriver.halted` then has the reason.
 """
 
 from __future__ import annotations
@@ -29,10 +29,14 @@ LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
 """Allowed deviation from the command: m/s or rad/s, plus a fraction of the command."""
 
 STILL = 0.02
-"""Speed below which a wheel stands, rad/s."""
+"""Largest speed at which a wheel is considered to stand still, rad/s."""
 
 STANDING_S, STANDS_S = 0.5, 6.0
-"""Time for which the wheels must stand, and time within which they must come to rest, s."""
+"""Limits for the end of a leg, s.
+
+The leg is done when the wheels have stood still for `STANDING_S`. If this takes longer than
+`STANDS_S`, the leg is halted.
+"""
 
 ENTER = "\r\n"
 PRESSED = "a key was pressed"
@@ -40,10 +44,10 @@ PRESSED = "a key was pressed"
 
 class Phase(StrEnum):
     OPENING = "opening"
-    """Zeros are sent until the daemon accepts them."""
+    """The driver commands zero until the daemon accepts its commands."""
     MOVING = "moving"
     SETTLING = "settling"
-    """Zeros are sent until the wheels stand."""
+    """The driver commands zero until the wheels stand."""
     DONE = "done"
     HALTED = "halted"
 
@@ -52,23 +56,25 @@ class LegDriver:
     """A leg while it is driven. Every `now` is in s of the same monotonic clock."""
 
     def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
-        """Start a leg. The daemon knows its commands by `source` and by `sender`."""
+        """Start a leg. The daemon identifies the commands of this leg by `source` and `sender`."""
         self._leg, self._source, self._drive, self._sender = leg, source, drive, sender
         self.phase = Phase.OPENING
         self.halted = ""
         """The reason why the leg was cut short, or ""."""
         self.disturbed = False
-        """Whether `halted` is something that may not happen again, so the leg can be repeated."""
+        """Whether the reason in `halted` may not occur again, so that the leg can be repeated."""
         self.silent = False
-        """Whether `halted` is the silence of the daemon. It is a disturbance if the daemon returns.
+        """Whether the leg was halted because nothing was received from the daemon.
+
+        If the daemon returns, the leg can be repeated.
         """
         self._begun = self._received = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
         self._waits = "no state of the daemon has arrived"
-        """Why the zeros do not count yet, or ""."""
+        """The reason why the daemon does not accept the commands yet, or ""."""
         self._starved = f"no command of source {source} has arrived for {OPENING_S:g} s"
-        """Objection of a computer that is too busy to send."""
+        """Objection if this computer is too busy to send commands."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -88,8 +94,9 @@ class LegDriver:
     def key(self, pressed: str, now: float) -> None:
         """Handle a key press.
 
-        Enter is ignored in phase OPENING, because the person who started the leg with Enter may
-        still hold the key.
+        If the leg has `by_key` set, a key ends its last move, and keys are ignored while the wheels
+        then come to rest. At any other time a key halts the leg. Enter is ignored in phase OPENING,
+        because the person who started the leg with Enter may still hold the key.
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
@@ -132,7 +139,7 @@ class LegDriver:
         """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
         # After a pause of this process, it is unknown whether the daemon was silent. The robot has
-        # braked meanwhile, and the time of a move may be over, so that the next one would begin at
+        # braked meanwhile, and the time of a move may be over. The next move would then begin at
         # the wrong place.
         if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
             self._halt(HELD_UP, disturbed=True)
@@ -187,10 +194,15 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if `why` is given for `DEVIATES_S`. "" means that all is well.
+        """Halt the leg if an objection lasts for `DEVIATES_S`.
 
-        A shorter deviation is tolerated: a computer that is busy for a moment sends its commands
-        late, and the robot slows down meanwhile.
+        A shorter one is tolerated: a computer that is busy for a moment sends its commands late,
+        and the robot slows down meanwhile.
+
+        Args:
+            why: the present objection, or "" if there is none.
+            now: the present time, s.
+            disturbed: whether the leg can be repeated after this objection.
         """
         if not why:
             self._deviates_since = None
@@ -203,7 +215,7 @@ class LegDriver:
         """Return why the daemon does not follow the commands of this leg, or ""."""
         if why := objection(state, self._source, self._sender):
             return why
-        # A source with a long timeout still drives the robot when its commands arrive no longer.
+        # A source with a long timeout still drives the robot after its commands stop arriving.
         (age,) = [source.age for source in state.sources if source.name == self._source]
         if age is None or age >= OPENING_S:
             return self._starved
@@ -212,8 +224,8 @@ class LegDriver:
     def _deviation(self, state: RobotState, now: float) -> str:
         """Return a sentence about how the wheels deviate from the command, or "".
 
-        A gyro is not asked: when wheels skid, the robot turns less than commanded although the
-        wheels do as commanded.
+        The turn rate by a gyro is not compared. If the wheels skid, the robot turns less than
+        commanded although the wheels follow the command.
         """
         if now - self._changed < OBEYED_S:
             return ""

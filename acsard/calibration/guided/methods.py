@@ -39,19 +39,19 @@ It includes the error with which the person placed the robot beside the marks.
 """
 
 FIRST_TURN = 1.2
-"""Rate of the first turn as it would be without skidding, rad/s."""
+"""Turn rate that the first turn would have without skidding, rad/s."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time that the widest track needs.
+"""Timeout of the first turn, as a multiple of the time that a turn takes with the widest track.
 
-After the timeout, the person has missed the moment at which the circle was full.
+If it expires, the person has missed the moment at which the circle was full.
 """
 
 MOST_SPIN_S = 24.0
 """Longest time for several turns on the spot, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
-"""Pauses before and after a move: to come to rest, and to let the robot stop shaking."""
+"""Pauses between moves. In `STOP` the robot comes to rest; in `SETTLE` it also stops shaking."""
 
 ROUND = "once round"
 """Name of the leg of the first turn, which a person ends with a key."""
@@ -71,7 +71,11 @@ def _at_the_edge(setup: Setup) -> str:
 
 
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
-    """Return the leg of a turn to the left that a key ends. `until` follows "Press SPACE"."""
+    """Return the leg of one turn to the left on the spot, which the person ends with a key.
+
+    `until` says when to press the key; it completes the instruction "Press SPACE ...". `asks` are
+    the questions after the turn, and `measures` the measurements that the answers give.
+    """
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.drive.wheel_separation_multiplier
     words = f"The robot turns to the left on the spot. Press SPACE {until}"
@@ -80,7 +84,11 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return how many turns at the true `rate`, rad/s, fit into `MOST_SPIN_S`: 1 to `most`."""
+    """Return how many full turns on the spot fit into `MOST_SPIN_S`, from 1 to `most`.
+
+    `rate` is the true turn rate, rad/s, and `track` the ratio of effective track to wheel
+    separation.
+    """
     one = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(most, int(MOST_SPIN_S / one)))
 
@@ -98,7 +106,7 @@ TO_LINE = (
     Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
 )
 LINE = "front", "rear", "wheelbase"
-"""Names of the answers `near`, `far` and `apart` of a `Slant`, for a line on the robot's left."""
+"""Values of `near`, `far` and `apart` of a `Slant`, for a line on the robot's left."""
 
 
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -145,7 +153,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
 # The method "wall": a tape measure, and a wall that a person sets the robot's back against.
 
 GAP_M = 0.2
-"""Distance from the wall to which the robot returns, m."""
+"""Distance from the wall at which the robot stops when it returns, m."""
 
 OUT_M = 0.9
 """Distance that the robot drives before the turns on the spot, m."""
@@ -300,18 +308,25 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
 # floor although its effective track is unknown.
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""Rates of fast turns, slow turns and curves as they would be without skidding, rad/s."""
+"""Rates that fast turns, slow turns and curves would have without skidding, rad/s."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
-"""Duration of a turn for a gyro, length of a curve, and angle of a turn for positions."""
+"""Sizes of the moves of "gyro" and "positions".
+
+They are the duration of a turn for a gyro (s), the length of a curve (m), and the angle of a turn
+for positions (rad), as it would be without skidding.
+"""
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Rates of each turn on the spot and of the curve after it, rad/s, as without skidding."""
+"""Pairs of rates, rad/s, of a turn on the spot and of the curve after it.
+
+The robot would have these rates without skidding.
+"""
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
-"""Pauses: before the first drive, between drives, and where the robot only has to stop.
+"""Pauses before the first drive, between drives, and where the robot only has to stop.
 
-`STANDING` and `PAUSE` are long enough to measure the gyro bias in them.
+`STANDING` and `PAUSE` are long enough to measure the bias of a gyro.
 """
 
 STRAIGHT = "straight"
@@ -368,7 +383,10 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve there and back, which stays on the floor whatever the robot's heading is."""
+    """Return a curve there and back, which stays on the floor for any heading of the robot.
+
+    `rate` is the turn rate that the robot would have without skidding, rad/s.
+    """
     metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 

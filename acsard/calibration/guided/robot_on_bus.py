@@ -1,10 +1,10 @@
 """Connects a guided drive to the robot: sends the commands of a leg, and records the messages.
 
-`leg_driver.py` decides which command to send. `Recorder` keeps the samples of a leg in the form
-that a log has. Each sender stamps its messages with its own clock, or not at all, and the clocks
-need not agree. The stamps of one key give the intervals between its samples. The sample of a key
-with the smallest delay between stamp and arrival is taken to have arrived without delay. The fit
-finds the delays that remain.
+`leg_driver.py` decides which command to send. `Recorder` keeps the samples of a leg in the same
+form as a log. Each sender stamps its messages with its own clock, or not at all, and the clocks
+need not agree. So the stamps of a key are used only for the intervals between its samples. The
+sample of a key with the smallest delay from stamp to arrival is assumed to have arrived without
+delay. The fit finds the delays that remain.
 """
 
 from __future__ import annotations
@@ -42,24 +42,23 @@ SHOWN_S = 0.2
 """Period in which the progress of a leg is shown, s."""
 
 RETURNS_S = 3.0
-"""Time within which a daemon that fell silent must speak again, s.
+"""Time within which a silent daemon must send its state again, s.
 
-If it does, its computer was too busy to run it, and the leg can be repeated.
+If the daemon does, its computer was only too busy to run it, and the leg can be repeated.
 """
 
 POSITIONS = (Odometry, PoseStamped)
 """Types of a position message, in the order in which they are tried.
 
-A CDR payload does not name its type. Decoding it as odometry fails if it is a pose, because a pose
-is shorter.
+A CDR payload does not name its type. To decode a pose as odometry fails, because a pose is shorter.
 """
 
 Take = Callable[[Any, float], object]
-"""Receives a message and its time of arrival, s."""
+"""Function that processes a message. Its second argument is the time of arrival, s."""
 
 
 class Sensor:
-    """A subscription to one key. Its messages are decoded as the first of `types` that fits."""
+    """A subscription to one key. The first of `types` that fits decodes its messages."""
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
@@ -67,7 +66,11 @@ class Sensor:
         self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
 
     def receive(self, take: Take, now: float) -> int:
-        """Pass the messages to `take`, return their number. Raises `GuideError` for a bad one."""
+        """Pass the messages that have arrived to `take`, and return their number.
+
+        `now` is passed as their time of arrival, s. Raises `GuideError` if a message cannot be
+        decoded.
+        """
         count = 0
         while (sample := self._samples.try_recv()) is not None:
             take(self._decoded(sample), now)
@@ -75,9 +78,10 @@ class Sensor:
         return count
 
     def await_first(self, what: str) -> None:
-        """Wait for the first message. Raises `GuideError` if none arrives within `FIRST_S`.
+        """Wait until a message arrives on the key, and discard it.
 
-        `what` names the expected message in the text of the error.
+        Raises `GuideError` if none arrives within `FIRST_S`. `what` names the expected message in
+        the text of that error.
         """
         end = time.monotonic() + FIRST_S
         while not self.receive(lambda message, now: None, 0.0):
@@ -106,7 +110,7 @@ class Sensor:
 STREAMS = {
     "wheels": ("left", "right"), "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
-"""Columns of the log by the source of their samples."""
+"""Columns of the log by the name of their source."""
 
 
 class Sample(Struct, frozen=True):
@@ -117,11 +121,15 @@ class Sample(Struct, frozen=True):
     made: float | None
     """Stamp by the sender's clock, s; None if the message has no stamp."""
     values: tuple[float, ...]
-    """Values in the order of `STREAMS`."""
+    """Values of the columns that `STREAMS` lists for the source."""
 
 
 class Recorder:
-    """Collects the samples of one leg. `came` is a message's time of arrival, s."""
+    """Collects the samples of one leg.
+
+    `joints` has the names of the wheel joints: front right, front left, rear left, rear right. Each
+    `came` is the time of arrival of a message, s.
+    """
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._right = joints[0], joints[3]
@@ -148,7 +156,7 @@ class Recorder:
         self._add("places", message.header.stamp, came, (spot.x, spot.y))
 
     def command(self, message: TwistStamped, came: float) -> None:
-        """Add the twist that the daemon commands of the wheels."""
+        """Add the twist that the daemon commands to the wheels."""
         values = message.twist.linear.x, message.twist.angular.z
         self._add("commands", message.header.stamp, came, values)
 
@@ -167,14 +175,17 @@ class Recorder:
 
 
 def times(samples: Sequence[Sample]) -> Floats:
-    """Return the times by this computer's clock, s; those of arrival if a stamp is missing."""
+    """Return the times of samples by this computer's clock, s.
+
+    If a sample has no stamp, they are the times of arrival.
+    """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
     return came if not len(came) or np.isnan(made).any() else on_arrival_clock(came, made)
 
 
 class RobotOnBus:
-    """The robot of a guided drive: follows the commands of a leg while its sensors are recorded."""
+    """The robot of a guided drive. It drives one leg at a time while its sensors are recorded."""
 
     def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
         self._client, self._prompt = client, prompt
@@ -193,7 +204,7 @@ class RobotOnBus:
     def positions(self, key: str, session: zenoh.Session | None) -> None:
         """Record the positions on `key` in each leg. Raises `GuideError` if none arrive.
 
-        `session` receives them; None means the session that also commands the robot.
+        `session` receives the positions. None means the session that also commands the robot.
         """
         sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
         sensor.await_first("a position (PoseStamped or Odometry)")
@@ -202,7 +213,10 @@ class RobotOnBus:
     def ride(self, leg: Leg) -> Run:
         """Drive a leg and return its recording.
 
-        Raises `GuideError` if the leg was halted; `DisturbedError` if it can be repeated.
+        Raises:
+            DisturbedError: the leg was halted, and can be repeated.
+            GuideError: the leg was halted for another reason.
+            LogError: the recording has too few samples of the wheels.
         """
         recorder = Recorder(self._joints)
         self._drain()
@@ -226,7 +240,7 @@ class RobotOnBus:
         return recorder.run()
 
     def _returns(self) -> bool:
-        """Return whether the daemon, which fell silent, speaks again within `RETURNS_S`."""
+        """Return whether the silent daemon sends its state again within `RETURNS_S`."""
         end = time.monotonic() + RETURNS_S
         while time.monotonic() < end:
             if self._watch.look(time.monotonic()):
@@ -270,5 +284,5 @@ class RobotOnBus:
         self._watch.look(time.monotonic())
 
     def _full(self, key: str) -> str:
-        """Return the full key: a name that `acsard topics` lists gets this robot's id in front."""
+        """Return the full key. A key that `acsard topics` lists gets this robot's id in front."""
         return self._client.key(key) if by_key(key) is not None else key

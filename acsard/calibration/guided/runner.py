@@ -29,19 +29,27 @@ from acsard.calibration.wheel_response import response
 from acsard.terminal.prompt import Ask, Prompt
 
 MOST_REPEATS = 2
-"""Number of times that a disturbed leg is repeated on a real robot."""
+"""Maximum number of times that a disturbed leg is repeated on a real robot."""
 
 MOST_SIMULATED_REPEATS = 20
-"""Number of times on the simulator, which no floor limits and no person has to set back."""
+"""Maximum number of times that a disturbed leg is repeated on the simulator.
+
+There the floor has no limits, and nobody has to set the robot back.
+"""
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
     """Return the index of the leg from which the drive goes on after a disturbance.
 
-    A sensor measures each leg alone. Tape readings belong together from the leg for which a person
-    sets the robot. A leg that is measured from the angle after the leg before it can begin again by
-    itself, if the person measures that angle anew. `number` is the index of the disturbed leg, and
-    `sensor` says that a sensor measures instead of a person.
+    A sensor measures each leg alone, so only the disturbed leg is repeated. The tape readings after
+    one placement of the robot belong together, so the drive goes back to the leg for which a person
+    placed the robot. There is one exception: a leg whose turn is measured from the robot's angle
+    after an earlier leg is repeated alone. The person then measures that angle again.
+
+    Args:
+        legs: the legs of the method.
+        number: the index of the disturbed leg.
+        sensor: whether a sensor measures instead of a person.
     """
     if sensor or angle_before(legs[number]):
         return number
@@ -49,7 +57,11 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 
 
 def angle_before(leg: Leg) -> str:
-    """Return the earlier leg from whose measured angle this leg alone turns on; "" without one."""
+    """Return the name of the earlier leg after which the angle was measured that this leg needs.
+
+    The turn of this leg is measured from that angle. The name is "" if the measurements of this leg
+    need no such angle, or if they cover several legs.
+    """
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")
 
@@ -59,14 +71,20 @@ def guide(
 ) -> Calibration:
     """Lead a person through a method of calibration, and return the result.
 
-    `name` is a key of `METHODS`. `ride` drives one leg and returns its recording. A leg that was
-    disturbed is repeated, twice at most, after the person has set the robot back; on the built-in
-    simulator (`simulated`) more often.
+    A disturbed leg is repeated after the person has set the robot back.
+
+    Args:
+        name: the name of the method, a key of `METHODS`.
+        setup: the robot, and the speeds and lengths of its drive.
+        prompt: the prompt that instructs and asks the person.
+        ride: the function that drives one leg and returns its recording.
+        simulated: whether the robot is the built-in simulator. Disturbed legs are then repeated
+            more often.
 
     Raises:
         GuideError: the drive cannot continue.
         LogError: a recording has too few samples.
-        NobodyError: nobody answers the questions.
+        NobodyError: no person answers the questions.
         RefusedError: the measurements are impossible or contradict each other.
     """
     method = METHODS[name]
@@ -90,7 +108,10 @@ def guide(
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
     def repeat(disturbed: DisturbedError) -> int:
-        """Prepare the repetition of the present leg, and return the index of the leg to begin."""
+        """Prepare the repetition of the disturbed leg. Return the index of the leg to drive next.
+
+        Raises `disturbed` if the leg was repeated too often.
+        """
         leg = legs[number]
         repeats[leg.name] = repeats.get(leg.name, 0) + 1
         if repeats[leg.name] > most:

@@ -1,11 +1,11 @@
 """Computes a `Calibration` from tape readings: wheel radii, effective track and improvement.
 
-A reading is one measurement of the robot's motion since a person last placed it: a distance, a
-turn, or a displacement. The fit is a Gauss-Newton fit to all readings. `calibration/positions.py`
-sums the path of the wheels that each reading is compared with.
+A reading is one measurement of the robot's motion since its pose was last known: a distance, a
+turn, or a displacement. Each reading is compared with the path of the wheels, which
+`calibration/positions.py` sums. The fit is a Gauss-Newton fit to all readings.
 
-A reading differs from the path of the wheels because of the error of tape and eye, and because of
-skidding on the way. If there are enough readings, their scatter shows how much the robot skidded.
+A reading differs from the path of the wheels because of the error of tape and eye, and because the
+robot skids. If there are enough readings, their scatter shows how much the robot skidded.
 """
 
 from __future__ import annotations
@@ -60,11 +60,14 @@ ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 """Parameters that are fitted."""
 
 PRECISE = 0.2
-"""Largest standard deviation of a turn that the fit may start from, as a fraction of the turn."""
+"""Limit for the turn reading that gives the starting parameters.
+
+Its standard deviation must be below this fraction of the turn.
+"""
 
 
 class Reading(Struct, frozen=True, dict=True):
-    """A measurement of the motion over one or more rides, in rad or m."""
+    """A measurement, in rad or m, of the robot's motion over one or more rides."""
 
     rides: tuple[Run, ...]
     """The recorded legs that the measurement covers, in order."""
@@ -79,19 +82,19 @@ class Reading(Struct, frozen=True, dict=True):
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return the measured minus the predicted value."""
+        """Return the measured minus the predicted value; of an `angle`, without whole turns."""
         off = self.value - prediction
         return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
 
 class Predicted(Struct, frozen=True):
-    """The value that a reading has if the robot follows its wheels, in rad or m."""
+    """The value, in rad or m, that a reading has if the robot moves as its wheels roll."""
 
     value: float
     derivatives: Floats
     """Derivatives of the value with respect to the parameters, shape (COUNT,)."""
     variance: float
-    """Variance by skidding."""
+    """Variance of the value by skidding, rad2 or m2."""
 
 
 class TapeFit(Struct, frozen=True):
@@ -102,7 +105,10 @@ class TapeFit(Struct, frozen=True):
     residuals: Floats
     """Measured minus predicted value of each reading."""
     held_out: Floats
-    """The same residuals, each from a fit without its own reading; NaN if that fit fails."""
+    """Measured minus predicted value of each reading, by a fit to all other readings.
+
+    It is NaN if that fit fails.
+    """
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
@@ -188,9 +194,10 @@ def _compared(
 
 
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
-    """Return the parameters and the normal equations.
+    """Return the parameters that fit the readings best, and the normal equations of this fit.
 
-    Raises `RefusedError` if the readings do not determine the parameters.
+    `start` has the parameters from which the search starts. Raises `RefusedError` if the readings
+    do not determine the parameters.
     """
     parameters, configured = start.copy(), base.start()
     for _ in range(MOST_STEPS):
@@ -223,7 +230,7 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
 def _held_out_residual(
     number: int, readings: Sequence[Reading], base: Base, start: Floats
 ) -> float:
-    """Return the residual of one reading in the fit to all others, or NaN if that fit fails."""
+    """Return the residual of the reading `number` in a fit to all others; NaN if that fit fails."""
     try:
         parameters, _ = _solved([*readings[:number], *readings[number + 1 :]], base, start)
     except RefusedError:
@@ -236,14 +243,24 @@ READ_M = 0.002
 """Standard deviation of a measured distance, and of a robot placed on a line by hand, m."""
 
 CREDIBLE = 0.85, 3.0
-"""Credible ratios of effective track to wheel separation. Outside them, a reading must be wrong."""
+"""Range of credible ratios of effective track to wheel separation.
+
+If a ratio is outside this range, a reading must be wrong.
+"""
 
 Answers = dict[tuple[str, str], float]
-"""The answers in m and rad by leg and question. The leg is "" before the first leg."""
+"""The answers, in m or rad, by the names of leg and question.
+
+The leg is "" for the questions before the first leg.
+"""
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
-    """Return the reading that the answers give. Raises `RefusedError` if they are impossible."""
+    """Return the reading of a measurement after the leg `leg`, by the person's answers.
+
+    `rides` has the recordings by the names of their legs. Raises `RefusedError` if the answers are
+    impossible.
+    """
     driven = tuple(rides[name] for name in measure.over or (leg,))
     if isinstance(measure, Mean):
         numbers = [answers[leg, name] for name in measure.answers]
@@ -272,9 +289,9 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
     least, most = CREDIBLE
     if not least < track < most:
         raise GuideError(
-            f"for one full circle the wheels report {math.degrees(by_wheels):.0f} deg: was it one "
-            "full circle, and do drive.wheel_radius and drive.wheel_separation agree with a tape? "
-            "Start again"
+            f"for one full turn the wheels report {math.degrees(by_wheels):.0f} deg: check that "
+            "the robot made exactly one turn, measure drive.wheel_radius and "
+            "drive.wheel_separation with a tape measure, and run this command again"
         )
     return min(WIDEST, max(1.0, track))
 
@@ -282,9 +299,9 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
 def slant(near: float, far: float, apart: float) -> float:
     """Return the angle in rad between the robot and a line, positive after a turn to the left.
 
-    `near` and `far` are the distances, m, from the line to two points of the robot, `apart` m from
-    each other. A turn to the left moves the near one towards the line. Raises `RefusedError` if the
-    distances are impossible.
+    `near` and `far` are the distances, m, of two points of the robot from the line. The points are
+    `apart` m from each other. A turn to the left moves the point `near` towards the line. Raises
+    `RefusedError` if the distances are impossible.
     """
     sine = (far - near) / apart
     if abs(sine) > 0.98:
@@ -304,16 +321,21 @@ ADVICE = (
 )
 
 TURNED, STRAIGHT = np.pi, 0.5
-"""A drive that turned by more than `TURNED` rad is a turn, by less than `STRAIGHT` rad a straight.
+"""Limits for the kind of a drive, rad.
 
-The heading error of a drive in between belongs to neither.
+A drive that turned by more than `TURNED` is a turn. A drive that turned by less than `STRAIGHT` is
+straight. The heading error of a drive in between is not reported.
 """
 
 
 def calibrated(
     tool: str, readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
 ) -> Calibration:
-    """Return the calibration by the readings of `tool`, in words. Raises `RefusedError`."""
+    """Return the calibration by tape readings.
+
+    `tool` names the measuring tool, such as "a tape". Raises `RefusedError` if the readings
+    contradict each other or are too inaccurate.
+    """
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
     fit = fit_readings(readings, base)
@@ -343,7 +365,11 @@ def calibrated(
 
 
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
-    """Return the errors before and after. An error after is that of a fit without its reading."""
+    """Return the odometry errors with the configured and with the new parameters.
+
+    The error of a reading with the new parameters is that of a fit without this reading. If that
+    fit fails, it is the error of the fit to all readings.
+    """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
     present[: P.DELAY] = base.start()[: P.DELAY]

@@ -1,1 +1,1 @@
-"""Pure: decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix."""
+"""Decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix; pure."""

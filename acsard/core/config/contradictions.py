@@ -1,8 +1,8 @@
 """Finds contradictions between the keys of a configuration, and surprising effects.
 
-A contradiction is a mistake: its line has the key, its value and the fix. A surprising effect gives
-a warning, which is a sentence. The rules about motion are in `motion_rules.py`, and those about
-simulated faults in `named_faults.py`.
+A contradiction is a mistake, and is reported as a line with the key, its value and the fix. A
+surprising effect is reported as a warning, which is a sentence. The rules about motion are in
+`motion_rules.py`, and the rules about simulated faults in `named_faults.py`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
-"""Shortest time in which encoder counts may wrap, in control periods.
+"""Shortest time, in control periods, after which encoder counts may wrap at the highest speed.
 
 With two periods, one lost feedback line does no harm.
 """
@@ -196,7 +196,10 @@ def _gyro_problems(config: Config) -> list[str]:
 
 
 def _battery_problems(config: Config) -> list[str]:
-    """Find thresholds in the wrong order, and one that the battery could never rise above."""
+    """Find thresholds in the wrong order, and levels that could never end.
+
+    A level ends when the battery rises above the threshold plus the hysteresis.
+    """
     battery, found = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
     for (name, below), (worse, lower) in pairwise(rows):
@@ -241,7 +244,8 @@ def _bumper_problems(config: Config) -> list[str]:
         return []
     return [
         'safety.bumper = "away" needs the place of each bumper, but safety.bumpers = []; write '
-        'safety.bumpers = ["front", "rear"] in the order of the board, or safety.bumper = "stop"'
+        'safety.bumpers = ["front", "rear"] in the order in which the board reports them, or '
+        'safety.bumper = "stop"'
     ]
 
 
@@ -301,8 +305,8 @@ def _ros_problems(config: Config) -> list[str]:
     ros = config.ros
     if ros.bridge and ros.namespace.partition("/")[0] == ROOT:
         return [
-            f'ros.namespace = {show(ros.namespace)}: "{ROOT}" begins the native keys, so the '
-            'bridge\'s keys would mix with them; write another, like "robot1"'
+            f"ros.namespace = {show(ros.namespace)}: acsard's own keys also begin with "
+            f'"{ROOT}", so the bridge\'s keys would mix with them; write another, like "robot1"'
         ]
     return []
 
@@ -317,8 +321,8 @@ def _host(endpoint: str) -> str | None:
     """Return the host of an endpoint such as "tcp/127.0.0.1:7448", or None if it is not valid."""
     scheme, _, address = endpoint.partition("/")
     if set(endpoint) & set("#?;= \t"):
-        # An endpoint can carry options for Zenoh. They could switch off the protection of these
-        # rules.
+        # These characters add options for Zenoh to an endpoint. Such options could switch off the
+        # protection that these rules give.
         return None
     host, _, port = address.rpartition(":")
     good = (
@@ -359,4 +363,4 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""The rules. Each is a function of its own, because a rule that reads an invalid key is skipped."""
+"""The rules. Each is a separate function, because a rule that reads an invalid key is skipped."""

@@ -61,13 +61,13 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert new keys into tables that the text writes as dotted keys, such as `mcu.port = ...`.
+    """Insert the new keys of tables that the text writes as dotted keys, such as `mcu.port = ...`.
 
-    The inserted keys are dotted keys as well, because tomlkit would open a table in the middle of
+    They are inserted as dotted keys as well. tomlkit would insert a table header in the middle of
     the dotted keys.
 
     Returns:
-        The text, and the settings that are still to be changed.
+        The text with the inserted keys, and the settings that it does not have yet.
     """
     import tomlkit
 

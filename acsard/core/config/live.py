@@ -1,8 +1,8 @@
 """Changes settings while the daemon runs: the table of these settings, and the check of a change.
 
-A change must satisfy the same rules as the file, and is applied completely or not at all. Each part
-of the robot has a method `use`, which decides how a change affects it. All settings that are not in
-the table take effect only at the next start of the daemon.
+A change must satisfy the same rules as the file, and is applied completely or not at all. The parts
+of the robot have a method `use`, with which they adopt the new settings. All settings that are not
+in the table take effect only at the next start of the daemon.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ WHEN: dict[When, str] = {
 }
 """When a setting may change, in words.
 
-- Some settings may only be lowered while the robot stands, because a driving robot could not stop
-  in time with a lower deceleration.
-- Some may change only while the robot stands: a lower `limits.wheel_speed` would cut the speed at
-  once, and new timeouts make the robot forget the program that commands it.
+- raised: the setting may be raised at any time, but lowered only while the robot stands. With a
+  lower deceleration, a driving robot could not stop in time.
+- rest: the setting may change only while the robot stands. A lower `limits.wheel_speed` would cut
+  the speed at once, and new timeouts make the robot forget the program that commands it.
 """
 
 
@@ -98,9 +98,10 @@ def live(key: str) -> Live | None:
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield each value of nested tables with its dotted name.
+    """Yield the dotted name and the value of each key in nested tables.
 
-    A table in a list, such as a source, gets the value of its key `name` in place of its index.
+    The name of a table in a list, such as a source, has the value of its key `name` in place of its
+    index. `name` is the dotted name of `value` itself, "" for the whole configuration.
     """
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -123,13 +124,16 @@ class Difference(Struct, frozen=True):
 
     def words(self, key: str) -> str:
         """Return both values in words."""
-        # A command source that only one of them has lacks a value in the other.
+        # If only one configuration has a command source, the other has no value for its keys.
         its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
         return f"{key} = {its}, not {ours}"
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return each dotted key whose value in force differs from the file, with both values."""
+    """Return the keys whose values differ, as dotted keys with both values.
+
+    `runs` is the configuration in force, and `file` the one in the configuration file.
+    """
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
         key: Difference(its.get(key), ours.get(key))
@@ -141,16 +145,16 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
     """Return the configuration with these settings, and a description of the changes.
 
-    A setting that already has the wanted value is not a change, and is not refused either. The
-    description is "" if nothing changes.
+    A setting that already has the requested value is neither changed nor refused. The description
+    is "" if nothing changes.
 
     Args:
         config: the present configuration.
-        wishes: the wanted values by dotted key.
+        wishes: the requested values by dotted key.
         at_rest: whether the robot stands.
 
     Raises:
-        ConfigError: the change is refused as a whole; the error has every reason.
+        ConfigError: the change is not allowed, so no setting is changed. The error has the reasons.
     """
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))
@@ -204,7 +208,7 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    """Return the reason why this change must wait until the robot stands, or "" if it need not."""
+    """Return why this change is allowed only while the robot stands, or "" if it always is."""
     row = live(key)
     if row is None or row.when == "always":
         return ""

@@ -1,8 +1,8 @@
-"""Keeps limits that `acsard set` lowered below their values in the file, also over a restart.
+"""Keeps limits that `acsard set` has lowered, even if the daemon restarts.
 
-A limit is lowered while its value is below that of the file. Decelerations are not kept, because a
-robot with a lower deceleration brakes more softly, which is not safer. A jerk of 0 means "no
-limit", so it counts as the highest value.
+A limit is lowered if its value is below that in the configuration file. Lowered decelerations are
+not kept, because a robot with a lower deceleration brakes more softly, which is not safer. A jerk
+limit of 0 means "no limit", so it is treated as the highest value.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ TABLE = "limits."
 
 
 def stays(key: str) -> bool:
-    """Return whether a lower value of the setting with this dotted key is kept over a restart."""
+    """Return whether a lowered value of the dotted key `key` is kept if the daemon restarts."""
     return key.startswith(TABLE) and not key.endswith("_deceleration")
 
 
 def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
-    """Return the present values of the lowered limits, by dotted key."""
+    """Return the limits whose value in `now` is below that in `file`, by dotted key."""
     return {
         TABLE + name: getattr(now, name)
         for name in file.__struct_fields__
@@ -36,9 +36,10 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
     """Return the configuration with the limits that were lowered before the restart, and events.
 
-    A limit is applied only if it is below that of `config`. If the limits contradict the
-    configuration, because the file has changed, each of them is applied alone. An event names a
-    limit that is dropped.
+    `kept` has these limits by dotted key. A limit is applied only if it is below that of `config`.
+    Together, the limits may contradict the configuration if the file has changed. Then they are
+    applied one by one, and each limit that contradicts it is dropped. The events report the limits
+    that are applied and dropped.
     """
     limits = config.limits
     wishes: dict[str, object] = {

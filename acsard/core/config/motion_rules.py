@@ -1,6 +1,6 @@
 """Finds contradictions between settings of motion.
 
-The robot must stop soon enough, and motion that the limits allow must not count as a fault. The
+The robot must stop soon enough, and motion that the limits allow must not be taken for a fault. The
 other rules are in `contradictions.py`.
 """
 
@@ -14,13 +14,15 @@ from acsard.core.config.partial import Rule, mistakes
 from acsard.core.config.settings import Config
 
 LEAST_JERK = 0.01
-"""Smallest jerk limit, m/s3 or rad/s3. Below it, walking pace takes over ten seconds to reach."""
+"""Smallest allowed jerk limit, m/s3 or rad/s3. With a lower one, the robot would need over ten
+seconds to reach walking pace."""
 
 LONGEST_STOP_S = 2.0
-"""Longest time from full speed to rest after a stop, s, for which a person should have to wait."""
+"""Longest allowed time from full speed to rest after a stop, s. No person should wait longer."""
 
 LONGEST_RAMP_S = 5.0
-"""Longest time from full speed to rest after commands have ended, s. Nobody steers meanwhile."""
+"""Longest allowed time from full speed to rest after commands have ended, s. During this time
+nobody steers the robot."""
 
 HEADROOM = 1.1
 """Factor by which a healthy wheel may exceed its commanded speed for a moment."""
@@ -29,14 +31,14 @@ MOST_WHEEL_SPEED = 99.99
 """Highest wheel speed that a serial line can express, rad/s."""
 
 LONGEST_REPLY_S = 0.25
-"""Longest time between two feedback lines, s.
+"""Longest allowed time between two feedback lines, s.
 
-A board that is silent for one second counts as restarted. With this period, the next line still
-comes in time if two lines are lost.
+A board that is silent for one second counts as restarted. With this period, the next line arrives
+in time even if two lines are lost.
 """
 
 LINES_OF_EVIDENCE = 2
-"""Number of feedback lines that must show a wheel fault, so that one line is not enough."""
+"""Number of feedback lines that must show a wheel fault before it is reported. One is too few."""
 
 
 class _Reach(Struct, frozen=True):
@@ -80,8 +82,8 @@ def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> lis
         elif value < least:
             found.append(
                 f"limits.{name} = {value:g}: braking from full speed ({speed:g} {unit}) would "
-                f"take {speed / value:.1f} s, but may take {most_s:g} s; write {least:g} or "
-                f"more, or a lower limits.{axis}_speed"
+                f"take {speed / value:.1f} s, and the longest that is allowed is {most_s:g} s; "
+                f"write {least:g} or more, or a lower limits.{axis}_speed"
             )
     return found
 
@@ -110,7 +112,7 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
 
 
 def _reply_problems(config: Config) -> list[str]:
-    """Find a period of feedback lines with which one lost line would look like a fault."""
+    """Find an `mcu.reply_period` with which a single lost line would look like a fault."""
     period, fault_s = config.mcu.reply_period, config.feedback.fault_time
     most = longest_reply(fault_s)
     if period <= most:
@@ -127,14 +129,14 @@ def _reply_problems(config: Config) -> list[str]:
 def longest_reply(fault_s: float) -> float:
     """Return the longest allowed `mcu.reply_period`, s.
 
-    `fault_s` is `feedback.fault_time`, s; 0 means that wheel faults are not watched.
+    `fault_s` is `feedback.fault_time`, s. It is 0 if the daemon does not check for wheel faults.
     """
     share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
     return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
 
 
 def _rounded_up(value: float) -> float:
-    """Return a value rounded up to three decimals, so that the value in a message is sufficient."""
+    """Return a value rounded up to three decimals, because messages suggest it as a minimum."""
     return math.ceil(round(value * 1000, 6)) / 1000
 
 

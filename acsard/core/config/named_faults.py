@@ -1,7 +1,7 @@
 """Reads the names of the simulator's faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
 
-The module has the table of the names and finds mistakes in `[sim] faults`. The faults themselves
-are methods of the same names in `core/simulator/faults.py`.
+The module has the tables of the names, and finds mistakes in `[sim] faults`. Methods with the same
+names in `core/simulator/faults.py` produce the faults.
 """
 
 from __future__ import annotations
@@ -33,15 +33,18 @@ ARGUMENTS = {
     "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
     "battery": "nn",
 }  # fmt: skip
-"""Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
+"""Faults with arguments, each with the kinds of its arguments.
+
+`m` is a motor, written as a to d and stored as 0 to 3. `n` is a number.
+"""
 
 INPUTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
-"""Faults that end with the seconds until they begin, and with their length in seconds."""
+"""Faults whose last two arguments are the time until the fault begins and its duration, s."""
 
 RESET = "reset"
-"""Fault that restarts the simulated board again and again, with a number of seconds in between.
+"""Fault that restarts the simulated board periodically. Its argument is the period, s.
 
-It needs a timer, so only `acsard sim --fault` has it.
+It needs a timer, so only `acsard sim --fault` offers it.
 """
 
 MOTORS = "abcd"
@@ -68,7 +71,7 @@ def forms() -> list[str]:
 def named(text: str) -> NamedFault:
     """Parse a fault such as "stalls=5:0.15".
 
-    Raises `ValueError` with the mistake and the fix. The caller names the text.
+    Raises `ValueError` with the mistake and the fix. The error does not quote `text`.
     """
     name, _, given = text.partition("=")
     known = {RESET: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
@@ -90,7 +93,9 @@ def named(text: str) -> NamedFault:
             f"both at least {SHORTEST_S}"
         )
     if name == "bumper_pressed" and fault.values[0] not in (1, 2, 3, 4):
-        raise ValueError("the bumpers are 1 to 4, in the order of the board")
+        raise ValueError(
+            "the bumpers have the numbers 1 to 4, in the order in which the board reports them"
+        )
     if name in INPUTS and not min(fault.values) >= 0:
         raise ValueError(
             "give the seconds from the start until it begins, then its seconds (0: it stays)"
@@ -118,7 +123,9 @@ def _problems(config: Config) -> list[str]:
         where = f"sim.faults[{i}] = {show(text)}"
         try:
             if named(text).name == RESET:
-                found.append(f"{where}: needs `acsard sim --fault {text}`; remove it here")
+                found.append(
+                    f"{where}: works only as `acsard sim --fault {text}`; remove it from sim.faults"
+                )
         except ValueError as error:
             found.append(f"{where}: {error}")
     return found

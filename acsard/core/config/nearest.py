@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 LONGEST = 80
-"""Number of characters that are compared. It bounds the time for a very long word."""
+"""Number of characters of a word that are compared, to limit the time for a very long word."""
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:

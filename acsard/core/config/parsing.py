@@ -1,6 +1,6 @@
 """Decodes the text of `acsard.toml` to a `Config`, or to an error with every mistake and its fix.
 
-The keys are in `settings.py`, and the rules between them in `contradictions.py`.
+The keys are defined in `settings.py`, and the rules between keys in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from acsard.core.config.validation import build_partly
 from acsard.core.values import AcsardError
 
 MAX_BYTES = 65536
-"""Largest size of a configuration in bytes. The reference file has about a quarter of it."""
+"""Largest size of a configuration, bytes. The reference file has about a quarter of this size."""
 
 
 class ConfigError(AcsardError):
@@ -30,7 +30,8 @@ class ConfigError(AcsardError):
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
     """Return the configuration in the bytes of a file. Raises `ConfigError` with every mistake.
 
-    `overrides` are values from the command line, by table and key. They replace those of the file.
+    `overrides` has values from the command line, by table and key. They replace the values of the
+    file.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(
@@ -67,7 +68,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
 
 
 def from_builtins(data: object) -> Config:
-    """Return the `Config` that `effective` converted to tables."""
+    """Return the `Config` for the plain tables that `effective` returned."""
     return convert(data, Config)
 
 

@@ -21,9 +21,9 @@ class InvalidKeyError(AcsardError):
 
 
 def view_without(config: Config, invalid: Set[str]) -> Config:
-    """Return a view of the configuration that raises `InvalidKeyError` for some keys.
+    """Return a view of `config` that raises `InvalidKeyError` if an invalid key is read.
 
-    `invalid` has the dotted names of these keys.
+    `invalid` has the dotted names of the invalid keys.
     """
     return cast(Config, _View(config, "", invalid)) if invalid else config
 
@@ -40,7 +40,7 @@ def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
 
 
 class _View:
-    """A view of one table, whose dotted name with a dot behind it is `path`."""
+    """A view of one table. `path` is its dotted name plus a dot, or "" for the whole document."""
 
     def __init__(self, table: object, path: str, invalid: Set[str]) -> None:
         self._table, self._path, self._invalid = table, path, invalid

@@ -162,7 +162,7 @@ class McuConfig(Struct, frozen=True):
 
     @property
     def line_bytes(self) -> int:
-        """Length in bytes of the longest line, in either direction, that may be on the wire."""
+        """Length of the longest line that the daemon or the board may send, bytes."""
         return line_bytes(self.trailing_comma, self.link_check != "off", self.wants_samples)
 
 
@@ -228,7 +228,7 @@ class BatteryConfig(Struct, frozen=True):
 
     @property
     def bounds(self) -> dict[BatteryLevel, float]:
-        """The thresholds that are set, by level, the worst level last."""
+        """The thresholds that are set, V or %, by level. The worst level is the last one."""
         found: dict[BatteryLevel, float] = {
             "warning": self.warning_below,
             "return": self.return_below,
@@ -370,7 +370,7 @@ class LogConfig(Struct, frozen=True):
 
 
 RECORD = "ACSARD_RECORD"
-"""Environment variable in which the systemd units name the directory of recordings."""
+"""Environment variable with which the systemd units set the directory of the recordings."""
 
 
 class RecordConfig(Struct, frozen=True):
@@ -433,7 +433,7 @@ class Config(Struct, frozen=True):
 
     @property
     def rate_hz(self) -> float:
-        """Control periods per second. "auto" is the highest comfortable rate, at most 100."""
+        """Control rate, Hz. "auto" means the highest comfortable rate, but at most 100 Hz."""
         if self.control.rate != "auto":
             return float(self.control.rate)
         mcu = self.mcu

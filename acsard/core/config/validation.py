@@ -1,6 +1,6 @@
 """Decodes a TOML table to a frozen struct, or to a list of mistakes with key, value and fix.
 
-The module knows only the types of the struct. The rules between keys are in `contradictions.py`.
+The module checks only the types in the struct. The rules between keys are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
     """Return `table` as a struct, or None if it has a mistake.
 
     Args:
-        cls: the struct.
+        cls: the type of the struct.
         table: the TOML table.
         path: the dotted name of the table, "" for the whole document.
         problems: the list that gets a line for each mistake.

@@ -8,32 +8,32 @@ BITS_PER_BYTE = 10
 """Bits per byte with 8N1: a start bit, eight data bits and a stop bit."""
 
 PLAIN_BYTES = 33
-"""Length of `ap12.50,bn08.75,cp15.00,dn10.25` with CR LF. A trailing comma adds one byte."""
+"""Length of `ap12.50,bn08.75,cp15.00,dn10.25` with CR LF, bytes. A trailing comma adds one."""
 
 CHECK_BYTES = 8
-"""Length of `#07*585F`: the sequence number and the checksum, in either direction."""
+"""Length of `#07*585F`, the sequence number and the checksum of a command or a reply, bytes."""
 
 SAMPLE_BYTES = 21
-"""Length of `@` and the five sample fields of a reply.
+"""Length of `@` and the five sample fields of a reply, bytes.
 
-A command asks for the fields with one more letter.
+A command that requests these fields has one more letter.
 """
 
 STATUS_BYTES = 28
-"""Length of `!status estop=pressed*F4BC` with CR LF, the line with which a board reports its
-emergency stop. A line with bumpers is about as long."""
+"""Length of `!status estop=pressed*F4BC` with CR LF, bytes. With this line a board reports its
+emergency stop. A status line with bumpers is about as long."""
 
 STATUS_HZ = 10
-"""Status lines per second."""
+"""Rate at which a board sends status lines, Hz."""
 
 FIELD = 65536
-"""Number of values of a sample field, which has four hexadecimal digits. Then it wraps to 0."""
+"""Number of values of a sample field. It has four hexadecimal digits, and FFFF wraps to 0."""
 
 COMFORTABLE_USE = 0.8
-"""Largest comfortable use of the wire.
+"""Largest comfortable use of the wire, as a share of its capacity.
 
-Above it, a line that is a little late delays the next one. The remaining time also leaves room for
-boards that send a space after each comma, which makes a reply 9 % longer (36 bytes).
+Above it, a line that is a little late delays the next one. The rest of the capacity also has room
+for boards that send a space after each comma, so that a reply is 9 % longer (36 bytes).
 """
 
 
@@ -43,7 +43,7 @@ def wire_ns(count: int, baud_rate: int) -> int:
 
 
 def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
-    """Return the length of the longest line in bytes. Each direction has its own wire.
+    """Return the length of the longest line, bytes: a command or a reply, each on its own wire.
 
     Args:
         trailing_comma: whether commands end with a comma.
@@ -55,13 +55,16 @@ def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) 
 
 
 def wire_use(rate_hz: float, baud_rate: int, count: int) -> float:
-    """Return the use of the wire by `rate_hz` lines per second of `count` bytes each.
+    """Return the share of the wire's capacity that lines of `count` bytes use at `rate_hz`.
 
-    Above 1 the lines do not fit.
+    If the result is above 1, the wire is too slow for the lines.
     """
     return count * BITS_PER_BYTE * rate_hz / baud_rate
 
 
 def highest_rate(baud_rate: int, count: int, use: float = 1.0) -> int:
-    """Return the number of lines of `count` bytes per second that use at most `use` of the wire."""
+    """Return the highest rate of lines, Hz, that uses at most the share `use` of the wire.
+
+    `count` is the length of a line in bytes.
+    """
     return int(use * baud_rate / (count * BITS_PER_BYTE))

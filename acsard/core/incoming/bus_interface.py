@@ -25,13 +25,13 @@ class BusInput(Struct, frozen=True):
     arrivals: tuple[Arrival, ...] = ()
     queries: tuple[Query, ...] = ()
     overrun: int = 0
-    """Number of samples that were dropped because the control loop did not take them in time."""
+    """Number of samples that were dropped because the control loop did not fetch them in time."""
     overrun_sources: tuple[str, ...] = ()
-    """The sources of which commands were dropped for that reason."""
+    """The command sources whose samples are among those that `overrun` counts."""
     dropped: int = 0
-    """Number of published messages that were dropped because the bus did not take them in time."""
+    """Number of published messages that were dropped because the bus did not send them in time."""
     stuck: bool = False
-    """True in the first input after the bus has begun to block."""
+    """True in the first `BusInput` after sending on the bus has begun to block."""
     routers: RoutersStatus | None = None
     """The connections to the endpoints in `bus.connect` if they have changed, else None."""
 
@@ -55,25 +55,26 @@ class Bus(Protocol):
 
     @property
     def wanted(self) -> AbstractSet[str]:
-        """Published topics that have a listener."""
+        """Published topics that have a subscriber."""
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` + 1 queries.
+        """Return the input since the last call, with at most `queries` queries.
 
-        The other queries wait for the next call.
+        There may be one more if all of these are service calls and a slow query waits. The other
+        queries wait for the next call.
         """
 
     def publish(self, key: str, message: Message) -> None:
-        """Queue a message for its listeners. `flush` sends it."""
+        """Queue a message for the subscribers of `key`. `flush` sends it."""
 
     def flush(self) -> None:
-        """Send the queued messages. Never wait for it."""
+        """Start to send the queued messages, without waiting for the end."""
 
     def reply(self, reply: Reply) -> None:
         """Reply to the query that holds the ticket `reply.ticket`."""
 
     def retire(self, ticket: int) -> None:
-        """End the query of this ticket: it gets no more replies."""
+        """End the query that holds this ticket. It gets no more replies."""
 
 
 GATEWAY_KEY = "gateway"
@@ -88,10 +89,10 @@ class GatewayFollower:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Count the events that are new in a report.
+        """Add the events that are new in a report to `counters`. Ignore an invalid report.
 
         Returns:
-            Wall-clock time at which the TLS certificate ends, ns; None if it is unknown.
+            Wall-clock time at which the TLS certificate expires, ns, or None if it is unknown.
         """
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)
@@ -110,7 +111,7 @@ class GatewayFollower:
 PEER = (
     "is not a router but another peer, perhaps a robot's daemon. A peer does not forward "
     "messages, so a client of one robot sees only that robot, and `acsard call stop --id '*'` "
-    "stops no other; put a router between the robots (deploy/zenoh/README.md)"
+    "stops only that one; put a router between the robots (deploy/zenoh/README.md)"
 )
 
 
@@ -123,7 +124,7 @@ class RouterFollower:
     def receive(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
-        """Take the present status, and add counters and events for the connections that changed."""
+        """Store the present status, and add counters and events for changed connections."""
         before, self.status = self.status, status
         lost = [endpoint for endpoint in status.missing if endpoint not in before.missing]
         made = [endpoint for endpoint in status.connected if endpoint not in before.connected]

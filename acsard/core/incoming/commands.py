@@ -1,9 +1,9 @@
 """Decodes samples and service queries from the bus into a `Command` or a `Request`.
 
-A sample is refused as a whole for each of these reasons:
+The whole sample is refused for each of these reasons:
 
 - The payload cannot be decoded or is too big.
-- A field that the daemon reads has NaN or infinity.
+- A field that the daemon reads is NaN or infinity.
 - The key has a wildcard.
 - The sample is a DELETE.
 - The sender id belongs to another certificate.
@@ -46,7 +46,7 @@ from acsard.core.values import Twist as BodyTwist
 BOUND_NS = 60 * NS_PER_S
 """Silence after which a sender may use another certificate, ns.
 
-A program with a fixed id may move from the robot to a laptop.
+It is needed because a program with a fixed id may move from the robot to a laptop.
 """
 
 MAX_BOUND = 1024
@@ -71,7 +71,11 @@ class Bindings:
         """
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Return the certificate that the sender id is bound to, or None if this one may use it."""
+        """Return the other certificate to which `sender` is bound, or None if there is none.
+
+        If there is none, bind the sender to `certificate`. `now_ns` is the monotonic time of the
+        command.
+        """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
             return bound
@@ -86,7 +90,7 @@ MAX_COMMAND_BYTES = 4096
 """Largest payload in bytes. A TwistStamped has less than 300 bytes as JSON."""
 
 REPLACED_NS = NS_PER_S // 2
-"""Lead of a timestamp before the daemon's clock above which Zenoh replaces it, ns."""
+"""If a timestamp is ahead of the daemon's clock by more than this, Zenoh replaces it, ns."""
 
 Via = Literal["native"] | Transport
 """The tree of keys on which a sample or query arrived: acsard's own, or that of a transport."""
@@ -96,7 +100,7 @@ class Arrival(Struct, frozen=True):
     """A sample as Zenoh delivered it."""
 
     key: str
-    """The key below `acsard/<id>/`. A sample on a ROS key has the native key that it stands for."""
+    """The key below `acsard/<id>/`. For a sample on a ROS key, it is the equivalent native key."""
     put: bool
     """True for a PUT, false for a DELETE."""
     payload: bytes
@@ -112,12 +116,12 @@ class Arrival(Struct, frozen=True):
     received_ns: int | None = None
     """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it.
 
-    It does so if the sample had no timestamp, or one too far ahead of the daemon's clock.
+    The session does so if the sample had no timestamp, or one too far ahead of the daemon's clock.
     """
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
-    """A Twist or a TwistStamped. The fields that are set show which one it is."""
+    """A Twist or a TwistStamped. The fields that are set show which of the two it is."""
 
     linear: Vector3 | UnsetType = UNSET
     angular: Vector3 | UnsetType = UNSET
@@ -145,7 +149,7 @@ _payloads = {
 
 
 class Receiver:
-    """Decodes commands and requests."""
+    """Decodes samples into commands, and service queries into requests."""
 
     def __init__(self, joints: JointsConfig, kinematics: Kinematics) -> None:
         self._joints = joints.as_tuple()
@@ -153,7 +157,10 @@ class Receiver:
         self._bindings = Bindings()
 
     def command(self, arrival: Arrival) -> Command:
-        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`. Raises `DecodeError`."""
+        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`.
+
+        Raises `DecodeError` if the sample is refused.
+        """
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
@@ -168,8 +175,8 @@ class Receiver:
         else:
             twist, header, cancelled = self._wheel_speeds(arrival)
         if header is not None and header.stamp.to_ns() > 0 and not identity.steady:
-            # The stamp of the header may come from another clock than that of the attachment, so
-            # its clock gets its own name.
+            # The stamps of the header and of the attachment may come from different clocks, so the
+            # clock of the header gets its own name.
             stamp_ns = header.stamp.to_ns()
             clock = f"{clock}, header on {arrival.via}/{arrival.key}"
         if identity.signed:
@@ -228,7 +235,7 @@ class Receiver:
                 "wrong_wheels", f"needs one velocity for each of {', '.join(self._joints)}"
             )
         places = [got.name.index(joint) for joint in self._joints]
-        # Other joints, for example those of an arm, are not the daemon's.
+        # Ignore the values of other joints, for example those of an arm.
         velocity, position, effort = (
             [values[place] for place in places] if len(values) == count else values
             for values in (got.velocity, got.position, got.effort)
@@ -244,7 +251,7 @@ class Receiver:
     def request(
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
-        """Return the request in a service query. Raises `DecodeError` if it is not valid.
+        """Return the request in a service query. Raises `DecodeError` if the payload is not valid.
 
         Args:
             verb: the service.
@@ -271,26 +278,27 @@ class Receiver:
 
 
 class Identity(Struct, frozen=True):
-    """The sender of a sample, with the stamp and the number of the sample if they are known."""
+    """The sender of a sample, with the stamp and the sequence number if they are known."""
 
     sender: str
     """The public name of the sender. The secret id is not kept."""
     stamp_ns: int | None = None
     """Time of sending by the sender's wall clock, ns."""
     sequence: int | None = None
-    """Number of the sample."""
+    """Sequence number that the sender gave the sample."""
     shared: bool = False
     """Whether several programs may share this identity."""
     steady: bool = False
-    """Whether the clock of the stamps is never adjusted."""
+    """Whether the sender states that the clock of its stamps is never adjusted."""
     signed: str = ""
-    """The public name without the certificate; "" unless a native command has a sender id."""
+    """The public name of the sender id alone, without the certificate. "" unless the sample is a
+    command on a native key with a sender id."""
 
 
-# Each command needs the parts of its key twice, and few keys ever command.
+# Each command needs the parts of its key twice, and few different keys carry commands.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return kind, source and certificate of a command's key, with "" for a missing part."""
+    """Return the kind, the source and the certificate in a command's key, "" for a missing part."""
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
     return kind, source, certificate
@@ -305,9 +313,10 @@ def identify(arrival: Arrival) -> Identity:
     - on a key of rmw_zenoh: the GID
     - on a key of a bridge: the session that stamped the sample, the key
 
-    Programs of which only the key is known look like one sender. So do all ROS nodes behind a
-    bridge, and all programs whose samples a router stamps. A GID is no proof: ROS discovery
-    publishes it, so a program that may put on a key of rmw_zenoh can claim any GID.
+    If only the key is known, all programs on that key look like one sender. So do all ROS nodes
+    behind a bridge, and all programs whose samples a router stamps. A GID does not prove the
+    identity: ROS discovery publishes it, so a program that may put on a key of rmw_zenoh can claim
+    any GID.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -343,7 +352,7 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def sender(arrival: Arrival) -> str:
-    """Return the public name of a sample's sender, "" if the attachment of rmw_zenoh has no GID."""
+    """Return the public name of a sample's sender, "" for a rmw_zenoh sample without a GID."""
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
         # A shorter GID could look like the public name of a native sender.
@@ -356,7 +365,8 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
     if form != "cdr":
         return _twists.decode_as(form, arrival.payload)
     named, size = arrival.encoding.partition(";")[2], len(arrival.payload)
-    # If the Encoding names no type, the size decides. DDS pads a payload to a multiple of four.
+    # If the Encoding names no type, the size shows the type. DDS pads a payload to a multiple of
+    # four bytes.
     plain, known = named in TWISTS, named in TWISTS + STAMPED_TWISTS
     if plain or (not known and size < TWIST_CDR_BYTES + 4):
         twist = decode_cdr(Twist, arrival.payload)
@@ -375,7 +385,7 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
     It is the public name of the sender id in the attachment, with the transport in brackets. The
     name is only a claim of the program, because Zenoh does not say on which connection a query
     arrived. The digits of the public name stay the same while the program keeps its secret. A call
-    over rmw_zenoh has the GID of the client. A call through a bridge has no name.
+    over rmw_zenoh is named by the GID of the client. A call through a bridge has no name.
 
     Args:
         via: the tree of keys on which the call arrived.

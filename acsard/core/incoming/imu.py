@@ -1,10 +1,11 @@
 """Decodes samples on the key `imu` into turn rates about the z axis of base_link, or refuses them.
 
 A sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
-required. Its z axis points up, so a turn to the left is positive.
+required. The z axis points up, so a turn to the left is positive.
 
-If several gyros send, the daemon follows the first one until that gyro is silent. Two gyros have
-different biases, so the first sample of another gyro is marked (`GyroSample.anew`).
+If several gyros send samples, the daemon uses only those of the first gyro until it is silent. Then
+it may change to another gyro, whose first sample is marked (`GyroSample.anew`), because two gyros
+have different biases.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from acsard.core.messages.signature import public_name
 from acsard.core.values import NS_PER_S, Event, GyroSample
 
 MAX_RATE = 50.0
-"""Largest turn rate that is accepted, rad/s. No robot turns as fast."""
+"""Largest turn rate that is accepted, rad/s. No robot turns that fast."""
 
 FOLLOWED_NS = NS_PER_S // 2
 """Silence of a gyro after which the daemon may follow another one, ns."""
@@ -34,11 +35,11 @@ MOST_WHO = 64
 """Largest number of characters of a sender's name in an error message."""
 
 UNKNOWN = [0.0] * 9
-"""Covariance of a sample that has none. sensor_msgs/Imu defines zeros as "unknown"."""
+"""Covariance for a sample without one. sensor_msgs/Imu defines zeros as "unknown"."""
 
 
 class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An Imu in which only the turn rate is required."""
+    """An Imu message in which only `angular_velocity` is required."""
 
     header: Header = Header()
     orientation: Quaternion = Quaternion()
@@ -53,12 +54,13 @@ _readings = Decoder(_Reading)
 
 
 class GyroFollower:
-    """Decodes the samples of one gyro on the bus, and refuses those of all others meanwhile."""
+    """Decodes the samples of one gyro on the bus, and refuses those of all other gyros."""
 
     def __init__(self, own: bool = False) -> None:
         """Start without a gyro.
 
-        `own` says that the daemon runs its own simulator. Then only its gyro is accepted.
+        `own` says that the daemon runs its own simulator. Then only the simulator's gyro is
+        accepted.
         """
         self._own = own
         self._followed = public_name(OWN) if own else ""
@@ -67,7 +69,10 @@ class GyroFollower:
     def receive(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
-        """Return the turn rate in a sample, or count and report the refusal and return None."""
+        """Return the turn rate in a sample, or None if the sample is refused.
+
+        A refusal is counted in `counters` and reported in `events`.
+        """
         try:
             sample = reading(arrival)
             anew = self._follow(sender(arrival), arrival.arrived_ns)
@@ -78,9 +83,10 @@ class GyroFollower:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Follow this sender, and return whether another one was followed before.
+        """Follow the sender with the public name `who`. Return whether another was followed before.
 
-        Raises `DecodeError` if another gyro is followed and not silent.
+        `now_ns` is the monotonic time of the sample. Raises `DecodeError` if the daemon follows
+        another gyro that is not silent.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
@@ -93,9 +99,9 @@ class GyroFollower:
 
 
 def reading(arrival: Arrival) -> GyroSample:
-    """Return the turn rate in a sample. Raises `DecodeError`.
+    """Return the turn rate in a sample. Raises `DecodeError` if the sample is not valid.
 
-    Orientation and acceleration are ignored.
+    The orientation and the acceleration are ignored.
     """
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")

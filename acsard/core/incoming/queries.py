@@ -1,4 +1,4 @@
-"""Answers queries from the bus, or turns a service call into a `Request` to the robot.
+"""Answers queries from the bus, or turns them into a `Request` to the robot if they call a service.
 
 A service runs only if the query has exactly the key of the service: a get on `<id>/**` must never
 stop the robot or clear a latch. All other keys may also be queried with a wildcard.
@@ -62,7 +62,7 @@ Current = Callable[[str], Message | None]
 MAX_WILDCARD = 512
 """Largest number of characters of a key expression with a wildcard.
 
-A longer one would take time from the control loop. No key is as long.
+A longer one would delay the control loop. No key is that long.
 """
 
 BUSY = "busy: too many queries at once; ask again"
@@ -74,11 +74,11 @@ class Query(Struct, frozen=True):
     ticket: int
     """The number with which replies name the query."""
     topic: str
-    """The key of the row in the topic table that the query matches."""
+    """The key of the row of the topic table that the query matches."""
     asked: str
-    """The key expression of the client, below `acsard/<id>/`."""
+    """The key expression of the query, without `acsard/<id>/` if it begins with exactly that."""
     fmt: str
-    """The `fmt` parameter, "" if it is absent."""
+    """The `fmt` parameter of the query, "" if it is absent."""
     payload: bytes
     encoding: str
     arrived_ns: int | None = None
@@ -104,17 +104,20 @@ class _Waiting(Struct, frozen=True):
     """A service call that waits for the answer of the robot."""
 
     key: str
+    """Key of the service."""
     form: Format
     """Encoding of the reply."""
     asked: Attachment | None
-    """The attachment of a call over rmw_zenoh, which the reply repeats."""
+    """The attachment of a call over rmw_zenoh, which the reply repeats. None for other calls."""
     ros: bool = False
+    """Whether the call came on a ROS key."""
     wish: bytes = b""
-    """The payload of a ROS request to set parameters, which the reply depends on; else b""."""
+    """The payload of a ROS request to set parameters, from which the reply is built. b"" for other
+    calls."""
 
 
 class Queries:
-    """Answers queries from constant values and from the present messages."""
+    """Answers queries with constant values and with the present messages."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
@@ -161,7 +164,10 @@ class Queries:
             return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
     def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
-        """Return the reply with the robot's answer, or None if no service call waits for it."""
+        """Return the reply with the robot's answer, or None if no service call waits for it.
+
+        `wall_ns` is the wall-clock time for the attachment of the reply, ns.
+        """
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
@@ -239,10 +245,10 @@ class Queries:
         return [] if value is None else [(topic, type(value).__name__, value)]
 
     def _matches(self, query: Query, key: str) -> bool:
-        """Return whether the key expression of a query includes a key.
+        """Return whether the key expression of a query includes a key below `acsard/<id>/`.
 
-        The expression is relative to `acsard/<id>/` if it began with exactly these two chunks.
-        Otherwise it is complete, for example `acsard/*/info`.
+        If the client's expression begins with exactly these two chunks, `query.asked` does not have
+        them. Otherwise it is the complete expression, for example `acsard/*/info`.
         """
         if "*" not in query.asked:
             return query.asked == key
@@ -267,7 +273,10 @@ def includes(expression: str, key: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Return whether a chunk of a key expression includes a chunk of a key."""
+    """Return whether `pattern`, a chunk of a key expression, includes a chunk of a key.
+
+    The pattern may be `*`, or have `$*` for any characters.
+    """
     if pattern == "*":
         return True
     first, *middle = pattern.split("$*")
@@ -311,14 +320,18 @@ def most_bytes(topic: str) -> int:
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment of a reply, with which rmw_zenoh finds the request."""
+    """Return the attachment of a reply, from which rmw_zenoh knows the request.
+
+    `asked` is the attachment of the request. If it is None, the reply has no attachment.
+    """
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
 
 def _format(query: Query) -> Format:
-    """Return the encoding of the reply.
+    """Return the encoding of the reply to a query.
 
-    It is that of `?fmt=`, else that of the payload of a service call, else JSON.
+    The parameter `fmt` decides. Without it, a service call is answered in the encoding of its
+    payload, and any other query in JSON. A call without a payload is answered in JSON too.
     """
     for form in FORMATS:
         if query.fmt == form:
@@ -331,12 +344,12 @@ def _format(query: Query) -> Format:
         try:
             return detect(query.encoding, query.payload)
         except DecodeError:
-            pass  # a service that needs no payload ignores one that cannot be decoded
+            pass  # a service that needs no payload ignores a payload that cannot be decoded
     return "json"
 
 
 def topic_table(config: Config) -> Topics:
-    """Return the rows of the topic table that this daemon has, with full keys."""
+    """Return the topic table with the rows that this daemon offers and with full keys."""
     robot = config.robot.id
     return Topics(
         [
@@ -347,7 +360,10 @@ def topic_table(config: Config) -> Topics:
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
-    """Return the command and state interfaces, named as in ros2_control."""
+    """Return the command and state interfaces of the joints, named as in ros2_control.
+
+    `outputs` are those of the last step, or None before the first step.
+    """
     linked = outputs is not None and outputs.linked
     claimed = outputs is not None and outputs.mode == "driving"
     joints = config.joints.as_tuple()

@@ -1,14 +1,14 @@
-"""Lowers the robot's highest speed by a nav2_msgs/SpeedLimit on the key `speed_limit`.
+"""Lowers the robot's highest speed to that of a nav2_msgs/SpeedLimit on the key `speed_limit`.
 
 A speed limit never raises a speed. The robot's `limits.linear_speed` is the lower one of two:
 
-- the *setting*: the value of the configuration, or of the last `set`.
-- the limit of the last message, in m/s. 0.0 lifts it.
+- the *setting*: the value in the configuration, or the value of the last `set`.
+- the limit in the last message, in m/s. A message with 0.0 lifts the limit.
 
-The robot knows nothing of speed limits. This module turns a message into the request that `set`
-makes. While a limit is in force, a `set` of a client is checked against the settings, because they
-return when the limit is lifted. The robot gets the client's value only as far as the limit allows.
-So no step drives with a speed above either.
+The robot itself does not know speed limits. This module turns a message into a request like that of
+a client's `set`. While a limit is in force, a client's `set` is checked against the settings
+without the limit, because they apply again when the limit is lifted. The robot then gets the
+client's value or the limit, whichever is lower. So no control step drives faster than either.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ SETTING = "limits.linear_speed"
 PAUSE_NS = NS_PER_S // 10
 """Least time between two changes of the limit, ns.
 
-Each change builds the whole configuration again, so a flood of messages would cost periods. The
-newest message waits.
+Each change builds the whole configuration again, so a flood of messages would delay the control
+loop. Meanwhile the newest message waits.
 """
 
 LIFTED = 0.0
@@ -57,14 +57,14 @@ class Limit(Struct, frozen=True):
     """The limit that a message asks for."""
 
     speed: float
-    """Highest speed, m/s; infinity for none."""
+    """Highest speed, m/s. Infinity means that the message lifts the limit."""
     by: str
     """Name of the sender, for the log."""
     arrived_ns: int
 
 
 def decode_limit(arrival: Arrival, configured: float) -> Limit:
-    """Return the limit in a sample. Raises `DecodeError`.
+    """Return the limit in a sample. Raises `DecodeError` if the sample is not valid.
 
     `configured` is the configured `limits.linear_speed`, m/s. A percentage is a share of it.
     """
@@ -93,7 +93,7 @@ NONE = Limit(math.inf, "", 0)
 
 
 class SpeedLimiter:
-    """The speed limit in force, and the settings that hold without it."""
+    """The speed limit in force, and the settings that apply without it."""
 
     def __init__(self, config: Config) -> None:
         """Start without a limit, with the configuration that the robot has."""
@@ -102,11 +102,11 @@ class SpeedLimiter:
         """The newest message that has not been applied yet."""
         self._changed_ns = 0
         self._robot = self._settings = config
-        """The configuration that the robot has, and the one without the speed limit."""
+        """The robot's configuration, and the same configuration without the speed limit."""
         self._asked: tuple[Request, float] | None = None
-        """This step's `set` of the speed, and the speed that the client wants, m/s."""
+        """The client's `set` of the speed in this step, and the speed that it asks for, m/s."""
         self._held: list[Request] = []
-        """Each `set` that waits for the next step, so that the one before it is settled first."""
+        """The `set` requests that wait for the next step, until the first one is settled."""
 
     @property
     def settings(self) -> Config:
@@ -115,7 +115,10 @@ class SpeedLimiter:
 
     @property
     def lowers(self) -> bool:
-        """Whether the limit is below the setting, also until the robot has obeyed its end."""
+        """Whether the limit lowers the speed.
+
+        After the end of a limit, this is True until the robot has applied the end.
+        """
         lowest = min(self._limit.speed, self._robot.limits.linear_speed)
         return lowest < self._settings.limits.linear_speed
 
@@ -128,9 +131,10 @@ class SpeedLimiter:
         return f"{self._limit.speed:.3g} m/s by {self._limit.by}; {setting:g} m/s without it"
 
     def receive(self, arrival: Arrival, configured: float, refusals: list[Refusal]) -> None:
-        """Take a message, or add the refusal, which the robot counts and reports.
+        """Store the limit in a message for the next step. Add invalid messages to `refusals`.
 
-        `configured` is as in `decode_limit`.
+        The robot counts and reports the refusals. `configured` is the configured
+        `limits.linear_speed`, m/s.
         """
         try:
             self._waiting = decode_limit(arrival, configured)
@@ -140,9 +144,10 @@ class SpeedLimiter:
     def requests(
         self, requests: tuple[Request, ...], now_ns: int
     ) -> tuple[tuple[Request, ...], list[Answer]]:
-        """Return the requests for the robot in this step, and answers to those that are refused.
+        """Return the requests for the robot in this step, and the answers to refused requests.
 
-        Call `settle` after the step.
+        `requests` are those of the clients, and `now_ns` is the monotonic time of the step. Call
+        `settle` after the step.
         """
         own = self._own(now_ns)
         if self._limit is NONE and not self._held:
@@ -163,11 +168,11 @@ class SpeedLimiter:
         return tuple(found), refused
 
     def _limited(self, request: Request) -> Request:
-        """Return a `set` with a speed that is within the limit.
+        """Return a client's `set` with its speed lowered to the limit, if it is higher.
 
-        Raises `ConfigError` if the settings would contradict each other without the limit.
+        Raises `ConfigError` if the settings would be invalid after the end of the limit.
         """
-        # The robot decides itself whether a change must wait until it stands.
+        # Whether a change must wait until the robot stands is checked by the robot itself.
         made, _ = changed(self._settings, request.settings, at_rest=True)
         if SETTING not in request.settings:
             return request
@@ -178,7 +183,7 @@ class SpeedLimiter:
         return replace(request, settings=request.settings | {SETTING: self._limit.speed})
 
     def _own(self, now_ns: int) -> tuple[Request, ...]:
-        """Return the request that makes the robot obey the newest message, if it needs one."""
+        """Return the request that makes the robot obey the newest message, or () for none."""
         if self._waiting is None or now_ns - self._changed_ns < PAUSE_NS:
             return ()
         new, self._waiting = self._waiting, None
@@ -192,10 +197,15 @@ class SpeedLimiter:
     def settle(
         self, robot: Config, answers: Iterable[Answer], events: list[Event]
     ) -> tuple[Answer, ...]:
-        """Take the robot's configuration after the step, and return its answers for the clients.
+        """Store the robot's configuration after the step, and return its answers for the clients.
 
-        An answer to a `set` whose speed must wait for the end of the limit says so, and so does an
-        event.
+        If a client has set a speed above the limit, the answer and a new event in `events` say that
+        the speed applies after the end of the limit.
+
+        Args:
+            robot: The configuration of the robot after the step.
+            answers: The robot's answers to the requests of the step.
+            events: The list to which the event is added.
         """
         answers = tuple(answers)
         speed = self._settings.limits.linear_speed

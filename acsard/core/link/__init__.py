@@ -1,2 +1,4 @@
-"""Pure package for the board's serial line: wire time, lines, frames, sample times and the
-session."""
+"""Handles the serial protocol of the board: lines, checksums, sample times and the link state.
+
+The package does no input or output.
+"""

@@ -2,9 +2,10 @@
 
     !status estop=ok bumpers=..X. driver=ok volts=24.31 amps=-1.20 charge=87% temp=41.5*HHHH
 
-Every field is optional, in any order, and at most once. The line is sent beside the replies and
-never in their place, so it says nothing about the speeds and does not count as a reply. Decoding is
-strict: a line counts as a whole or not at all. The forms make damage visible:
+Every field is optional. The fields may come in any order, and each at most once. The board sends
+the line in addition to its replies, never instead of one. So the line says nothing about the speeds
+and does not count as a reply. Decoding is strict: one invalid field makes the whole line invalid.
+The forms of the values make damage visible:
 
 - The words of an input differ in many bits, so no small damage turns `pressed` into `ok`.
 - Each number has a fixed number of decimals or ends with `%`, so a number that was cut is refused.
@@ -24,7 +25,10 @@ from msgspec.structs import astuple
 from acsard.core.link.codec import FrameError
 
 STATUS = b"!status"
-"""Begins every status line. A reply begins with a letter, and an identity with other letters."""
+"""First bytes of every status line.
+
+A reply begins with a letter, and the line in which a board identifies itself with `!acsard-mcu`.
+"""
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
 
@@ -66,7 +70,7 @@ def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
 
 
 def shown(status: BoardStatus) -> dict[str, str]:
-    """Return the fields as text for `diagnostics`, by a name with its unit."""
+    """Return the fields of `status` that are not None, as text by name, for `diagnostics`."""
     bumpers = status.bumpers
     values = {
         "emergency_stop": _word(status.estop, "pressed", "released"),
@@ -80,14 +84,14 @@ def shown(status: BoardStatus) -> dict[str, str]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-# A board at rest sends the same line again and again.
+# A board at rest repeats the same line, so the last lines are cached.
 @lru_cache(8)
 def decode_status(line: bytes, check: bool) -> BoardStatus:
-    """Return the fields of a status line without its end.
+    """Return the fields of a status line.
 
     Args:
-        line: The line, which begins with `STATUS`.
-        check: Whether the line must have a checksum. A checksum that it has must be right anyway.
+        line: The line without its line end. It begins with `STATUS`.
+        check: Whether a line without a checksum is refused. A wrong checksum is always refused.
 
     Raises:
         FrameError: The line is damaged, or it has an unknown field.

@@ -3,10 +3,10 @@
     command  ap12.50,bn08.75,cp15.00,dn10.25#07S*HHHH
     reply    ap12.50,bn08.75,cp15.00,dn10.25#07@TTTTAAAABBBBCCCCDDDD*HHHH
 
-After `#` come two digits of the sequence. Then a command has the letters of its requests, and a
-reply has the sample fields if the command asked for them. After `*` comes the CRC-16/XMODEM of
-everything before it. All digits are upper-case hexadecimal, so each line has one correct form.
-`codec.py` handles the plain part.
+After `#` come the two digits of the sequence number. In a command, request letters may follow. In a
+reply, `@` and the sample fields follow if the command asked for them. After `*` comes the
+CRC-16/XMODEM of everything before it. All digits are upper-case hexadecimal, so each line has one
+correct form. `codec.py` handles the plain part.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from msgspec import Struct
 from acsard.core.link.codec import FrameError
 
 SEQUENCES = 256
-"""The sequence counts modulo this number."""
+"""Number of different sequence numbers. After the last one they begin again at 0."""
 
 ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
@@ -36,8 +36,8 @@ _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9
 class Reading(Struct, frozen=True):
     """The sample fields of a reply, taken when the board read its encoders.
 
-    `mcu_ms` is the board's clock in ms. `counts` are those of the motors a to d; they rise when the
-    motor turns in its `p` direction. All five numbers are modulo 65536.
+    `mcu_ms` is the board's clock in ms. `counts` are the encoder counts of the motors a to d. A
+    count rises when its motor turns in the `p` direction. All five numbers are modulo 65536.
     """
 
     mcu_ms: int
@@ -45,7 +45,11 @@ class Reading(Struct, frozen=True):
 
 
 class Checked(Struct, frozen=True):
-    """A reply with a correct CRC: its plain part, the sequence that it answers and its sample."""
+    """A reply with a correct CRC.
+
+    `plain` is its plain part. `sequence` is the sequence number of the command that it answers.
+    `reading` has the sample fields, or is None for a reply without them.
+    """
 
     plain: bytes
     sequence: int
@@ -53,13 +57,19 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return a command line (ending in CR LF) with this sequence, these requests and the CRC."""
+    """Return a plain command line in its checked form. Both end with CR LF.
+
+    `letters` are the request letters, such as `ASK_SAMPLE`.
+    """
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
 def unseal(line: bytes) -> Checked:
-    """Return the parts of a reply without its line end; raise `FrameError` if any part is wrong."""
+    """Return the parts of a checked reply. `line` has no line end.
+
+    Raises `FrameError` if the form or the CRC is wrong. The plain part is not decoded.
+    """
     match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line

@@ -1,9 +1,10 @@
 """Encodes four wheel speeds as one line of the board's plain protocol, and decodes such a line.
 
-`ap12.50,bn08.75,cp15.00,dn10.25`: motor letter, `p` or `n` for the direction, rad/s. Encoding is
-exact to the byte. Decoding is strict about meaning and lenient about form (spaces after commas, a
-trailing comma, one or two integer digits, one to three decimals). A line counts as a whole or not
-at all. Only this module maps motor letters and signs to wheels.
+An example is `ap12.50,bn08.75,cp15.00,dn10.25`. Each value has a motor letter, `p` (positive) or
+`n` (negative) for the direction, and a speed in rad/s. Encoding is exact to the byte. Decoding is
+lenient about form: it accepts spaces after commas, a trailing comma, one or two integer digits, and
+one to three decimals. It is strict about meaning: one invalid value makes the whole line invalid.
+Only this module maps motor letters and signs to wheels.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ LETTERS = "abcd"
 Motors = tuple[float, float, float, float]
 
 MAX_SPEED = 99.99
-"""rad/s, the largest number with two integer digits and two decimals."""
+"""Largest speed in a line, rad/s: it has two integer digits and two decimals."""
 
 Reason = Literal[
     "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
@@ -35,7 +36,7 @@ _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """A line that is not a valid frame; `reason` is the name under which it is counted."""
+    """The error for an invalid line. `reason` is the name of the counter for such lines."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)
@@ -48,7 +49,10 @@ class FrameError(AcsardError):
 
 
 class Codec:
-    """An encoder and decoder of lines for one wiring and one dialect."""
+    """An encoder and decoder of lines for one wiring of the motors.
+
+    With `trailing_comma`, encoded lines end with a comma.
+    """
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
@@ -84,7 +88,7 @@ class Codec:
         return ",".join(tokens).encode() + self._end
 
     def wheels(self, motors: Motors) -> Motors:
-        """Map values of the motors a to d to wheels in `WHEELS` order, forward positive."""
+        """Return values of the motors a to d by wheel, in `WHEELS` order, with forward positive."""
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
             wheel[index] = motor * sign
@@ -92,9 +96,9 @@ class Codec:
         return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
-        """Return the speeds in a line without its end.
+        """Return the wheel speeds in `line`, which has no line end.
 
-        Raise `FrameError` unless all of it is valid.
+        Raises `FrameError` if any part of the line is invalid.
         """
         words = _words(line)
         if words is None:
@@ -112,10 +116,13 @@ class Codec:
         return WheelSpeeds(front_right, front_left, rear_left, rear_right)
 
 
-# A robot at rest reports one line again and again.
+# A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
 def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    """Return the four words of a line, each a motor and its direction, with their speeds."""
+    """Return the four values of a line as pairs such as `(b"ap", 12.5)`, None if it is malformed.
+
+    A pair has the motor letter with the direction, and the speed without sign, rad/s.
+    """
     match = _LINE.fullmatch(line)
     if match is None:
         return None

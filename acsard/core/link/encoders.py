@@ -1,9 +1,9 @@
-"""Converts encoder counts into the angle that each motor turned since the reading before.
+"""Converts encoder counts into the angle that each motor turned since the previous reading.
 
-The counts are cumulative, so a lost line loses no distance, and the board's own milliseconds do not
-depend on when the host read the line. Both are modulo 65536: a difference is used only if it cannot
-have wrapped and the motors can have turned so far. Otherwise the caller falls back to speed times
-time. The result also reports a probable restart of the board.
+The counts are cumulative, so a lost line loses no distance. The board's own milliseconds do not
+depend on when the host read the line. Counts and milliseconds are modulo 65536. So a difference is
+used only if it cannot have wrapped and if the motors are fast enough for it. Otherwise the caller
+uses speed times time. The module also detects a probable restart of the board.
 """
 
 from __future__ import annotations
@@ -20,18 +20,25 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Counts that are allowed beyond the fastest wheel: one at each end, and play in the gears."""
+"""Counts that are allowed in addition to those at the highest speed of a wheel.
+
+They cover one count at each end of the interval, and play in the gears.
+"""
 
 ROUNDING_MS = 2
-"""Error of the difference of two readings that are rounded to whole milliseconds, ms."""
+"""Largest error of the time between two readings, whose times are whole milliseconds, ms."""
 
 LATEST_MS = 1000.0
-"""Delay of a line in ms above which the delay is not tracked. The session starts over after such a
-gap anyway."""
+"""Largest delay of a line that is tracked, ms. A longer delay is treated as this one. The session
+starts over after such a gap anyway."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
-"""The reason why a difference is unusable. "unknown": there is no earlier reading, or it is too
-old. "leap": no motor can have turned so far. "restarted": the board has been powered on again."""
+"""The reason why the difference between two readings cannot be used.
+
+- unknown: there is no earlier reading, or it is too old
+- leap: no motor can have turned that far
+- restarted: the board has probably restarted
+"""
 
 
 class Turned(Struct, frozen=True):
@@ -42,14 +49,14 @@ class Turned(Struct, frozen=True):
 
 
 class Encoders:
-    """A comparison of each reading with the one before."""
+    """A comparison of each reading with the previous reading."""
 
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start.
 
-        A reading is never read before it is made. Between two readings the board's clock can
-        therefore gain on the host's only by the delay of the first one. A larger gain than
-        `quiet_ns` means that the board has restarted.
+        The host cannot receive a reading before the board has taken it. Between two readings, the
+        board's clock can therefore gain on the host's clock at most the delay of the first reading.
+        If it gains more than `quiet_ns`, the board has restarted.
 
         Args:
             counts: Encoder counts per turn, 0 if unknown.
@@ -61,16 +68,21 @@ class Encoders:
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
         self._promptest = MinimumDelay(most=LATEST_MS)
-        """The least delay of a reading, in ms."""
+        """Tracks the delay of the readings in excess of the least delay, ms."""
 
     def forget(self) -> None:
-        """Forget the last reading, which belongs to another session or is accounted for."""
+        """Forget the last reading.
+
+        It belongs to another session, or the caller has covered the time since then by speed times
+        time.
+        """
         self._last = None
 
     def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:
         """Return how far the motors turned since the last reading, or why that is unknown.
 
-        `at_ns` is the host's time of the reading. It serves only to detect a restart or a wrap.
+        `at_ns` is the monotonic time at which the host received the reading. It is used only to
+        detect a restart or a wrap.
         """
         last, self._last = self._last, (reading, at_ns)
         if last is None:

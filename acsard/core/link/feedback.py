@@ -3,12 +3,13 @@
 The time between two samples comes from the best clock that is available:
 
 - the board's own clock, if the board sends it with its counts;
-- the lines that left, if the board answers each one (`sample_time.py`);
-- the period of a free-running board (`sample_time.py`), where `ReplyStyle` detects which of the
-  two kinds the board is;
-- otherwise the times of the reads, spread evenly over the lines of a read.
+- the times at which the command lines were written, if the board answers each line
+  (`PromptedTimes`);
+- the period of the board, if it reports by its own clock (`FreeRunningTimes`);
+- otherwise the times at which the host read the lines, spread evenly if one read has several lines.
 
-`session.py` decides by arrival times alone whether the link can be trusted.
+`ReplyStyle` detects whether the board answers or reports by its own clock. These times do not
+affect the state of the link, which depends only on arrival times.
 """
 
 from __future__ import annotations
@@ -25,41 +26,44 @@ from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, Pr
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
-"""Least distance between the stamps of two lines, ns. A line with an equal stamp would be taken for
-the one before."""
+"""Least time between the stamps of two lines, ns. A line with an equal stamp would be taken for the
+previous line."""
 
 LATER = 0.05
-"""Gain of the filter for the mean offset between two clocks."""
+"""Gain of the filter for the mean offset between the two clocks of `sample_time.py`."""
 
 FULL_READ = 1024
-"""Bytes of a full read of the port. After a full read more data may wait."""
+"""Number of bytes in a full read of the port. After a full read more data may wait."""
 
 DIFFERS = 1.5
-"""Difference between periods and lines sent since the last read that scheduling does not cause."""
+"""Least difference between the periods and the command lines since the last read that scheduling
+alone does not cause. `ReplyStyle` adds up the reads with such a difference."""
 
 TELLING = 2.5
-"""Difference between the two sums that is needed for a decision."""
+"""Least difference between the sum of periods and the sum of command lines for a decision."""
 
 LATEST = 100.0
-"""Periods since the last read. After more, the read is ignored."""
+"""Largest number of periods since the last read. After more periods, the read is ignored."""
 
 CLEAR = 0.5
-"""Share of the sums' difference by which one sum must be nearer to the received lines."""
+"""For a decision, one sum must be nearer to the number of received lines than the other sum, by at
+least this share of the difference between the sums."""
 
 AFTER = 3
-"""Number of reads after a differing one that belong to it."""
+"""Number of reads after a read with a difference of `DIFFERS` that are added to the sums too."""
 
 NEAR = 0.35
-"""Largest distance of the nearer sum from the received lines, as a share of these: lines are lost
-too."""
+"""Largest difference between the nearer sum and the number of received lines, as a share of the
+received lines. It is not 0 because some lines get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
-    """A good line: its sample was taken at `at`, `dt` s after the previous one.
+    """A good line. The board took its sample at `at`, `dt` s after the previous sample.
 
-    After a gap `dt` is 0, because nobody knows how the robot moved in it, and `gap` is its length
-    in s. `turned` is how far the wheels turned since the previous line by their encoders' counts,
-    in rad and `WHEELS` order, or None if unknown. It is also valid after a gap.
+    After a gap `dt` is 0, because the motion during the gap is unknown, and `gap` is the length of
+    the gap in s. `turned` is the angle of each wheel since the previous line according to the
+    encoder counts in the line, in rad and `WHEELS` order, or None if unknown. It is also valid
+    after a gap.
     """
 
     at: Instant
@@ -68,20 +72,21 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """Seconds at the start of `dt` that no line reported. The speeds of the lines around it stand
-    in."""
+    """The part of `dt`, at its start, that no line reported, s. The speeds of the lines before and
+    after it are used for this part."""
     asked_ns: int | None = None
-    """Monotonic time at which the answered line left, None if that line is unknown."""
+    """Monotonic time at which the command line that this line answers was written, ns. None if that
+    command line is unknown."""
     since: float = 0.0
-    """Seconds since the previous line arrived, 0 after a silence. The plausibility checks use
-    it."""
+    """Time since the previous line, s: by the board's clock if it is known, else by arrival. 0
+    after a silence or a gap. The plausibility checks use it."""
     heard_ns: int = 0
-    """Monotonic time at which the line was complete here."""
+    """Monotonic time at which the host had received the whole line, ns."""
     counted: Motors | None = None
-    """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
-    the counts per turn are configured and the speeds show whole counts (`whole_counts.py`)."""
+    """Angle that each wheel turned in `dt` minus `bridged`, rad in `WHEELS` order. None unless the
+    counts per turn are configured and the speeds show whole counts (`whole_counts.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
-    """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
+    """Quantization step of each wheel's reported speed, rad/s, `math.inf` if unknown."""
     count: float = 0.0
     """Angle of one encoder count, rad, 0 if it is not configured."""
 
@@ -89,15 +94,16 @@ class Feedback(Struct, frozen=True, gc=False):
 class ReplyStyle:
     """Detects whether the board reports by its own clock or answers the daemon's lines.
 
-    While the daemon sends one line per period, both look alike. Sometimes it sends more or fewer
-    lines: the host stood still, or a command's line went at once. Then the number of lines received
-    follows either the periods that passed or the lines that left. The decision compares both sums
-    with the lines received, over the reads in which they differ and over the next few, which bring
-    the lines that an adapter still held.
+    While the daemon sends one line per period, both kinds of boards look alike. Sometimes the
+    daemon sends more or fewer lines, because the host did not run or because a new command was sent
+    at once. Then the number of received lines equals either the number of periods or the number of
+    command lines. Both numbers are added up over the reads in which they differ, and over the next
+    few reads, which bring the lines that an adapter still held. The sum that is nearer to the
+    number of received lines shows the kind of the board.
     """
 
     def __init__(self, speaks: bool) -> None:
-        """Start. With `speaks` the configuration says that the board reports by its own clock."""
+        """Start. `speaks` is True if the configuration says that the board has its own clock."""
         self.speaks: bool | None = speaks or None
         """True if the board reports by its own clock, False if it answers, None while unknown."""
         self._known = speaks
@@ -105,11 +111,11 @@ class ReplyStyle:
         self._came = self._periods = self._asked = 0.0
 
     def left(self) -> None:
-        """Note that a command line left."""
+        """Count a command line that was written."""
         self._left += 1
 
     def read(self, lines: int, periods: float) -> None:
-        """Take a read of `lines` lines, `periods` reply periods after the last read."""
+        """Process a read of `lines` lines. It came `periods` reply periods after the last read."""
         left, self._left = self._left, 0
         if self._known or periods > LATEST:
             return
@@ -139,7 +145,8 @@ class ReplyStyle:
 class Timeline:
     """The times of the good lines in order.
 
-    Call `read` for each read, then for each of its lines `place`, or `spoilt` if the line is bad.
+    For each read of the port, call `read`. Then, for each of its lines in order, call `place` if
+    the line is good and `spoilt` if it is bad.
     """
 
     def __init__(
@@ -152,7 +159,7 @@ class Timeline:
             codec: The codec for the board's wiring.
             wheel_speed: The highest speed that a wheel can have, rad/s.
             quiet_ns: The duration of silence after which the link is stale, ns.
-            rate_hz: Control rate.
+            rate_hz: Control rate, Hz.
         """
         self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
@@ -166,13 +173,13 @@ class Timeline:
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
         self._last_placed = Placed("reads", 0)
-        """The place of the last good line."""
+        """The time of the last good line."""
         self._later = 0.0
-        """How much later a reply is due by its line than by the slots, mean in ns."""
+        """Mean time by which `PromptedTimes` places a reply later than `FreeRunningTimes`, ns."""
         self.leaps = 0
-        """Number of readings with impossible counts. The speeds replaced them."""
+        """Number of readings with impossible counts. Speed times time was used instead."""
         self.restarted = False
-        """Whether the last line's clock shows that the board has restarted."""
+        """Whether the board's clock in the last line shows that the board has restarted."""
 
     def forget(self) -> None:
         """Start a new session: the next line does not follow the last one."""
@@ -182,14 +189,18 @@ class Timeline:
         self._forgotten = True
 
     def left(self, at_ns: int) -> None:
-        """Note that a command line left at `at_ns`."""
+        """Record that a command line was written at `at_ns` on the monotonic clock."""
         self._prompts.left(at_ns)
         self._style.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
-        """Take a read of `size` bytes that completes `lines` lines.
+        """Process a read of the port that completes at least one line.
 
-        `following` is the number of bytes that came after the last line.
+        Args:
+            at: The time of the read.
+            size: The number of bytes in the read.
+            lines: The number of lines that the read completes.
+            following: The number of bytes in the read after the end of the last line.
         """
         before, end_ns = self._end_ns, at.mono_ns
         if following:
@@ -210,9 +221,9 @@ class Timeline:
         self._prompts.read(end_ns, lines)
 
     def spoilt(self) -> None:
-        """Note that the next line of the read is bad.
+        """Skip the next line of the read, because it is bad.
 
-        For a prompted board a bad line still counts as the reply to a command.
+        If the board answers lines, the bad line is still the reply to one of them.
         """
         self._rest -= 1
         if not self._style.speaks:
@@ -227,15 +238,16 @@ class Timeline:
         silent: bool,
         asked_ns: int | None = None,
     ) -> Feedback:
-        """Return the feedback of the read's next line.
+        """Return the feedback of the next line of the read, which is good.
 
         Args:
             speeds: The speeds in the line.
-            reading: The sample fields of a checked reply, if it has them.
-            following: Bytes of the read that came behind the line.
-            length: Bytes of the line.
-            silent: Whether the link was silent before it.
-            asked_ns: When the line left that this reply answers, if it is known.
+            reading: The sample fields of a checked reply, None if it has none.
+            following: The number of bytes in the read after the end of the line.
+            length: The number of bytes of the line with its line end.
+            silent: Whether the link was silent before the line.
+            asked_ns: Monotonic time at which the line that this reply answers was written, ns. None
+                if unknown.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -248,8 +260,8 @@ class Timeline:
         dt, bridged = self._since_last(placed)
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
-        # A prompted board makes no line unless it is asked, so a silence of the host leaves no line
-        # missing.
+        # A board that answers lines sends nothing by itself, so no line is missing after a silence
+        # of the host.
         clocked = placed.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
@@ -267,16 +279,16 @@ class Timeline:
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
     def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
-        """Return the place of the next line on the best available clock."""
+        """Return the time of the next line by the best available clock."""
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
             ours = asked_ns is not None or speaks is False or self._prompts.thinks
             if ours and answered is not None:
                 if asked_ns is None and answered.due_ns - came_ns > self._usual_ns / 2:
-                    # The usual delay comes from a first reply that was read late, during a stall
-                    # that the line before has already counted. This line's time is therefore its
-                    # arrival.
+                    # The usual delay is too long: it was measured on a first reply that was read
+                    # late because of a stall. The time of the previous line already includes that
+                    # stall, so the time of this line is its arrival.
                     return Placed("prompts", came_ns, early=True)
                 return answered
         slot = self._slots.place(self._rest)
@@ -292,8 +304,9 @@ class Timeline:
     def _since_last(self, placed: Placed) -> tuple[float, float]:
         """Return the time since the last good line, and the part of it that no line reported, s.
 
-        If different clocks placed the two lines, the host times of both decide, so changes of the
-        clock do not add up.
+        If two different clocks placed the lines, the result is the difference of their `due_ns`,
+        corrected by the mean offset of the clocks. So the errors of changes between the clocks do
+        not add up.
         """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
@@ -310,14 +323,14 @@ class Timeline:
         return dt, dt - period if missing else 0.0
 
     def _compare(self, answered: Placed, slot: Placed) -> None:
-        """Update the mean by which replies are due later by their lines than by the slots."""
+        """Update `_later` with the times of one reply by both clocks of `sample_time.py`."""
         later_ns = answered.due_ns - slot.due_ns
         if slot.dt is None or self._last_placed.clock != "slots":
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return how much later a line is due by this clock than by the slots, mean in ns."""
+        """Return the mean time by which `clock` places a line later than the slots do, ns."""
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -327,7 +340,7 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return when the sample of a line was taken: before its own bytes were on the wire."""
+        """Return when the board took the sample of a line: before the line's bytes were sent."""
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
@@ -338,7 +351,7 @@ class Timeline:
         return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
-        """Return how far the motors turned since the line before, None if unknown."""
+        """Return the angles of the motors since the previous line, or None if unknown."""
         self.restarted = False
         if reading is None or not self._counts:
             self._encoders.forget()

@@ -1,24 +1,27 @@
-"""Splits the serial bytes into lines, with bounded memory. Every newline resynchronizes.
+"""Splits the received bytes into lines, with bounded memory.
 
-This module knows nothing about the meaning of a line. Lines end with LF or CR LF. Empty ones are
-dropped silently, because the daemon starts every session with a bare end of line and an echoing
-board may send it back.
+This module does not know the meaning of a line. Lines end with LF or CR LF. After noise, the next
+LF begins a new line. Empty lines are dropped silently, because the daemon starts every session with
+a bare line end, and a board that echoes may send it back.
 """
 
 from __future__ import annotations
 
 MAX_LINE = 128
-"""Bytes of a line with its end. The longest frame has 62, so more is noise without a newline."""
+"""Largest number of bytes in a line, with its line end.
+
+A reply has about 62 bytes, and a status line with all fields about 100. A longer line is noise.
+"""
 
 
 class LineReader:
-    """A splitter of a byte stream into lines. The stream may come in any pieces."""
+    """A splitter that turns a byte stream, in pieces of any size, into lines."""
 
     def __init__(self) -> None:
         self._held = b""
         self._discarding = False
         self.too_long = 0
-        """Number of over-long lines that were discarded."""
+        """Number of lines that were discarded because they were too long."""
 
     def clear(self) -> None:
         """Forget a half-received line, because the port has been reopened."""
@@ -26,10 +29,10 @@ class LineReader:
         self._discarding = False
 
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
-        """Return the lines that `data` completes, without their ends, in order.
+        """Return the lines that `data` completes, in order and without their line ends.
 
-        Each line comes with the number of bytes of `data` that followed it. Those bytes were on the
-        wire after the line was complete, so their number tells how long ago that was.
+        Each line is paired with the number of bytes of `data` that followed it. Those bytes were
+        on the wire after the line was complete, so their number shows how long ago that was.
         """
         lines = []
         ends = data.split(b"\n")

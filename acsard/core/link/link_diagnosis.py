@@ -1,10 +1,10 @@
-"""Explains the link to the operator: why it is not up, or loses lines, and what to do.
+"""Explains to the operator why the link is not up or loses lines, and what to do.
 
 The module knows three causes of a silence: this computer did not run (`Lateness`), the board sent
-something else (`SilenceDiagnosis`), or the board is silent. It also warns if a link that is up
-loses answers (`UnansweredLines`), and it has the sentences for `state.reason`, the log and the web
-page. It decides nothing about the link itself, which `link_state.py` judges by the silence alone.
-`acsard mcu check` shares the diagnosis.
+something other than replies (`SilenceDiagnosis`), or the board is silent. It also warns if a link
+that is up loses answers (`UnansweredLines`). It has the sentences for `state.reason`, the log and
+the web page. The diagnosis does not change the state of the link, which `link_state.py` decides.
+`acsard mcu check` uses the same diagnosis.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
-"""Share of the silence that ends a link. Two steps this far apart have caused the silence."""
+"""Share of the silence that ends a link. If two control steps are further apart than this share,
+this computer is the cause of a silence."""
 
 BUSY = "which other program uses the processor? (`top` shows it; as a service acsard has priority)"
 """The advice for a computer that is late."""
@@ -31,18 +32,18 @@ HOST = "this computer did not run for"
 SIMULATOR = "the built-in simulator, which is a part of this program, is late"
 
 PATIENCE_NS = 3 * NS_PER_S
-"""Time before the first diagnosis. A board that boots has answered by then."""
+"""Time before the first diagnosis, ns. A booting board has answered by then."""
 
 SHOWN = 64
-"""Most characters that are shown: a whole line and some noise on it."""
+"""Largest number of bytes that a diagnosis shows: a whole line and some noise."""
 
 Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
-"""The look of the received bytes.
+"""The class of the received bytes.
 
 - nothing: no byte at all
-- statuses: status lines of the board, and no reply
-- cut: pieces of valid lines, or lines without an end
-- foreign: valid lines with other bytes on them
+- statuses: status lines of the board, but no reply
+- cut: pieces of valid lines, or lines without a line end
+- foreign: valid lines with other bytes before or after them
 - garbage: nothing that resembles a line
 - few: good lines among others
 - sparse: only good lines, but too seldom
@@ -67,17 +68,17 @@ BLOCKED = (
     "the serial port sends nothing, because its driver accepts no bytes: unplug the "
     "adapter and plug it in again"
 )
-"""The reason while the driver takes no bytes."""
+"""The reason that is reported while the driver of the port accepts no bytes."""
 
 WINDOW = 1000
-"""Lines sent that are examined together: 10 s at 100 Hz."""
+"""Number of sent lines that are examined together: 10 s at 100 Hz."""
 
 LOST = 0.02
-"""Share of lost answers that causes the warning. A sound link loses none."""
+"""Share of lines without an answer above which the warning is given. A sound link has none."""
 
 
 def is_ours(words: str) -> bool:
-    """Return whether `Lateness.words` blames this computer for the silence."""
+    """Return whether `words`, a result of `Lateness.words`, blames this computer."""
     return HOST in words or SIMULATOR in words
 
 
@@ -94,14 +95,15 @@ class Lateness:
         self._simulated, self._least_ns = simulated, SHARE * quiet_ns
         self._looked_ns: int | None = None
         self.late_s = 0.0
-        """Longest time without a step since the last good line, s; 0 if no step was late."""
+        """Longest time between two steps since the last good line, s. 0 if no step was late."""
         self.step_s = 0.0
-        """Time between the last two steps if it was too long, else 0; s."""
+        """Time between the last two steps, s, if it was too long. Otherwise 0."""
 
     def look(self, now_ns: int, good: bool) -> bool:
-        """Note a step, and whether a good line came with it.
+        """Record a control step. `good` says whether the step received a good line.
 
-        Return True if this line ends a silence that this computer caused.
+        Return True if a good line ends a silence that this computer caused. With the simulator,
+        which runs on this computer, every good line counts as such a line.
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
@@ -124,7 +126,8 @@ class Lateness:
 class Heard(Struct):
     """The bytes and lines received in an interval.
 
-    `last` is the last line, or bytes, that was bad.
+    `lines` is the number of lines and `good` the number of good ones. `last` is the last bad line,
+    or the last bytes while no line has ended.
     """
 
     size: int = 0
@@ -138,13 +141,13 @@ class Heard(Struct):
     """Longest time in the interval in which this computer did not run and received nothing, s."""
 
     def take(self, data: bytes) -> None:
-        """Take received bytes, before their lines."""
+        """Add received bytes. Call this before `line` adds the lines in them."""
         self.size += len(data)
         if not self.lines:
             self.last = (self.last + data)[-SHOWN:]
 
     def line(self, line: bytes, good: bool) -> None:
-        """Take one line of them without its end."""
+        """Add a received line without its line end. `good` says whether it is a valid reply."""
         self.lines += 1
         self.good += good
         if not good:
@@ -152,7 +155,7 @@ class Heard(Struct):
 
     @property
     def looks(self) -> Look:
-        """The look of the bytes."""
+        """The class of the received bytes."""
         if self.statuses and not self.lines:
             return "statuses"
         if not self.size:
@@ -165,7 +168,10 @@ class Heard(Struct):
 
     @property
     def counted(self) -> str:
-        """Text with the number of received lines and the last bad line; bytes if no line ended."""
+        """Text with the number of received lines and the last bad line.
+
+        If no line has ended, the text has the number of bytes and the last bytes.
+        """
         if self.statuses and not self.lines:
             return "only status lines were received"
         if not self.size:
@@ -198,19 +204,24 @@ class SilenceDiagnosis:
 
     def __init__(self) -> None:
         self.heard: Heard | None = None
-        """The last interval of `PATIENCE_NS`; None before the first one ends, and while the link is
-        up."""
+        """The bytes and lines of the last complete interval.
+
+        None until the first interval has ended, and while the link is up.
+        """
         self.now = Heard()
-        """The interval under way."""
+        """The bytes and lines of the present interval."""
         self._since_ns: int | None = None
 
     def forget(self) -> None:
-        """Start over: the link is up, or the port has been opened again."""
+        """Discard the diagnosis: the link is up, the output is blocked, or the port was opened."""
         if self._since_ns is not None:
             self.heard, self.now, self._since_ns = None, Heard(), None
 
     def judge(self, now_ns: int) -> bool:
-        """Note that the link is still not up. Return whether the diagnosis has changed."""
+        """Process a control step in which the link is not up.
+
+        Return True if an interval has ended and the diagnosis has changed.
+        """
         if self._since_ns is None:
             self._since_ns = now_ns
         if now_ns - self._since_ns < PATIENCE_NS:
@@ -221,21 +232,31 @@ class SilenceDiagnosis:
 
 
 class UnansweredLines:
-    """Warns if the board leaves lines of an established link unanswered; nothing else shows that.
+    """Warns if the board does not answer all lines while the link is up.
 
-    The totals of lines sent and of good lines are compared window by window. The warning comes
-    once, until the link is sound again or lost. A board that reports by its own clock at another
-    rate looks the same and is not faulty.
+    Nothing else shows this loss. After every `WINDOW` sent lines, the number of sent lines is
+    compared with that of good lines. The warning is given once, and again only after a window
+    without loss or after the link was lost. A board that reports by its own clock at another rate
+    causes the same warning although it is not faulty.
     """
 
     def __init__(self, reply_period: float) -> None:
-        """Start; `reply_period` is that of a board with a clock of its own, s, else 0."""
+        """Start. `reply_period` is the setting mcu.reply_period, s.
+
+        It is 0 for a board that answers lines. Otherwise nothing is compared.
+        """
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
         self._told = False
 
     def look(self, sent: int, good: int, linked: bool) -> Event | None:
-        """Take the present totals; return the warning, if one is due."""
+        """Process the present totals, and return the warning if it is due.
+
+        Args:
+            sent: Number of lines sent since the start.
+            good: Number of good lines since the start.
+            linked: Whether the link is up.
+        """
         if not linked or self._own_clock:
             self._since, self._told = None, False
             return None
@@ -258,7 +279,7 @@ class UnansweredLines:
 
 
 def damaged(link: Link, check: Negotiation) -> bool:
-    """Return whether the daemon asks for the checked link because replies were damaged."""
+    """Return whether the daemon asks for checked lines because replies were damaged."""
     return link.damaged and check.asking
 
 
@@ -303,7 +324,11 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event for a newly agreed line form, a warning if the board lacks part of it."""
+    """Return the event for the newly agreed form of the lines, plain or checked.
+
+    It is a warning if the board does not support the check, or if `wants_samples` is true and the
+    board sends no counts.
+    """
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the serial lines are {check.in_force}"
     if check.state == "plain":

@@ -1,11 +1,15 @@
-"""Decides whether the link can carry motion: received lines and silences move it through a table.
+"""Decides whether the link can carry motion, by a state machine for received lines and silences.
 
 - down: the port is closed.
-- booting: the port is open or the board has restarted, and fewer than GOOD_LINES good lines came.
-- up: lines come in time, and correct if they are checked.
-- stale: the link was up. Then no good line came for `quiet`, or BAD_LINES bad checked lines came in
-  a row, or no line left for the board's watchdog time although the port is open, or the received
-  lines were the daemon's own.
+- booting: the port was opened or the board has restarted, and fewer than GOOD_LINES good lines have
+  come since.
+- up: good lines arrive in time.
+- stale: the link was up until one of these happened:
+
+  - No good line came for `quiet_ns`.
+  - BAD_LINES bad lines came in a row on a checked link.
+  - The open port could not write a line for the board's watchdog time.
+  - The received lines were the daemon's own lines (an echo).
 """
 
 from __future__ import annotations
@@ -33,7 +37,10 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("stale", "opened"): "booting",
     ("stale", "trusted"): "up",
 }
-"""Maps (state, sign) to the next state. Without an entry the state stays."""
+"""Maps (state, sign) to the next state. A pair without an entry does not change the state.
+
+A sign is an input of the state machine.
+"""
 
 WORDS: dict[State, str] = {
     "down": "the serial port is closed; it is being reopened",
@@ -46,32 +53,37 @@ WATCHDOG_S = 0.3
 """Seconds after the last valid line at which the board stops the motors by itself."""
 
 GOOD_LINES = 3
-"""Good lines before the link is trusted. A board that just reset may print anything for a while."""
+"""Number of good lines in a row before the link is trusted. A board that has just reset may print
+anything for a while."""
 
 BAD_LINES = 5
-"""Bad lines in a row after which a checked link asks for the check again."""
+"""Number of bad lines in a row on a checked link after which the daemon asks for the check
+again."""
 
 SPARSE = 2
-"""Silences in a row, each ended by one good line, that make the lines sparse. A single one is a
-link that was lost for a moment."""
+"""Number of silences in a row, each ended by one good line, after which the lines are reported as
+too sparse. A single silence only means that the link was lost for a moment."""
 
 
 class Link:
     """The state of the link and its counts of good and bad lines. Only `sign` changes the state."""
 
     def __init__(self, quiet_ns: int) -> None:
-        """Start; after `quiet_ns` of silence the link is stale."""
+        """Start. After `quiet_ns` ns without a good line the link is stale."""
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
-        """Seconds between the last two good lines if they repeatedly are too far apart, else 0."""
+        """Time between the last two good lines, s, if lines are repeatedly too sparse. Else 0."""
         self._silences = 0
-        """Silences in a row, each ended by one good line."""
+        """Number of silences in a row, each ended by one good line."""
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
 
     def sign(self, sign: Sign) -> None:
-        """Change the state by `TABLE`. Every sign except "trusted" resets the good-line count."""
+        """Process an input of the state machine, and change the state by `TABLE`.
+
+        Every input except "trusted" resets the count of good lines.
+        """
         self.state = TABLE.get((self.state, sign), self.state)
         if sign == "trusted":
             return
@@ -87,9 +99,9 @@ class Link:
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
 
     def good(self, at_ns: int) -> int | None:
-        """Count a good line.
+        """Count a good line, which arrived at `at_ns` on the monotonic clock.
 
-        Return the ns since the one before, None for the first of a session.
+        Return the time since the previous good line, ns, or None for the first of a session.
         """
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
@@ -105,21 +117,22 @@ class Link:
         return since_ns
 
     def excuse(self) -> None:
-        """Reset the count of silences: the last line came in time, or the host was late."""
+        """Reset the count of silences.
+
+        The last line came in time, this computer caused the silence, or the port was opened or
+        closed.
+        """
         self._silences, self.sparse_s = 0, 0.0
 
     def missed(self) -> None:
-        """Note a bad line or a silence.
-
-        Unless the link is up, this resets the count of good lines.
-        """
+        """Reset the count of good lines after a bad line or a silence, unless the link is up."""
         if self.state != "up":
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a bad line.
+        """Count a bad line. Return True if it is exactly the BAD_LINES-th in a row.
 
-        Return True if it is the last of BAD_LINES in a row, so that the check must be asked for.
+        On a checked link, the caller must then ask for the check again.
         """
         self.missed()
         self._bad_in_row += 1
@@ -131,7 +144,7 @@ class Link:
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Take the link down after silence, or bring it up after enough good lines.
+        """Make the link stale after a silence, or bring it up after GOOD_LINES good lines.
 
         `may_rise` is False if the link must not come up now.
         """

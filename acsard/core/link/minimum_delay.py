@@ -1,8 +1,8 @@
-"""Measures how late events are by two unrelated clocks, relative to the minimum delay so far.
+"""Measures the delay of events between two unrelated clocks, relative to the least delay so far.
 
 The arrival time by our clock minus the departure time by theirs is the delay plus an unknown offset
 between the clocks. The offset cancels out in the comparison with the smallest value so far, so the
-result is the delay in excess of the minimum. Clocks drift, so the minimum counts for less as time
+result is the delay in excess of the minimum. The clocks drift, so the minimum slowly rises as time
 passes.
 """
 
@@ -11,26 +11,27 @@ from __future__ import annotations
 import math
 
 DRIFT = 0.01
-"""Relative drift between two clocks that is allowed. A ceramic resonator has half of it."""
+"""Largest relative drift between two clocks. A ceramic resonator has half of it."""
 
 
 class MinimumDelay:
-    """The lateness of the last event, in the caller's unit of time."""
+    """The delay of the last event in excess of the minimum, in the caller's unit of time."""
 
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
         """Start.
 
-        `drift` is the relative drift of the clocks, and a lateness above `most` counts as `most`.
+        `drift` is the largest relative drift of the clocks. An excess above `most`, in the caller's
+        unit of time, is treated as `most`.
         """
         self._drift, self._most = drift, most
         self.late = 0.0
-        """Lateness of the last event over the minimum delay."""
+        """Delay of the last event in excess of the minimum."""
 
     def add(self, ours: float, theirs: float) -> float:
-        """Take an event and return its lateness over the minimum so far.
+        """Process an event, and return its delay in excess of the minimum so far.
 
-        A negative result makes this event the new minimum. The lateness includes the drift of the
-        clocks since the last event.
+        If the result is negative, this event is the new minimum. The result includes the drift of
+        the clocks since the last event.
 
         Args:
             ours: time since the last event by our clock.
@@ -42,13 +43,14 @@ class MinimumDelay:
         return later
 
     def measure(self, ours: float, theirs: float) -> float:
-        """Return the lateness of an event, less drift.
+        """Return the delay of an event in excess of the minimum, less the allowed drift.
 
-        A negative result is below the accepted minimum.
+        A negative result is below the accepted minimum, which does not change until `believe`. The
+        arguments are those of `add`.
         """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late
 
     def believe(self) -> None:
-        """Accept the last measured event as the minimum if its lateness is negative."""
+        """Accept the delay of the last measured event as the minimum if it is less."""
         self.late = min(max(0.0, self.late), self._most)

@@ -1,20 +1,25 @@
-"""Negotiates the check of the serial line, with stops only, at every opening and after every gap.
+"""Negotiates whether lines have a check, at every opening of the port and after every gap.
 
-- off: mcu.link_check is "off". Lines are plain and the daemon asks for nothing.
-- waking: only stops leave. The board has not answered yet. Every second question is a plain stop,
-  because the board may know no other line, and its silence proves nothing.
-- asking: only stops leave. The board has answered, so its silence to a question is an answer.
-- plain: with "auto" only. The board answers, but without the check. The daemon asks again after the
-  next gap.
-- checked: a correct reply to a line has come. From now on only correct replies count.
-- sampled: checked, and the replies bring the encoder counts that the lines ask for.
+The check is the sequence number and CRC of `checksum.py`. A question is a stop line that asks for
+it. The states of the negotiation are:
 
-A board that has once answered with the check is not believed without it until the port is reopened,
-because noise must not end the check.
+- off: mcu.link_check is "off". Lines are plain, and the daemon does not ask for the check.
+- waking: the daemon sends only stops. The board has not answered yet, so its silence proves
+  nothing. Every second stop is plain, because the board may know only plain lines.
+- asking: the daemon sends only stops. The board has sent a plain line, so it is awake. If it does
+  not answer a question now, it probably does not know the check.
+- plain: only with mcu.link_check = "auto". The board answers, but without the check. The daemon
+  asks again after the next gap.
+- checked: the board has answered a question correctly. Now the daemon accepts only checked replies.
+- sampled: as checked, and the replies have the encoder counts that the lines ask for.
 
-The module also recognizes lines that only come back, because TX and RX are joined or the far end
-echoes. A question that comes back shows it at once, because no reply carries the letters of a
-question. For plain lines, and for checked lines that ask for no sample, `EchoDetector` shows it.
+Once a board has answered with the check, the daemon accepts no plain replies until the port is
+reopened, because noise must not end the check.
+
+The module also detects echoes: the daemon's own lines come back, because TX and RX are connected or
+the far end echoes. A question that comes back is detected at once, because no reply has request
+letters. `EchoDetector` detects the echo of plain lines, and of checked lines that ask for no
+sample.
 """
 
 from __future__ import annotations
@@ -33,12 +38,12 @@ State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
 Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
 """The inputs of the state machine.
 
-- gap: the link starts over
-- heard: a plain line came while asking
-- answer: a correct answer to a question, without a sample
-- sample: a correct answer to a question, with a sample
-- refusal: no question was answered
-- samples_end: the replies bring no more samples
+- gap: the negotiation starts again
+- heard: a plain line came while the daemon asks
+- answer: the board answered a question correctly, without a sample
+- sample: the board answered a question correctly, with a sample
+- refusal: the board answered none of the questions
+- samples_end: the replies have no samples any more
 """
 
 TABLE: dict[tuple[State, Sign], State] = {
@@ -55,7 +60,7 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("sampled", "gap"): "waking",
     ("sampled", "samples_end"): "checked",
 }
-"""Maps (state, sign) to the next state. Without an entry the state stays."""
+"""Maps (state, sign) to the next state. A pair without an entry does not change the state."""
 
 IN_FORCE: dict[State, str] = {
     "off": "plain",
@@ -67,7 +72,7 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why asking never ends, so that nothing drives.
+"""The reason why the negotiation does not end, so that the robot cannot drive. "" means no trouble.
 
 - echo: the lines that the daemon sends come back
 - forgotten: the board answered with the check before and does not now
@@ -88,41 +93,44 @@ MENDS: dict[Trouble, str] = {
 }
 
 TRIES = 3
-"""Unanswered questions of a kind after which the board does not know that kind."""
+"""Number of unanswered questions of one kind (with or without request letters) after which the
+daemon concludes that the board does not know that kind."""
 
 WINDOW = 64
-"""Lines whose answers may still come, far fewer than the sequence can distinguish."""
+"""Largest number of lines that wait for an answer, far fewer than there are sequence numbers."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
-"""Largest delay of an answer. Before a later one the board's own watchdog has stopped the
+"""Largest delay of an answer, ns. After a longer one the board's watchdog has stopped the
 motors."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
-"""Distance of the stop lines while nothing comes back: 10 Hz is enough to wake the board and leaves
-little in a queue."""
+"""Least time between two stop lines while the board sends nothing, ns. 10 Hz is enough to wake the
+board, and few lines pile up in buffers."""
 
 THINKING_NS = 30_000_000
-"""Time that the board and the drivers may take to answer besides the wire time."""
+"""Time that the board and the drivers may take to answer, in addition to the wire time, ns."""
 
 FEW_SAMPLES = 5
-"""Correct replies in a row without the requested sample, after which samples no longer come."""
+"""Number of correct replies in a row without a sample after which the daemon stops asking for
+samples."""
 
 REPORTS = 20
-"""Equal reports in a row: 0.2 s at 100 Hz."""
+"""Number of reports in a row that must equal sent lines in an echo: 0.2 s at 100 Hz."""
 
 CHANGE = 2.0
-"""rad/s; sum of the changes among them, of the wheel that changes most. A small one alone may be a
-coincidence of coarse encoders."""
+"""Least sum of the speed changes in an echo's reports, rad/s. Each change is that of the wheel that
+changes most. A smaller sum may be a coincidence with coarse encoders."""
 
 LINES = 8
-"""Lines that a report is compared with: an echo that comes back within 70 ms at 100 Hz is found."""
+"""Number of sent lines with which a report is compared. At 100 Hz, this detects an echo that comes
+back within 70 ms."""
 
 _Run = tuple[int, float, WheelSpeeds]
-"""The equal reports in a row, the sum of their changes, and the speeds of the last one."""
+"""Number of equal reports in a row, sum of their speed changes in rad/s, and the last speeds."""
 
 
 class Throttle:
-    """A limiter that passes one event and the next only after a given time."""
+    """A rate limiter. After an event has passed, the next one must wait for a given time."""
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
@@ -130,9 +138,9 @@ class Throttle:
         self._before_ns: int | None = None
 
     def lets(self, now_ns: int, wait_ns: int) -> bool:
-        """Return whether an event may pass now, `wait_ns` after the last.
+        """Return whether an event may pass now, and record it as the last event if it may.
 
-        If so it becomes the last.
+        It may pass if the last event was at least `wait_ns` ago.
         """
         if self.last_ns is not None and now_ns - self.last_ns < wait_ns:
             return False
@@ -140,45 +148,51 @@ class Throttle:
         return True
 
     def undo(self) -> None:
-        """Forget the last event, because its line did not leave. The next line need not wait."""
+        """Forget the last event, because its line was not written. The next one need not wait."""
         self.last_ns = self._before_ns
 
 
 class EchoDetector:
-    """Recognizes a run of reports that only repeat sent lines.
+    """Detects a run of reports that only repeat sent lines.
 
-    A reply without a sample has the same form as a command, so an echo looks like a board that
-    reports exactly the speeds it was sent. An echo is a run of `REPORTS` reports, each equal byte
-    for byte to one of the last `LINES` lines, always the same number of lines before. The changes
-    of speed in the run add up to `CHANGE`. At rest every board looks like an echo, and nothing is
-    decided.
+    A reply without a sample has the same form as a command. So an echo looks like a board that
+    reports exactly the commanded speeds. A run of at least `REPORTS` reports is an echo under two
+    conditions. Each report equals, byte for byte, the line that was sent a fixed number of lines
+    earlier, among the last `LINES` lines. And the speed changes in the run add up to at least
+    `CHANGE`. At rest every board looks like an echo, so a run without changes proves nothing.
 
-    A board that measures is not taken for an echo, because its wheels lag behind the lines in
-    another way than by a whole number of lines. In simulated drives with accelerations of 0.1 to
-    100 m/s2 and encoders of up to 1,000,000 counts a turn, equal reports in a row covered at most
-    0.04 rad/s of changes if the motors lag by 2 ms or more. A board that reports its set points,
-    or a simulator whose wheels have no lag at all, looks exactly like an echo. The daemon then
-    drives nothing until the port is opened again, and says why.
+    A board that measures its speeds is not taken for an echo, because the lag of its wheels is not
+    a whole number of lines. This was simulated for accelerations of 0.1 to 100 m/s2, encoders of up
+    to 1,000,000 counts a turn, and motors that lag by 2 ms or more. The equal reports in a row then
+    covered at most 0.04 rad/s of changes. A board that reports its set points, or a simulator whose
+    wheels have no lag, looks exactly like an echo. The daemon then does not drive until the port is
+    opened again, and reports the reason.
     """
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Start over: the port has been opened."""
+        """Forget all lines and reports, because the port has been opened."""
         self._sent: deque[bytes] = deque(maxlen=LINES)
-        """The last lines, of which the newest has the number `_lines`."""
+        """The last sent lines. The newest one has the number `_lines`."""
         self._lines = self._reports = 0
         self._runs: dict[int, _Run] = {}
-        """By the number of a report minus that of its line, which no delay of an echo changes."""
+        """The runs, by the number of a report minus that of the equal line.
+
+        This difference is constant in an echo, whatever its delay is.
+        """
 
     def left(self, line: bytes) -> None:
-        """Note that this line left, with its end."""
+        """Record that `line`, with its line end, was written to the port."""
         self._lines += 1
         self._sent.append(line.removesuffix(b"\r\n"))
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Take a report without its end, and the speeds in it; return whether it is an echo."""
+        """Process a report, and return whether it completes an echo.
+
+        `line` is the report without its line end, and `speeds` are the speeds in it.
+        """
         self._reports += 1
         runs: dict[int, _Run] = {}
         if line not in self._sent:
@@ -199,27 +213,32 @@ class EchoDetector:
 
 
 class Negotiation:
-    """The negotiation of the check. It asks, seals lines, and matches replies with lines."""
+    """The negotiation of the check.
+
+    It makes the questions, adds the check to lines, and matches replies with lines.
+    """
 
     def __init__(self, mcu: McuConfig, stop: bytes) -> None:
-        """Start; `stop` is the plain stop line."""
+        """Start. `mcu` is the table `[mcu]`, and `stop` is the plain stop line."""
         self._stop, self._wanted = stop, mcu.link_check
         self.state: State = "off" if mcu.link_check == "off" else "waking"
         self.trouble: Trouble = ""
         self.settled_ns = 0
-        """Monotonic time at which asking last ended."""
+        """Monotonic time at which the negotiation last ended, ns."""
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
-        """The last question if its echo can be distinguished from an answer, else b""."""
+        """The last question, without its line end, if no answer can equal it. Otherwise b""."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
-        """Sequence and time of the sealed line just made, until `settle` reports whether it
-        left."""
+        """Sequence number and time (ns) of the last checked line that was made.
+
+        None after `settle` has reported whether the line was written.
+        """
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
-        """Sequences and times of the lines that left and are not answered."""
+        """Sequence numbers and times (ns) of the written lines that are not answered yet."""
         self._knows = False
         self._without = 0
         self._echo = EchoDetector()
@@ -227,23 +246,23 @@ class Negotiation:
 
     @property
     def asking(self) -> bool:
-        """Whether only questions leave."""
+        """Whether the daemon sends only questions and plain stops."""
         return self.state in ("waking", "asking")
 
     @property
     def checked(self) -> bool:
-        """Whether only replies with a correct check count."""
+        """Whether only replies with a correct check are accepted."""
         return self.state in ("checked", "sampled")
 
     @property
     def in_force(self) -> str:
-        """The check in force, as text."""
+        """The present form of the lines, in words."""
         return IN_FORCE[self.state]
 
     def begin(self, fresh: bool = False) -> None:
-        """Ask from the start and forget all earlier answers.
+        """Start the negotiation again, and forget the lines that wait for answers.
 
-        `fresh` means that the port has been opened.
+        `fresh` says that the port has been opened. Then also forget what is known about the board.
         """
         self._sign("gap")
         self._begin(fresh)
@@ -262,10 +281,10 @@ class Negotiation:
     def _sign(self, sign: Sign) -> None:
         self.state = TABLE.get((self.state, sign), self.state)
 
-    # Lines that leave.
+    # Lines to the board.
 
     def seal(self, line: bytes, now_ns: int) -> bytes:
-        """Return the line in the form in force."""
+        """Return a plain command line in the present form, plain or checked."""
         if not self.checked:
             return line
         return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
@@ -286,13 +305,17 @@ class Negotiation:
         return line
 
     def left(self, line: bytes) -> None:
-        """Note that this line left, with its end."""
+        """Record that `line`, with its line end, was written to the port."""
         self._echo.left(line)
 
     def settle(self, went: bool, late_ns: int = 0) -> None:
-        """Note whether the last line left, `late_ns` after it was made.
+        """Record whether the port wrote the last line.
 
-        No answer can come to a line that did not leave.
+        A line that was not written gets no answer.
+
+        Args:
+            went: Whether the port wrote the line.
+            late_ns: The time from making the line to writing it, ns.
         """
         if self._made is not None and went:
             sequence, made_ns = self._made
@@ -308,12 +331,13 @@ class Negotiation:
         self._made = (self._sequence, now_ns)
         return seal(line, self._sequence, letters)
 
-    # Lines that come back.
+    # Lines from the board.
 
     def echoed(self, line: bytes) -> bool:
-        """Return whether this line or an earlier one was an echo of the daemon's own question.
+        """Return whether `line`, without its line end, or an earlier line was an echo.
 
-        After an echo no received line is believed until the port is reopened.
+        `line` is compared with the last question. After an echo, every received line is rejected
+        until the port is reopened.
         """
         if self._question and line == self._question:
             self.trouble = "echo"
@@ -321,26 +345,28 @@ class Negotiation:
 
     @property
     def echoes(self) -> bool:
-        """Whether every received line counts as an echo, until the port is reopened."""
+        """Whether every received line is treated as an echo, until the port is reopened."""
         return self.trouble == "echo"
 
     def repeated(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Take a report without a sample; return whether it and those before it are an echo."""
+        """Process a report without a sample, and return whether the last reports are an echo."""
         if self._echo.report(line, speeds):
             self.trouble = "echo"
         return self.echoes
 
     def heard_plain(self) -> None:
-        """Note a whole plain line while the daemon asks for the checked link.
+        """Record that a valid plain line came while the daemon asks for the check.
 
-        The board is awake, so from now on its silence is an answer too.
+        The board is awake, so unanswered questions are counted from now on.
         """
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
-        """Take a correct reply; return when the line that it answers left.
+        """Process a correct reply, and return when the line that it answers was written.
 
-        Raises `FrameError` unless the reply answers a line that was sent and is unanswered.
+        `at_ns` is the time at which the reply was read. Both times are ns on the monotonic clock.
+        Raises `FrameError` unless the reply answers a line that was written within `LATE_NS` and is
+        not answered yet.
         """
         while self._pending and at_ns - self._pending[0][1] > LATE_NS:
             self._pending.popleft()
@@ -362,15 +388,15 @@ class Negotiation:
         return left_ns
 
     def judge(self, now_ns: int) -> None:
-        """Count a question without an answer.
+        """Count the last question as unanswered if its answer is overdue.
 
-        After the last one accept the plain form or report trouble.
+        If no kind of question was answered, accept plain lines or set `trouble`.
         """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:
             return
         if self.echoes:
-            self._unanswered = 0  # keep asking, so that nothing drives
+            self._unanswered = 0  # keep asking, so that the robot cannot drive
             return
         if now_ns - asked_ns < self._answer_ns:
             return

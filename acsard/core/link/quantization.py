@@ -1,9 +1,9 @@
-"""Measures how coarsely encoders show in the reported speeds, and adds whole counts to each line.
+"""Measures how coarsely encoders quantize the reported speeds, and adds whole counts to each line.
 
-If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds. If
-they are not, the pose uses speed times time: nobody can tell from the speeds alone how many counts
-a turn has, unless the firmware divides by a fixed period. Then the time of a line is known as well,
-and only the rounding to two decimals is left.
+If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds.
+Otherwise the pose uses speed times time, because the speeds alone do not show how many counts a
+turn has. The exception is firmware that divides by a fixed period. However, the time of its lines
+is known as well, so the only error of speed times time is the rounding to two decimals.
 """
 
 from __future__ import annotations
@@ -17,40 +17,44 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import WholeCounts
 
 FLICKER = 0.0105
-"""rad/s. A smaller step is only rounding."""
+"""Smallest change of a reported speed that is a step, rad/s. A smaller change is only rounding."""
 
 BLOCK = 64
-"""Steps that are examined together: enough for three counts even if a filter smooths few counts."""
+"""Number of steps that are examined together. They include at least three counts, even if counts
+are rare and the firmware filters the speeds."""
 
 FIRST = 24
-"""Steps of the first block after which `size` has a first value, which may still grow."""
+"""Number of steps in the first block after which `Steps.size` gets a value. It may still grow."""
 
 RECUR = 3
-"""Number of steps of a block that must reach a size. One damaged line makes two."""
+"""Number of steps in a block that must reach a size. A single damaged line causes only two."""
 
 ALIKE = 3.0
-"""Bound on a wheel's reported step, as a multiple of the second largest of the four. Random jumps
-look like steps too."""
+"""Bound on the step of a wheel, as a multiple of the second largest step of the four wheels. The
+bound is needed because random jumps look like steps too."""
 
 COARSE, JUMP_GAIN = 0.015, 0.06
-"""Mean jump of a wheel, rad per line, from which on its encoder counts as coarse, and the gain of
-its filter. About 200 counts a turn reach it."""
+"""`COARSE` is a mean jump of a wheel, rad per line. Above it, the encoder is treated as coarse. An
+encoder with about 200 counts a turn reaches it. `JUMP_GAIN` is the gain of the filter for the mean
+jump."""
 
 LONGEST_LINE = 0.03
-"""Time of a line, s, above which the motors' own accelerations look like jumps."""
+"""Longest time of a line, s, over which jumps are measured. Over a longer time, the accelerations
+of the motors look like jumps."""
 
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
 class Steps:
-    """The step of one wheel's reported speed from line to line that its encoder causes.
+    """The size of the steps that an encoder causes in the reported speed of its wheel.
 
-    One count more or less in a period is a step of 2 pi / (counts T): 31 rad/s at 20 counts a turn
-    and 100 Hz. It is not an acceleration. The size is learned from the reports, so it holds for any
-    firmware, whether it divides counts by its nominal period or by the measured time, or filters
-    them. Steps that come from counts recur. A damaged line makes only two, one there and one back.
+    One count more or less in a period T changes the reported speed by 2 pi / (counts per turn x T).
+    This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step is not an acceleration. The size
+    is learned from the reports. So it is right for firmware that divides counts by its nominal
+    period, divides them by the measured time, or filters the speeds. Steps that counts cause recur.
+    A damaged line causes only two steps, one away from the speed and one back.
 
-    `size` is in rad/s, `math.inf` until enough steps were seen.
+    `size` is in rad/s. It is `math.inf` until enough steps were found.
     """
 
     def __init__(self) -> None:
@@ -61,7 +65,7 @@ class Steps:
         self._count = 0
 
     def add(self, speed: float) -> None:
-        """Take the next reported speed, rad/s."""
+        """Process the next reported speed, rad/s."""
         step = abs(speed - self._last)
         if step < FLICKER:
             return
@@ -76,30 +80,32 @@ class Steps:
         if self._count == FIRST and self.size == math.inf:
             self.size = largest[0]
         if self._count == BLOCK:
-            # At its start a block has seen too little, so the size of the block before still
-            # counts.
+            # A new block has too few steps at first, so it starts with the size of this block.
             self._before, self._count = largest[0], 0
             self.size, self._largest = self._before, [0.0] * RECUR
 
 
 class Coarseness:
-    """Detects wheel speeds that jump to and fro from line to line, as those of coarse encoders do.
+    """Detects wheel speeds that jump back and forth from line to line, as with coarse encoders.
 
-    A change of the acceleration is a jump as well, but lasts for one line.
+    A change of the acceleration causes a jump too, but only in one line.
     """
 
     def __init__(self) -> None:
         self._rows = NOTHING, NOTHING
         """The speeds of the last two lines, rad/s."""
         self._jumps, self._wheel = [0.0] * 4, 0
-        """Filtered jump of each wheel, rad per line, and the wheel of the last line."""
+        """Filtered jump of each wheel, rad per line, and the wheel examined in the last line."""
 
     def add(self, speeds: Motors, own: float) -> bool:
-        """Take the speeds of a line over `own` s; return whether the encoders look coarse."""
+        """Process the speeds of a line, rad/s. Return whether the examined encoder looks coarse.
+
+        `own` is the time that the line covers, s.
+        """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:
             return False
-        # One wheel per line keeps every step short.
+        # Only one wheel is examined per line, which keeps every control step short.
         wheel = self._wheel = (self._wheel + 1) % 4
         mean, jump = self._jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
         self._jumps[wheel] = mean = mean + JUMP_GAIN * (own / 2 * jump - mean)
@@ -110,19 +116,19 @@ class CountRecovery:
     """The quantization of all wheels, learned from every good line of one port."""
 
     def __init__(self, counts: int = 0) -> None:
-        """Start; `counts` are the configured counts per turn, 0 if nobody knows them."""
+        """Start. `counts` is the configured number of counts per turn, 0 if unknown."""
         self._configured, self._whole = counts, WholeCounts(counts)
         self.coarse_lines = 0
-        """Number of lines with the jumps of coarse encoders of which nobody knows the counts."""
+        """Number of lines with jumps of coarse encoders while the counts are not configured."""
         self.forget()
 
     def forget(self) -> None:
-        """Start over: the board may be another one, or it reports in another way."""
+        """Forget all earlier lines: the board has restarted, or may be another one."""
         self._whole.forget()
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)
         self._reported, self._steps = NOTHING, NOTHING
-        """rad/s. The step that each wheel reports, and the bounded step that is passed on."""
+        """Learned step of each wheel, and the same step after the bound `ALIKE`, both rad/s."""
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -130,7 +136,10 @@ class CountRecovery:
         return (self._configured if self._whole.believed else 0,) * 4
 
     def look(self, line: Feedback) -> Feedback:
-        """Return the line with each wheel's counted angle and quantization step, where known."""
+        """Return the line with the counted angle and the quantization step of each wheel added.
+
+        The counted angles are None if they are unknown.
+        """
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:
             if line.turned is None and own > 0.0:

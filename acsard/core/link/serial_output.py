@@ -1,7 +1,7 @@
-"""Decides whether a line may go to the serial port now, and defines the interface of the port.
+"""Decides whether a line may be written to the serial port now, and defines the port's interface.
 
-`SerialOutput` is used by the real port (`daemon/serial/port.py`) and by the virtual one of the
-tests. A line goes now or not at all.
+The real port (`daemon/serial/port.py`) and the virtual port of the tests use `SerialOutput`. A line
+is written at once or dropped. It is never queued.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
-"""What happened to a line: it was sent, it is dropped for a newer one, or the port is closed."""
+"""The result for a line: it was sent, it was dropped in favor of a newer one, or the port is
+closed."""
 
 
 class Port(Protocol):
@@ -26,64 +27,72 @@ class Port(Protocol):
 
     @property
     def sent_ns(self) -> int:
-        """Monotonic time at which the kernel took the last line, ns."""
+        """Monotonic time at which the kernel last accepted bytes, ns."""
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        `late` is the time of a step that comes late, or None. With it, bytes that still wait in the
-        kernel are read first.
+        `late` is the time of the control step if the step is late, else None. For a late step, the
+        port also reads the bytes that still wait in the kernel.
         """
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Send a line that was made at `now`, and return whether it was sent.
+        """Write a line that the control loop made at `now`, and return the result.
 
-        A line that is not sent is dropped.
+        If the port does not write the line at once, it drops the line.
         """
 
 
 class SerialOutput:
-    """The output of a serial port from its opening to its closing. It never keeps a line."""
+    """The output of a serial port from its opening to its closing. It has no queue."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
-        """Start. `stop` is the plain stop line. A line older than `period_ns` is superseded."""
+        """Start. `stop` is the plain stop line. Any other line may be `period_ns` old at most."""
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
-        """The begin of every stop line, plain or checked."""
+        """The bytes with which every stop line begins, plain or checked."""
         self.sent_ns = 0
-        """Monotonic time at which the kernel took the last line, ns."""
+        """Monotonic time at which the kernel last accepted bytes, ns."""
         self._free_ns = 0
         self._torn = self._first = True
 
     def prepare(self, line: bytes, made_ns: int, now_ns: int, kernel_bytes: int) -> bytes | None:
-        """Return the bytes to pass to the kernel for a line, or None if the line is superseded.
+        """Return the bytes to pass to the kernel for a line, or None if the line must be dropped.
 
-        A line is superseded for each of these reasons:
+        A line is dropped for each of these reasons:
 
         - The kernel still has bytes to send.
-        - The line before is still on the wire.
-        - The line is older than a period, because the process did not run. A stop is never too old.
+        - The previous line was still on the wire when the line was made.
+        - The line is older than a period because the process did not run. This does not apply to a
+          stop.
 
-        The first line after the port was opened is always a plain stop.
+        The first line after the port was opened is replaced by a plain stop.
 
         Args:
-            line: the line.
-            made_ns: the monotonic time at which the step that made the line began, ns.
-            now_ns: the present monotonic time, ns.
-            kernel_bytes: the number of bytes that the kernel has not sent yet.
+            line: The line with its line end.
+            made_ns: The monotonic time at which the step that made the line began, ns.
+            now_ns: The present monotonic time, ns.
+            kernel_bytes: The number of bytes that the kernel has not sent yet.
         """
         if kernel_bytes or made_ns < self._free_ns:
             return None
         goes = self._stop if self._first else line
         if now_ns - made_ns > self._period_ns and not goes.startswith(self._still):
             return None
-        # A line end in front ends a line of which the board has received only a part.
+        # The additional line end ends a line of which the board has received only a part.
         return (b"\r\n" if self._torn else b"") + goes
 
     def took(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
-        """Take note that the kernel took the first `taken` of the bytes `handed` for `line`.
+        """Record how many bytes the kernel accepted, and return whether the line was sent.
 
-        Returns "sent" if it took the whole line. The remaining bytes are dropped.
+        The result is "superseded" if the kernel did not accept all bytes, or if `prepare` had
+        replaced the line by a stop. The remaining bytes are dropped.
+
+        Args:
+            line: The line that was given to `prepare`.
+            handed: The bytes that `prepare` returned.
+            taken: The number of these bytes that the kernel accepted.
+            now_ns: The present monotonic time, ns.
         """
         whole = taken == len(handed)
         if whole:

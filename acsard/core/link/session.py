@@ -1,10 +1,9 @@
-"""Follows one serial port through opens, losses and silences.
+"""Follows one serial port through openings, losses and silences.
 
-The session takes the bytes that the port received and returns feedback, with the time at which each
-line was complete. It writes the lines that leave in the form in force, plain or checked. It decides
-nothing about motion: `link_state.py` decides whether the link may carry motion, and
-`negotiation.py` which form is in force. The link is not up while the session asks the board for the
-check.
+The session decodes the bytes that the port received, and returns the good lines as feedback with
+their times. It also encodes the lines to the board. `negotiation.py` decides whether lines are
+plain or checked, and `link_state.py` decides whether the link may carry motion. The link does not
+come up while the session asks the board for the check.
 """
 
 from __future__ import annotations
@@ -32,20 +31,22 @@ NAMES: dict[LinkState, EventName] = {
     "up": "link_up",
     "stale": "link_stale",
 }
-"""The event that reports each state of the link."""
+"""The event that reports a change to each state of the link."""
 
 LONG_GAP_NS = 1 * NS_PER_S
-"""A gap this long in either direction means the MCU may have been reset: commanders start over."""
+"""Duration of a gap, in either direction, after which the MCU may have been reset, ns. Every
+commander must then return to neutral first."""
 
 BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
-"""The output is blocked when no line has left for this long: the MCU has stopped by itself."""
+"""Time without a written line after which the output is reported as blocked, ns. By then the MCU
+has stopped the motors by itself."""
 
 IDENTITY = b"!acsard-mcu "
-"""Begins the line with which an MCU of ours names itself when it has booted."""
+"""First bytes of the line with which an MCU with our firmware identifies itself after booting."""
 
 
 class McuSession:
-    """Follows one serial port."""
+    """The session with the MCU on one serial port, through openings, losses and silences."""
 
     def __init__(
         self,
@@ -58,7 +59,7 @@ class McuSession:
 
         Args:
             mcu: The table `[mcu]`.
-            rate_hz: Control rate.
+            rate_hz: Control rate, Hz.
             wheel_speed: The highest speed that a wheel can have, rad/s.
             longest_reply: The highest value that mcu.reply_period may have, s.
         """
@@ -68,7 +69,7 @@ class McuSession:
         self.statuses: list[tuple[int, BoardStatus]] = []
         """The status lines of the last `update`, each with its monotonic time of arrival, ns."""
         self.status = BoardStatus()
-        """The last value of each field of the status lines."""
+        """The last received value of each field of the status lines."""
         self.status_ns: int | None = None
         """Monotonic time of the last status line, None before the first one."""
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
@@ -82,12 +83,12 @@ class McuSession:
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
         self._rejected: dict[str, tuple[int, bytes]] = {}
-        """Lines rejected in this update by reason: their number and the last one."""
+        """Number of lines that this update rejected, and the last of them, by reason."""
         self.good_lines = 0
         self._heard_ns: int | None = None
         self.restarted = False
-        """True if the last `update` saw a new session with the MCU: the port was opened again, the
-        MCU has started again, or a long gap has ended."""
+        """True if the last `update` began a new session with the MCU: the port was opened again,
+        the MCU has restarted, or a long gap has ended."""
         self.events: list[Event] = []
         """Events of the last `update`, for the log."""
         self._starting_over = False
@@ -96,17 +97,18 @@ class McuSession:
         self._opened = 0
         self._blind, self._just_blind = Throttle(), False
         self._made: tuple[bytes, int] | None = None
-        """The line just made and its time, until its fate is known."""
+        """The last line that was made and its time (ns), until it is known whether the port wrote
+        it."""
         self._left_ns = 0
-        """When the last line left, or when the port was opened."""
+        """Monotonic time at which the port wrote the last line or was opened, ns."""
         self._held_up = False
-        """True if the last line made did not leave."""
+        """True if the port did not write the last line that was made."""
         self.blocked = False
-        """True if the port is open, but its driver has not taken a line for `BLOCKED_NS`."""
+        """True if the port is open, but its driver has not accepted a line for `BLOCKED_NS`."""
 
     @property
     def link(self) -> LinkState:
-        """Whether there is a link, and whether it may carry motion (`up`)."""
+        """The state of the link. The link may carry motion only if it is `up`."""
         return self._link.state
 
     def update(
@@ -118,15 +120,15 @@ class McuSession:
         unsent: bool = False,
         late_ns: int = 0,
     ) -> list[Feedback]:
-        """Take the port's state and bytes, and return the good lines in order.
+        """Process the state of the port and the received bytes, and return the good lines in order.
 
         Args:
             now: Both clocks at this step.
             port_open: Whether the port is open.
             opened: The number of openings of the port. Another number starts a new session.
             received: The bytes since the last update.
-            unsent: True if the last line did not leave.
-            late_ns: How much later than it was made the last line left, ns.
+            unsent: True if the port did not write the last line.
+            late_ns: The time from making the last line to writing it, ns.
         """
         self.restarted, self._starting_over, self.events = False, False, []
         if self.statuses:
@@ -156,8 +158,8 @@ class McuSession:
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
         """Return the line with these speeds, plain or checked, or None if no line is due.
 
-        While the MCU does not answer, and while the session asks for the checked link, every line
-        is a stop. The first stop goes at once, because the MCU may still obey the line before.
+        While the MCU does not answer, and while the session asks for the check, every line is a
+        stop. The first stop is due at once, because the MCU may still obey the previous line.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
@@ -175,7 +177,7 @@ class McuSession:
         return self.negotiation.seal(line, now_ns)
 
     def silent(self, now_ns: int) -> bool:
-        """Return whether no good line came for `quiet`, or none at all in this session."""
+        """Return whether no good line came for `quiet_ns`, or none at all in this session."""
         return self._link.silent(now_ns)
 
     def feedback_age_s(self, now_ns: int) -> float | None:
@@ -183,7 +185,10 @@ class McuSession:
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
     def words(self, port_trouble: str = "") -> str:
-        """Return a sentence about the link; `port_trouble` is the reason of a closed port."""
+        """Return a sentence about the link.
+
+        `port_trouble` is the reason why the port is closed, "" if there is none.
+        """
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
@@ -194,16 +199,19 @@ class McuSession:
 
     @property
     def note(self) -> str:
-        """The check in force, as an addition to a reason; "" with `link_check = "off"`."""
+        """Text about the present form of the lines, to append to a reason.
+
+        It is "" with `mcu.link_check = "off"`.
+        """
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
 
     # sessions
 
     def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
-        """Note whether the line just made has left, and when.
+        """Record whether the port wrote the last line, `late_ns` after it was made.
 
-        A line that did not leave uses up no throttle.
+        If the port did not write the line, the next one need not wait for the throttle.
         """
         made = self._made
         if made is None:
@@ -234,7 +242,10 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        """Start over with an MCU that has started again: its motors stand still now."""
+        """Start a new session, because the MCU has restarted and its motors stand still.
+
+        `how` describes the restart for the event.
+        """
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.sign("restarted")
@@ -248,11 +259,12 @@ class McuSession:
         if not self._held_up:
             self.blocked = False
         elif now_ns - self._left_ns > BLOCKED_NS and not self.lateness.step_s:
-            # A step that comes late also finds an old line, but then the computer was late.
+            # In a late step, the last line is old too, but then this computer is the cause.
             self.blocked = True
         if self.blocked:
             link.sign("blocked")
-        # The link is never up in the update that saw a restart: the arbiter must see it lost first.
+        # The link does not come up in the update that detected a restart, because the arbiter must
+        # see a lost link first.
         link.judge(now_ns, may_rise=not self._starting_over)
         up = link.state == "up"
         quiet = not up and link.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
@@ -266,13 +278,13 @@ class McuSession:
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
-        """Count lines that were not taken; `line` is the last of them."""
+        """Count `more` rejected lines. `line` is the last of them, b"" if it is unknown."""
         self.rejects[reason] += more
         before, _ = self._rejected.get(reason, (0, b""))
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        """Add one event per reason. One per line would cost a period for a read full of junk."""
+        """Add one event per reason. After a read of noise, one per line would take a period."""
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""
             self.events.append(
@@ -281,7 +293,7 @@ class McuSession:
         self._rejected.clear()
 
     def _bad(self) -> None:
-        """Note a bad line. After several in a row the session asks for the check again."""
+        """Count a bad line. After several in a row, a checked link asks for the check again."""
         if self._link.bad() and self.negotiation.checked:
             self._link.sign("damaged")
             self.negotiation.begin()
@@ -306,12 +318,12 @@ class McuSession:
     # lines
 
     def _read(self, piece: Received) -> list[Feedback]:
-        """Return the good lines of one read, and show each line to the timeline."""
+        """Return the good lines of one read, and pass each line to the timeline."""
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, came = self._link, piece.data
         statuses = [line for line, _ in lines if line.startswith(STATUS)]
         if statuses:
-            # A status line is no reply, so it says nothing about the times and the link.
+            # A status line is not a reply, so it is not used for the sample times and the link.
             lines = [each for each in lines if not each[0].startswith(STATUS)]
             self._take_statuses(statuses, piece.at.mono_ns)
             came = b"\n".join([line for line, _ in lines])
@@ -381,11 +393,15 @@ class McuSession:
         size: tuple[int, int],
         asked_ns: int | None,
     ) -> Feedback:
-        """Return the feedback of a good line; `size` is the bytes behind it, then its own."""
+        """Return the feedback of a good line.
+
+        `size` is the number of bytes in the read after the line, and the number of bytes of the
+        line with its line end.
+        """
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:
-            self.restarted = True  # even if the board or the port has already restarted
+            self.restarted = True  # also if an earlier update has reported a restart
         since_ns = self._link.good(read_at.mono_ns)
         silent = since_ns is None or since_ns > self.quiet_ns
         feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)

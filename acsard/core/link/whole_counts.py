@@ -1,22 +1,24 @@
 """Recovers whole encoder counts from the speeds of a plain line, if the counts per turn are known.
 
-A firmware that divides counts by time reports n a / T for a wheel that made n counts of the angle a
-in T s. The time T since its sample before is the same for all four wheels, but the host knows it
-only to a few ms. With a coarse encoder that error turns the robot: one count of 16 a turn is 0.4
-rad of the wheel, and 30 % of T is 30 % of that. A count, however, is a whole number:
+Let a be the angle of one count, and T the time in s since the previous sample. For a wheel that
+made n counts, firmware that divides counts by time reports the speed n a / T. T is the same for all
+four wheels, but the host knows it only to a few ms. With a coarse encoder that error falsifies the
+heading: at 16 counts a turn, one count is 0.4 rad of the wheel, and an error of 30 % in T is an
+error of 30 % of that angle. However, n is a whole number:
 
-1. Each number n of counts of the fastest wheel means a time T = n a / speed. The candidates are
-   tried from the one nearest to the host's estimate of T.
-2. The first candidate that makes the counts of the other wheels whole as well is right.
-3. The error of the host's time is carried to the next line: a sample that was later than the host
-   believed leaves less time until the next one. A wrong candidate is thereby made good.
+1. Each candidate n for the fastest wheel implies a time T = n a / speed. The search starts at the n
+   whose T is nearest to the host's estimate.
+2. The first n that makes the counts of the other wheels whole too is accepted.
+3. The error of the host's time is carried to the next line: if a sample was later than the host
+   believed, less time is left until the next sample. The carried time also corrects a wrong n.
 
-If the host's time shows the number of counts too badly, as with fine encoders, the line is its
-speed times its time. That time includes the part that the lines before have left over, so that no
-time is lost and none counts twice.
+With fine encoders, the host's time is too inaccurate to find n. Then the angle of each wheel is its
+speed times the host's time. That time includes the time carried from earlier lines, so no time is
+lost or counted twice.
 
-The speeds of a firmware that filters, or that measures the time between two edges, are not whole
-counts. Such lines are noticed by their other wheels, and the caller then uses speed times time.
+Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
+whole counts. The module detects this because the counts of the other wheels are not whole. The
+caller then uses speed times time.
 """
 
 from __future__ import annotations
@@ -26,65 +28,77 @@ import math
 from acsard.core.link.codec import Motors
 
 ROUNDING = 0.0052
-"""Largest rounding error of a speed in two decimals, rad/s."""
+"""Largest rounding error of a speed with two decimals, rad/s."""
 
 MOST_TRIES = 16
-"""Candidates that are tried at most, which bounds the time of a control step."""
+"""Largest number of candidates n that are tried, which bounds the time of a control step."""
 
 BY_CHANCE = 0.05
-"""Largest probability that speeds at random fit one of the candidates."""
+"""Largest accepted probability that random speeds fit one of the candidates n tried so far.
+
+Above it, a fit proves nothing.
+"""
 
 EXACT = 0.3
-"""Counts by which the host's time may differ from that of fine encoders' whole counts."""
+"""Largest accepted difference, in counts, between n and the host's time, if a fit proves nothing.
+
+This is the case with fine encoders.
+"""
 
 WIDE, WIDE_S = 0.6, 0.005
-"""Largest difference between the firmware's time and the host's: a share of it, plus s."""
+"""Largest difference between the firmware's time and the host's.
+
+It is `WIDE` times the host's time, plus `WIDE_S` seconds.
+"""
 
 KEPT = 0.95
-"""Largest share of the host's time error that is carried to the next line. Two clocks that differ
-by 0.5 % would otherwise drift apart for ever."""
+"""Largest share of the host's time error that is carried to the next line. With a share of 1, the
+carried error of two clocks that differ by 0.5 % would grow for ever."""
 
 REPEATED = 0.65
-"""Share of the firmware's last time. A line with the same speeds after less time repeats the line
-before: firmware that is asked again too soon has no new counts."""
+"""Share of the firmware's last T. After less time, a line with unchanged speeds may repeat the
+previous line: firmware that is asked again too soon has no new counts."""
 
 SOON, OFF = 0.45, 0.25
-"""Share of the firmware's last time below which such a line is a repetition in any case. Above it,
-its time must also differ by so many counts from that of whole counts."""
+"""Limits for a line with unchanged speeds. After less than `SOON` times the firmware's last T, it
+is always a repetition. Between `SOON` and `REPEATED` times the last T, it is a repetition only if
+it shows no whole counts, or if the host's time differs from that of whole counts by more than `OFF`
+counts."""
 
 UNSURE, SLOW = 0.2, 0.025
-"""Mean error of the host's time, in counts of the fastest wheel, above which the nearest number of
-counts is often wrong (at random it is 0.25), and the gain of its filter. It is as large for 96
-counts behind a USB adapter that batches lines for 16 ms."""
+"""`UNSURE` is a mean error of the host's time, in counts of the fastest wheel. Above it, the
+nearest n is often wrong. A random time has a mean error of 0.25. An encoder with 96 counts a turn
+reaches `UNSURE` behind a USB adapter that batches lines for 16 ms. `SLOW` is the gain of the filter
+for this error."""
 
 GAIN, DOUBTFUL = 0.1, 0.3
-"""Gain of the filter for the share of lines that are not whole counts, and the share from which on
-no line is believed to be."""
+"""`GAIN` is the gain of the filter for the share of lines that are not whole counts. From the share
+`DOUBTFUL` on, no line is treated as whole counts."""
 
 
 class WholeCounts:
-    """Whole counts of four wheels, line by line."""
+    """The recovery of the whole counts of four wheels, line by line."""
 
     def __init__(self, counts: int) -> None:
-        """Start; `counts` are the encoder counts per wheel turn, 0 if unknown."""
+        """Start. `counts` is the number of encoder counts per wheel turn, 0 if unknown."""
         self.angle = math.tau / counts if counts else 0.0
         """Angle of one count, rad, 0 if unknown."""
         self.forget()
 
     def forget(self) -> None:
-        """Start over: the board may be another one."""
+        """Forget all earlier lines, because they may be those of another board."""
         self._apart = self._period = 0.0
-        """By how much the last sample was earlier than the host believed, and the firmware's last
-        time, s."""
+        """`_apart` is how much earlier the last sample was than the host believed, s. `_period` is
+        the firmware's last T, s."""
         self._run = 0
-        """Number of lines with counts since the last one without."""
+        """Number of lines with recovered counts since the last line without them."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self._doubt = self._unsure = 0.0
-        """Filtered share of the lines that are not whole counts, and filtered error of the host's
-        time, in counts."""
+        """`_doubt` is the filtered share of the lines that are not whole counts. `_unsure` is the
+        filtered error of the host's time, in counts."""
 
     def pause(self) -> None:
-        """Note a line by which the time of its sample remains as unknown as the host's time."""
+        """Reset the carried time, because a line does not show the firmware's T."""
         self._apart, self._run = 0.0, 0
 
     @property
@@ -93,15 +107,19 @@ class WholeCounts:
         return self.angle > 0.0 and self._doubt < DOUBTFUL
 
     def turned(self, speeds: Motors, own: float) -> Motors | None:
-        """Return how far each wheel turned in the `own` s of this line, rad.
+        """Return the angle by which each wheel turned since the previous line, rad.
 
-        Return None if the firmware does not report whole counts, or too slow a speed.
+        Return None if the firmware does not report whole counts, or if all speeds are too low.
+
+        Args:
+            speeds: The speeds in the line, rad/s.
+            own: The host's estimate of the time since the previous line, s.
         """
         before, self._before = self._before, speeds
         a, b, c, d = speeds
         fastest = max(a, b, c, d, -a, -b, -c, -d)
         if fastest <= ROUNDING:
-            # The firmware's time stays unknown, so the host's is as good as it gets.
+            # The line does not show the firmware's time, so the host's time is the best available.
             self.pause()
             return speeds if fastest == 0.0 else None
         want = own + self._apart
@@ -128,16 +146,17 @@ class WholeCounts:
             off = abs(want - period) * fastest / self.angle
             self._unsure += SLOW * (off - self._unsure)
         if not number or (shown is None and self._unsure > UNSURE):
-            # Speed times time, with the time that the lines before have left over.
+            # Speed times time. The time includes the time carried from earlier lines.
             self.pause()
             self._period = want
             return a * want, b * want, c * want, d * want
-        # The first time is between two samples of which the host knows neither better.
+        # After the first line, the error comes from two sample times in equal parts, so only half
+        # of it is carried. With each further line the share grows.
         self._run += 1
         kept = min(KEPT, self._run / (self._run + 1))
         self._period, self._apart = period, kept * (want - period)
         if abs(want - period) <= period * ROUNDING / fastest:
-            self._apart = 0.0  # nothing but the rounding of the speeds
+            self._apart = 0.0  # the rounding of the speeds explains the difference
         size, count = self.angle, period / self.angle
         return (
             round(a * count) * size,
@@ -147,10 +166,15 @@ class WholeCounts:
         )
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
-        """Return the counts of the fastest wheel, 0 if the line does not show them.
+        """Return n, the counts of the fastest wheel, or 0 if the line does not show n.
 
-        Also return whether the speeds prove that they are whole counts, or that they are not. None
-        means that they prove nothing.
+        The second value is True if the speeds prove that they are whole counts, False if they prove
+        the opposite, and None if they prove nothing.
+
+        Args:
+            speeds: The speeds in the line, rad/s.
+            fastest: The largest absolute value of the speeds, rad/s.
+            want: The host's estimate of T, with the carried time, s.
         """
         count = fastest / self.angle
         exact = want * count  # counts if the host's time were right
@@ -162,7 +186,8 @@ class WholeCounts:
         shares -= {0.0, 1.0}
         if not shares:
             return number, None
-        # A share s of n counts is off by (1 + s) n times the rounding error of the fastest speed.
+        # A wheel with the share s of the fastest speed makes s n counts. The computed s n is wrong
+        # by up to (1 + s) n times the relative rounding error of the fastest speed.
         error = ROUNDING / fastest
         step, chance = 1 if exact > number else -1, 0.0
         for _ in range(MOST_TRIES):
@@ -180,7 +205,8 @@ class WholeCounts:
                         fits = False
                         break
                 if chance > BY_CHANCE:
-                    # The host's time agrees with the counts if the firmware divides by a round one.
+                    # The speeds prove nothing. If the firmware divides by a round period, then the
+                    # host's time alone agrees with the counts.
                     return (number if fits and abs(number - exact) <= EXACT else 0), None
                 if fits:
                     return number, True

@@ -1,12 +1,12 @@
 """Encodes msgspec structs as CDR, the encoding of ROS 2, and decodes them.
 
-The codec is derived from the type of the struct. It writes plain CDR (XCDR1), little endian, behind
-the encapsulation header of 4 bytes. Alignment counts from the byte after the header. It reads both
-byte orders.
+The codec is derived from the type of the struct. It writes plain CDR (XCDR1), little endian, after
+the encapsulation header of 4 bytes. It reads both byte orders. Numbers are aligned relative to the
+byte after the header.
 
-Each type is compiled once to a list of parts. Neighbouring numbers are one part, which a single
-call packs, so a message needs a few calls instead of one for each field. `cdr_types.py` reads the
-types.
+The codec of each type is compiled once to a list of parts. Neighbouring numbers form one part that
+a single call packs. So a message needs a few calls and not one for each field. `cdr_types.py` reads
+the types.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class _Source:
         count = self.count(1)
         raw = self.data[self.at : self.at + count]
         self.at += count
-        # Some writers encode an empty string without any byte, not even the final zero.
+        # Some writers encode an empty string as length 0, without the final zero byte.
         if raw[-1:] not in (b"\0", b""):
             raise CdrError("a string without its end")
         try:
@@ -130,7 +130,13 @@ def _whole(code: str, value: Any) -> Any:
 
 @cache
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
-    """Return the layout of numbers that begin at `start` (mod 8), each aligned to its size."""
+    """Return the layout of numbers, each aligned to its size.
+
+    Args:
+        order: the byte order, "<" or ">".
+        codes: the code of each number in the struct module.
+        start: the position of the first number modulo 8.
+    """
     text, at = order, start
     for code in codes:
         pad = -at % SIZES[code]
@@ -205,7 +211,7 @@ class _Text:
 
 
 class _List:
-    """A part: a sequence of at most `most` items, or if `fixed` an array of `most` items."""
+    """A part: a sequence of at most `most` items, or an array of `most` items if `fixed`."""
 
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
         self._get, self._most = get, most

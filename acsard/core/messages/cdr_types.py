@@ -1,8 +1,8 @@
-"""Reads from a struct type the fields in the order of CDR, and a function that builds an instance.
+"""Reads the type of a struct: its fields in the order of CDR, and how to build an instance.
 
 A number declares its width with `Meta(extra={"cdr": code})`, where the code is one of the struct
-module (`B i I q Q`, and `f` for a float32). Without it a `float` is a float64. Null stands for NaN
-in a `float | None`. A list whose `Meta` fixes its length is an array.
+module (`B i I q Q`, and `f` for a float32). A `float` without a code is a float64. In a field of
+type `float | None`, CDR has NaN for None. A list whose `Meta` fixes its length is an array.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _is_float(kind: inspect.Type) -> bool:
 
 
 def nullable(kind: inspect.Type) -> bool:
-    """Return whether a number may be null, for which CDR has NaN."""
+    """Return whether a number may be None, which CDR encodes as NaN."""
     return isinstance(plain(kind), inspect.UnionType)
 
 

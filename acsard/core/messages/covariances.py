@@ -15,7 +15,7 @@ SMALLEST, LARGEST = 1e-6, 1e6
 """Smallest and largest variance of an axis that is not measured, m2 or rad2."""
 
 UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
-"""Covariance of a twist of which no axis is measured."""
+"""Covariance of a twist that is not measured on any axis, m2/s2 and rad2/s2."""
 
 
 class Covariances:

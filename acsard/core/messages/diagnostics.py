@@ -3,12 +3,12 @@
 The levels have these meanings:
 
 - OK: the robot needs no attention.
-- WARN: a person should know about it.
-- ERROR: it keeps the robot from driving.
+- WARN: there is a condition that a person should know about.
+- ERROR: there is a condition that keeps the robot from driving.
 
 As long as the daemon runs, each message has the same rows. If a row were missing from a message,
-rqt_robot_monitor would show the row as stale. The rows of the board and of its battery appear with
-the first status line that has something for them, and stay.
+rqt_robot_monitor would show the row as stale. The rows of the board and of its battery appear when
+the board first reports a value for them, and then they stay.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ OF_LEVEL = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown":
 """Level of the row for each level of the battery."""
 
 REFUSED_S = 2.0
-"""Time for which a refused command is shown, s. These are two messages at the default rate."""
+"""Time for which a refused command is shown, s: two messages at the default rate of 1 Hz."""
 
 MISSED_SHARE = 0.01
 """Fraction of the control periods of the last minute that may be missed without a warning."""
@@ -171,7 +171,7 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """Return the row that says whether front and rear wheels agree and are as fast as expected."""
+    """Return the row of the wheels: do front and rear agree, and are they as fast as expected?"""
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
@@ -247,7 +247,7 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
-    """Return the row of the endpoints in `bus.connect`, or nothing if it names none."""
+    """Return a list with one row for the endpoints in `bus.connect`, empty without endpoints."""
     missing, peers = routers.missing, routers.peers
     values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
     values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)

@@ -19,7 +19,8 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 
     Args:
         ends: the end of each certificate that TLS needs, wall-clock ns since 1970, by the name of
-            its owner. The name of the robot's own is "". It is empty if the ends are unknown.
+            its owner. The robot's own certificate has the name "". The mapping is empty if no end
+            is known.
         now_ns: the present time, wall-clock ns since 1970.
     """
     if not ends:
@@ -41,7 +42,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 def first(ends: Mapping[str, int]) -> tuple[str, int]:
     """Return the owner and the end of the certificate that ends first.
 
-    Of two that end together the named one counts, because the ends of a TLS gateway's certificates
-    arrive as one number without a name.
+    If two certificates end at the same time, the one with a name is returned. The reason is that
+    the TLS gateway reports the ends of all its certificates as one number without a name.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

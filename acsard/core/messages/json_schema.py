@@ -38,7 +38,7 @@ ENOUGH: dict[type, list[str]] = {
     Imu: ["angular_velocity"],
     SpeedLimit: ["speed_limit"],
 }
-"""Required fields of the received types that do not require all fields without a default."""
+"""Required fields of some received types. Other types require each field without a default."""
 
 Schema = dict[str, Any]
 

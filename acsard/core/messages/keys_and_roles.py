@@ -1,4 +1,4 @@
-"""The table of all keys below `acsard/<id>/`: direction, type, rate, meaning, and the least roles.
+"""The table of all keys below `acsard/<id>/`: direction, type, rate, meaning and required roles.
 
 A key that is not in the table does not exist. The bus declares its keys from this table, `acsard
 topics` and the README list it, and the query `topics` answers with it. `permissions.py` derives the
@@ -25,8 +25,8 @@ Direction = Literal["out", "in", "query", "service"]
 
 - out: the daemon publishes on it.
 - in: clients put on it.
-- query: the daemon answers queries for it, also those with a wildcard.
-- service: the daemon acts on a query for it, but only on one with this exact key.
+- query: the daemon answers queries for it, also queries with a wildcard.
+- service: a query for it calls a service. The query must name the exact key.
 """
 
 
@@ -111,7 +111,7 @@ SERVICES: dict[Verb, Service] = {
         '{"settings": {"limits.linear_speed": 0.8}}',
     ),
 }
-"""Every service. What each interface needs of a service comes from its row."""
+"""All services by verb. Each interface takes its facts about a service from this table."""
 
 PLAIN_SERVICES = tuple(
     verb for verb, service in SERVICES.items() if service.optional or not service.payload
@@ -119,7 +119,7 @@ PLAIN_SERVICES = tuple(
 """The services that can be called without a payload."""
 
 IMU = "imu"
-"""Key of the gyro's samples. The simulator publishes the samples of its gyro on the same key."""
+"""Key on which a gyro's samples arrive. The simulator publishes those of its own gyro on it."""
 
 SPEED_LIMIT = "speed_limit"
 """Key on which a speed filter lowers the robot's highest speed."""
@@ -128,10 +128,10 @@ DESCRIPTION = "robot_description"
 """Key of the robot's URDF."""
 
 WHOAMI = "whoami/<role>"
-"""One key for each role.
+"""Pattern of the keys with which a client finds out its role. There is one key for each role.
 
-Zenoh's access rules let a client query only the keys of its own role and of lower roles, so an
-answer proves the role.
+Zenoh's access rules let a client query only the keys of its own role and of lower roles. So an
+answer on a key proves that the client has at least this role.
 """
 
 
@@ -167,7 +167,10 @@ def _out(
     simulated: bool = False,
     urdf: bool = False,
 ) -> Topic:
-    """Return the row of a published key, which every client may follow and query."""
+    """Return the row of a key on which the daemon publishes messages of the type `kind`.
+
+    Every client may subscribe to the key and query it. The other arguments are those of `Topic`.
+    """
     return Topic(
         key, "out", kind, rate, note,
         subscribe="viewer", query="viewer", latched=latched, simulated=simulated, urdf=urdf,
@@ -209,8 +212,8 @@ TOPICS: tuple[Topic, ...] = (
     _command("wheel_cmd/<source>", "JointState", "four wheel speeds of a source", local=True),
     _command("cmd/<source>/<certificate>", "Twist or TwistStamped", "cmd/<source> over TLS"),
     _command("wheel_cmd/<source>/<certificate>", "JointState", "wheel_cmd/<source> over TLS"),
-    # A gyro changes the pose, as set_pose does, so it needs the same role. Clients follow and query
-    # the gyro of the simulator.
+    # A gyro changes the pose, as set_pose does, so it needs the same role. Clients may subscribe to
+    # the gyro of the simulator and query it.
     Topic(
         IMU, "in", "Imu", "any", "turn rate from a gyro, with [odometry] gyro",
         publish="maintainer", subscribe="viewer", query="viewer", gyro=True,
@@ -241,10 +244,10 @@ TOPICS: tuple[Topic, ...] = (
 FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
-"""The rows of messages that clients follow: the published ones and the gyro of the simulator."""
+"""The rows of keys that clients can follow: the published keys and the simulator's gyro."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The rows of messages that the daemon publishes. It also answers queries with the last message."""
+"""The rows of keys on which the daemon publishes. To a query it replies with the last message."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
@@ -278,10 +281,9 @@ COMMANDS = ("cmd", "wheel_cmd")
 
 
 def command_key(kind: str, source: str, certificate: str = "") -> str:
-    """Return the key on which a sender commands as a source.
+    """Return the key on which a sender puts commands as a source.
 
-    Over TLS each certificate has its own key, and the access rules let no other certificate put on
-    this key.
+    Over TLS each certificate has its own key. The access rules let no other certificate put on it.
 
     Args:
         kind: "cmd" or "wheel_cmd".
@@ -293,9 +295,9 @@ def command_key(kind: str, source: str, certificate: str = "") -> str:
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """Return the keys on which senders command as these sources.
+    """Return the keys, below the robot's id, of all kinds of commands for these sources.
 
-    `certificate` is as in `command_key`, or "*" for all certificates.
+    `certificate` is as in `command_key`, or "*" for the keys of all certificates.
     """
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]

@@ -1,4 +1,4 @@
-"""Derives the permissions of each role from the table of keys in `topics.py`.
+"""Derives the permissions of each role from the table of keys in `keys_and_roles.py`.
 
 These functions make the access rules of the daemon and of the TLS gateway, the rules of a fleet's
 router, the permissions of the page, and the tables of roles in the documentation.
@@ -23,26 +23,26 @@ MAY: dict[Role, str] = {
     "operator": "it may drive by the listed sources, stop and clear",
     "maintainer": "it has every permission",
 }
-"""The permissions of each role in words, for the message of a tool that was refused."""
+"""The permissions of each role in words, for the error message of a tool without permission."""
 
 
 def has(role: str, least: Role) -> bool:
-    """Return whether a role has the permissions of `least`. "" is a client without a role."""
+    """Return whether `role` includes the role `least`. A client without a role has the role ""."""
     return role in ROLES and ROLES.index(role) >= ROLES.index(least)
 
 
 def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
-    """Return the keys of these rows that `role` may use in this way and lower roles may not.
+    """Return the keys of `rows` for which `role` is the least role that has the permission `use`.
 
     Keys of commands are left out, because they contain names of the configuration. `source_keys`
-    makes these keys, and `COMMAND_ROLE` is their least role.
+    returns these keys, and `COMMAND_ROLE` is their least role.
     """
     exact = (pair for row in rows if not row.local for pair in _exact(row, use))
     return [key for key, least in exact if least == role and "<" not in key]
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield each key that a row stands for, with the least role that may use it in this way."""
+    """Yield each key that a row stands for, with the least role that has the permission `use`."""
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":
         yield from ((row.key.replace("<role>", role), role) for role in ROLES)
@@ -56,11 +56,11 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 
 
 def least_role(key: str) -> Role:
-    """Return the least role that may use `key`, the part of the full key behind the robot's id.
+    """Return the least role that may use `key`, the part of the full key after the robot's id.
 
-    To use means to put on a key for commands, to query a key that answers, and to follow any other
-    key. An unknown key gets the lowest role. This function gives no permission: it only names the
-    role in the hint for a client that has received nothing.
+    To use a key means to put on it if the daemon receives on it, to query it if the daemon answers,
+    and otherwise to subscribe to it. An unknown key gets the lowest role. This function does not
+    grant permissions: its result is for the hint to a client that has received nothing.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

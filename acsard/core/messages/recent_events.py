@@ -2,7 +2,7 @@
 
 An event that repeats is one row with a count. If each repetition had its own row, a computer that
 misses a control period every second would push a fault out of the twenty rows within 20 s. An event
-whose `news` is true always gets its own row. The log has a line for each event.
+whose `news` is true always gets its own row. The log, in contrast, has a line for each of them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from acsard.core.motion.event_throttle import together
 from acsard.core.values import NS_PER_S, Event, Instant
 
 LAST = 20
-"""Number of rows. A reader that polls slowly usually misses no event with this many rows."""
+"""Number of rows. So many rows are kept that a client that polls slowly seldom misses an event."""
 
 PAUSE_NS = 60 * NS_PER_S
 """Time without a repetition after which an event of the same name gets a new row."""
@@ -36,7 +36,7 @@ class RecentEvents:
         self._total = 0
 
     def add(self, events: Iterable[Event], now: Instant) -> None:
-        """Add events of a step that took place at `now`."""
+        """Add the events of a step, whose time is `now`."""
         for event in events:
             self._total += 1
             same = None if event.news else self._same(event, now)

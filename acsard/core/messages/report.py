@@ -1,6 +1,7 @@
 """Builds the messages that are due after a step, and the present value of any published key.
 
-Only messages with a subscriber are built. All messages of one feedback line carry its stamp.
+A message is built only if its key has a subscriber. All messages that come from the same feedback
+line have the stamp of that line.
 """
 
 from __future__ import annotations
@@ -87,14 +88,14 @@ class Report:
         self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
     ) -> None:
         self.certificate_ends = dict(certificate_ends or {})
-        """Ends of the TLS certificates, as `expiry` takes them.
+        """End of each TLS certificate, in the form of the argument `ends` of `expiry`.
 
-        The TLS gateway reports the robot's own if the daemon may not read it.
+        If the daemon may not read the robot's own certificate, the TLS gateway reports its end.
         """
         self.settings_differ = ""
-        """How the settings in force differ from the configuration file, in words; else empty."""
+        """How the settings in force differ from the configuration file, in words; "" if equal."""
         self.speed_limit = ""
-        """The speed limit that lowers a setting, in words; else empty."""
+        """The speed limit that lowers a setting, in words; "" if none does."""
         self.description = ""
         """The robot's URDF; "" without a file in `[ros] urdf`."""
         self._names = list(config.joints.as_tuple())
@@ -114,14 +115,15 @@ class Report:
     def due(
         self, outputs: Outputs, wanted: Collection[str], look: Look
     ) -> Iterator[tuple[str, Message]]:
-        """Yield the pairs of key and message to publish after this step.
+        """Return an iterator over the pairs of key and message to publish after this step.
 
-        The messages of feedback come first, because `state` takes as long to build as ten others.
+        The messages of feedback come first, because `state` takes ten times as long to build.
 
         Args:
             outputs: the outputs of the step.
             wanted: the keys that have a subscriber.
-            look: returns the state of the robot; called only if a message needs it.
+            look: a function that returns the state of the robot. It is called only if a message
+                needs the state.
         """
         self._outputs = outputs
         if outputs.events:
@@ -137,7 +139,7 @@ class Report:
             or (outputs.events and "events" in wanted)
         ):
             return self._due(outputs, wanted, look)
-        # Most steps end here, because nothing is due that a client follows.
+        # Most steps end here, because no message with a subscriber is due.
         return iter(())
 
     def _due(
@@ -169,7 +171,10 @@ class Report:
                     yield key, message
 
     def current(self, key: str, look: Look) -> Message | None:
-        """Return the present value of a published key, or None if it has no value yet."""
+        """Return the present value of a published key, or None if it has no value yet.
+
+        `look` returns the state of the robot. It is called only if the message needs the state.
+        """
         estimate, outputs = self._estimate, self._outputs
         match key:
             case "tf_static":
@@ -196,7 +201,7 @@ class Report:
                 return None
 
     def tf_static(self) -> TFMessage:
-        """Return all static transforms in one message, without those that are switched off."""
+        """Return one message with all static transforms that the configuration switches on."""
         base = Header(Time.from_ns(self._start.wall_ns), self._config.odometry.base_frame)
         lidar, footprint = self._config.lidar, self._config.footprint
         transforms = []
@@ -216,10 +221,10 @@ class Report:
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Return the message with the stamp of its sample.
+        """Return the odometry message of an estimate.
 
-        `live` is false if feedback has stopped since. The twist is then zero, and its covariance
-        says that it is not measured.
+        `live` is false if the feedback has stopped since the estimate. The twist is then zero, and
+        its covariance is `UNKNOWN`.
         """
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
@@ -296,7 +301,10 @@ class Report:
         return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """Return the message with the stamp of the last report, None if the board has none."""
+        """Return the battery message, or None if the board has never reported a battery.
+
+        Its stamp is the time of the board's last report.
+        """
         battery, now = snapshot.battery, outputs.now
         if battery is None:
             return None

@@ -39,7 +39,7 @@ LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
-"""Bound of a list, so that a very long list is refused quickly. No robot has as many joints."""
+"""Maximum length of a list. A longer one is refused quickly, and no robot has as many joints."""
 
 
 def one_of(values: Iterable[object]) -> Meta:
@@ -168,7 +168,10 @@ class TFMessage(Message, frozen=True):
 
 
 class JointState(Message, frozen=True):
-    """State of the joints: `position` rad (not wrapped), `velocity` rad/s, `effort` (unused)."""
+    """State of the wheel joints, or a command for them.
+
+    `position` is in rad and not wrapped, `velocity` is in rad/s, and `effort` is not used.
+    """
 
     header: Header = Header()
     name: Annotated[list[str], FEW] = []
@@ -193,11 +196,11 @@ class Imu(Message, frozen=True):
 
 
 class SpeedLimit(Message, frozen=True):
-    """A highest speed below that of the settings, as nav2_msgs/SpeedLimit; 0.0 is no limit."""
+    """A limit on the speed below the configured one, as nav2_msgs/SpeedLimit; 0.0 lifts it."""
 
     header: Header
     percentage: bool
-    """Whether `speed_limit` is in % of the configured `limits.linear_speed`, and not in m/s."""
+    """True if `speed_limit` is in % of the configured `limits.linear_speed`, false if in m/s."""
     speed_limit: float
 
 
@@ -209,21 +212,21 @@ class Battery(Message, frozen=True):
 
     header: Header
     voltage: Float32 | None = None
-    """V."""
+    """Voltage, V."""
     temperature: Float32 | None = None
     """Temperature of the battery, degrees Celsius. The daemon never measures it."""
     current: Float32 | None = None
-    """A. It is negative while the battery discharges."""
+    """Current, A. It is negative while the battery discharges."""
     charge: Float32 | None = None
-    """Ah. The daemon never measures it."""
+    """Charge, Ah. The daemon never measures it."""
     capacity: Float32 | None = None
-    """Ah. The daemon never measures it."""
+    """Capacity, Ah. The daemon never measures it."""
     design_capacity: Float32 | None = None
-    """Ah. The daemon does not know it."""
+    """Capacity by design, Ah. The daemon does not know it."""
     percentage: Float32 | None = None
     """State of charge, 0 to 1."""
     power_supply_status: Annotated[Byte, one_of(range(5))] = 0
-    """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full. It follows from `current`."""
+    """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full, as derived from `current`."""
     power_supply_health: Annotated[Byte, one_of(range(9))] = 0
     """Always 0, unknown."""
     power_supply_technology: Annotated[Byte, one_of(range(9))] = 0
@@ -231,9 +234,9 @@ class Battery(Message, frozen=True):
     present: bool = False
     """Whether the board reports a battery at present."""
     cell_voltage: Annotated[list[Float32], FEW] = []
-    """V of each cell; always empty."""
+    """Voltage of each cell, V. The list is always empty."""
     cell_temperature: Annotated[list[Float32], FEW] = []
-    """Degrees Celsius of each cell; always empty."""
+    """Temperature of each cell, degrees Celsius. The list is always empty."""
     location: str = ""
     serial_number: str = ""
 
@@ -245,12 +248,12 @@ class BatterySummary(Message, frozen=True):
     percent: float | None
     """State of charge, 0 to 100."""
     amps: float | None
-    """It is negative while the battery discharges."""
+    """Current, A. It is negative while the battery discharges."""
     level: Annotated[str, one_of(get_args(BatteryLevel))]
     """Level by the thresholds in `[battery]`; `ok` if none is set.
 
-    `unknown` means that the board no longer reports the battery, or not the measure of the
-    thresholds.
+    `unknown` means that the board no longer reports the battery, or not the quantity (V or %) of
+    the thresholds.
     """
 
 
@@ -262,7 +265,7 @@ class SourceState(Message, frozen=True):
     age: float | None
     """Seconds since the last accepted command of the source; null before the first one."""
     waits_for: str
-    """The condition under which the source will drive, in words; empty if it drives."""
+    """The condition that the source waits for before it drives, in words; empty if it drives."""
 
 
 class Spread(Message, frozen=True):
@@ -307,12 +310,12 @@ class RobotState(Message, frozen=True):
     certificate_expiry: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS.
 
-    The words begin with "valid" while the certificate is valid for 30 days or longer.
+    The text begins with "valid" as long as the certificate is valid for 30 more days.
     """
     latencies: dict[str, Latency] = {}
-    """Durations of the control loop by the names in `daemon/latencies.py`, up to a second old."""
+    """Latencies of the daemon by the names in `daemon/latencies.py`, up to one second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
-    """Use of the gyro in odometry."""
+    """State of the gyro, which shows whether the odometry uses it."""
     encoder_counts: list[int] = []
     """Configured encoder counts per wheel turn, in the order of `wheels`.
 
@@ -333,12 +336,12 @@ class RobotState(Message, frozen=True):
     latch: LatchNumber = 0
     """Number of the latch that keeps the robot from driving; 0 without a latch.
 
-    If several latches are set, it is that of the fault, else that of the stop.
+    If several latches are set, it is the number of the fault, or of the stop if there is no fault.
     """
     latch_file_error: str = ""
     """Reason why a stop would not survive a restart, in words.
 
-    Empty if a stop survives, and in the simulator.
+    It is empty if a stop would survive, and with the built-in simulator.
     """
     feedback_age: float | None = None
     """Seconds since the last valid feedback line; null before the first one."""
@@ -358,18 +361,18 @@ class RobotState(Message, frozen=True):
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
-    If the daemon could not start again with that file, the text has the reason. The effect of a
-    speed limit is not among them.
+    If the daemon could not start again with that file, the text has the reason. A setting that a
+    speed limit lowers is not listed.
     """
     speed_limit: str = ""
-    """The limit of a SpeedLimit that lowers `limits.linear_speed`, with its sender, in words.
+    """The speed limit that lowers `limits.linear_speed` at present, with its sender, in words.
 
-    Empty if none lowers it.
+    It is empty if no speed limit lowers it.
     """
     certificate_days: float | None = None
-    """Days until the first of the certificates that TLS needs ends; negative after its end.
+    """Remaining days of the certificate that ends first, of those that TLS needs.
 
-    Null without TLS, and while its end is unknown.
+    The number is negative after the end. It is null without TLS, and while the end is unknown.
     """
 
 
@@ -384,7 +387,7 @@ class GatewayState(Message, frozen=True):
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
-    """Number of checks at which all connections were in use. There are four checks a second."""
+    """Number of checks that found all connections in use. There are four checks a second."""
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
 
@@ -429,9 +432,9 @@ class LogEvent(Message, frozen=True):
     by: str
     """Client that caused the event; empty if no client did."""
     count: int
-    """Number of occurrences since the previous event of this name.
+    """Number of occurrences that this row stands for.
 
-    If the event repeats without a pause of a minute, it is the number since the first occurrence.
+    Repetitions with pauses of less than a minute are counted in the same row.
     """
 
 
@@ -533,7 +536,7 @@ class WhoAmI(Message, frozen=True):
     """The caller of the query as the daemon sees it."""
 
     role: Annotated[str, one_of(ROLES)]
-    """A role that the caller has at least, according to the access rules."""
+    """The role in the queried key. The access rules show that the caller has at least this role."""
     sender: str
     """The caller's public name and its transport, as in the log."""
 

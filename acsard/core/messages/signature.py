@@ -35,7 +35,7 @@ Nobody can find a second id with the same 64 bits.
 MARKS = " @._-:/+"
 """Characters besides letters and digits that a public name may contain.
 
-The daemon's texts use none of them to separate a name from other words.
+The daemon's texts use other characters to separate a name from the words beside it.
 """
 
 

@@ -1,7 +1,8 @@
-"""Lists what is wrong with a robot although it may be `ready`, for every place that shows a robot.
+"""Lists the warnings about a robot, such as a low battery. A robot may have them while `ready`.
 
-Each of these ends a robot's work quietly, hours or weeks later: `fleet`, `top`, `echo --short`, the
-page and `/metrics` show them with the same words. Programs find the same facts in `state`.
+If nobody reacts to a warning, it may end the robot's work hours or weeks later. `fleet`, `top`,
+`echo --short`, the page and `/metrics` show the warnings with the same words. Programs find the
+same facts in `state`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ WHATS: tuple[What, ...] = get_args(What)
 """Every subject of a warning; the most urgent one is the first."""
 
 WARNING = "WARNING"
-"""Begins the warnings of a robot in a line of text."""
+"""The word in front of the warnings in a line of text."""
 
 ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop silent"}
 
@@ -33,7 +34,7 @@ BATTERY = {
     "stop": "battery empty",
     "unknown": "battery level unknown",
 }
-"""Words for each level of the battery but `ok`."""
+"""Words for each level of the battery except `ok`."""
 
 
 class StateWarning(Struct, frozen=True):
@@ -43,7 +44,7 @@ class StateWarning(Struct, frozen=True):
     brief: str
     """A few words, which a column of a table can hold."""
     text: str = ""
-    """The words of the robot; "" if `brief` has all of them."""
+    """The details that the robot reports; "" if `brief` already says everything."""
 
     def __str__(self) -> str:
         """Return all words in one line, printable."""
@@ -56,13 +57,19 @@ def warnings(state: RobotState) -> list[StateWarning]:
 
 
 def brief(found: Sequence[StateWarning]) -> str:
-    """Return these warnings in few words, printable, as `WARNING: recording fails`; "" for none."""
+    """Return the warnings as one short printable text, such as "WARNING: recording fails".
+
+    Returns "" if there are no warnings.
+    """
     words = ", ".join(printable(one.brief) for one in found)
     return f"{WARNING}: {words}" if words else ""
 
 
 def charge(battery: BatterySummary | None) -> str:
-    """Return the state of charge, else the voltage, of a battery; "" if neither is reported."""
+    """Return the state of charge of a battery as text, or its voltage if the charge is unknown.
+
+    Returns "" if neither is reported.
+    """
     if battery is None:
         return ""
     if battery.percent is not None:

@@ -5,10 +5,11 @@
 - A source that is not armed yet (`neutral.py`) holds its place with zero, so that no source of a
   lower priority drives past it.
 - A source that sends zeros holds the robot still for any length of time, because an operator who
-  wants that and a controller that has failed look the same. `state` and the log report it.
+  wants that and a controller that has failed look the same. `state` and the log report such a
+  source.
 
-Each refusal has a name under which it is counted, and `arbiter_text.py` has the sentences for
-people. `values.Command` explains source, sender and clock.
+`Objection` has a short name for each reason to refuse a command, and `arbiter_text.py` has the
+sentences for people. `values.Command` explains source, sender and clock.
 """
 
 from __future__ import annotations
@@ -24,19 +25,25 @@ from acsard.core.motion.neutral import Sender
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
-"""Senders remembered per source. A sender that is live and armed is never replaced."""
+"""Largest number of senders that one source remembers. A sender that is live and armed is never
+replaced."""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
-"""The reason to refuse a command, or "" if the command counts."""
+"""The reason to refuse a command, or "" if the arbiter accepts it."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""Durations, s, after which `state` reports that a sender still sends zeros or still waits."""
+"""Durations after which `state` reports that a sender still sends only zeros, or is still not
+armed, s."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
 
 class Choice(Struct, frozen=True):
-    """The twist to follow, or None if no sender may drive; `wait` then has the reason."""
+    """The choice of the arbiter in one step.
+
+    If a sender may drive, `twist` is the twist to follow, `arrived_ns` is its monotonic arrival,
+    and `source` and `sender` name its origin. Otherwise `twist` is None and `wait` is the reason.
+    """
 
     source: str = ""
     twist: Twist | None = None
@@ -46,7 +53,7 @@ class Choice(Struct, frozen=True):
 
 
 IDLE = Choice()
-"""The choice while no source sends and none is doubted."""
+"""The choice while no source is live and no stamps are refused."""
 
 
 class _Source:
@@ -59,7 +66,10 @@ class _Source:
         self.use(settings, pause)
 
     def use(self, settings: Source, pause: float) -> None:
-        """Apply this timeout and this pause from now on, also to the senders."""
+        """Apply the command timeout of `settings` from now on, also to the known senders.
+
+        `pause` is `commands.neutral_pause`, s.
+        """
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
@@ -68,9 +78,10 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Return a new sender of this name, or None if the table is full of senders that drive.
+        """Add a sender of this name and return it.
 
-        The new sender replaces the one of the lowest account if the table is full.
+        If the table is full, the new sender replaces the sender that `_account` ranks lowest.
+        Return None if all senders in the full table are live and armed.
         """
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
@@ -81,13 +92,21 @@ class _Source:
         return added
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Rank a sender: armed and live before armed, and then by its last message."""
+        """Return the rank of a sender, to compare it with other ones.
+
+        A sender that is armed and live ranks above one that is only armed, and that one above all
+        others. Among equals, the sender with the later last message ranks higher.
+        """
         sender = self.senders[name]
         armed = sender.armed(now_ns)
         return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """Forget the unproven zeros of a sender, or ask for a new one if its clock was set."""
+        """Disarm the sender `name` if it was armed by a zero whose stamp was never proven.
+
+        `was_set` means that the clock of the sender was set. The sender must then send a new zero
+        in any case.
+        """
         sender = self.senders.get(name)
         if sender is None:
             return
@@ -97,29 +116,36 @@ class _Source:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """Return the live senders: the armed ones first, each group in the order of arrival."""
+        """Return the live senders, armed ones first, and otherwise the earlier ones first."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live
         return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
 
     def latest_ns(self) -> int | None:
-        """Return when a command of any sender last counted, None if none ever did."""
+        """Return the arrival of the last command that counted, of any sender, ns.
+
+        Return None if no command has counted since `require_neutral`.
+        """
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
     def require_neutral(self) -> None:
-        """Ask every sender for a zero before it drives again."""
+        """Require a zero from every sender before it drives again."""
         for sender in self.senders.values():
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the wait of a sender that is not armed."""
+        """Return the wait of a sender that is not armed.
+
+        `lasts` is the time for which the sender has sent speeds, s, or 0.0 if that is not reported
+        yet.
+        """
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return the wait of a source whose stamps are refused, None if they are not."""
+        """Return why this source waits if the stamps of its senders are refused, otherwise None."""
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
@@ -145,7 +171,7 @@ class Arbiter:
         self._freshness = Freshness()
 
     def use(self, commands: CommandsConfig) -> None:
-        """Apply these timeouts and this pause from now on.
+        """Apply the timeouts and `neutral_pause` of `commands` from now on.
 
         The last commands, the arming and the clocks of all senders stay as they are. The names and
         priorities of the sources must be those that the arbiter was constructed with.
@@ -154,10 +180,10 @@ class Arbiter:
             self._sources[settings.name].use(settings, commands.neutral_pause)
 
     def require_neutral(self, since_ns: int = 0) -> None:
-        """Forget all commands and ask each sender for a zero before it drives again.
+        """Forget all commands, and require a zero from each sender before it drives again.
 
-        Only a zero that arrives at `since_ns` or later counts. A zero that was sent before the stop
-        was cleared does not say that its sender stands still now.
+        Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. A zero
+        that was sent before a stop was cleared does not show that its sender commands rest now.
         """
         self._since_ns = since_ns
         for source in self._ranking:
@@ -165,7 +191,7 @@ class Arbiter:
         self._holder = self._followed = None
 
     def accept(self, command: Command) -> Objection:
-        """Take a command and return "", or return the reason to refuse it."""
+        """Accept a command and return "", or return the reason to refuse it."""
         source = self._sources.get(command.source)
         if source is None:
             return "unknown_source"
@@ -189,9 +215,11 @@ class Arbiter:
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
-        """Note a message that could not be decoded: its sender is not silent.
+        """Record that a message arrived that could not be decoded or was lost.
 
-        `sender` is "" for messages that nobody has read.
+        The message may have been a speed, so an earlier zero of its sender does not arm it any
+        more. `sender` is "" if the sender is unknown. The message may then be from any sender of
+        `source`.
         """
         known = self._sources.get(source)
         if known is None:
@@ -219,7 +247,7 @@ class Arbiter:
                 and source.priority == first[0].priority
                 and kept.armed(now_ns)
             ):
-                # A sender that came before it may have become armed only now.
+                # A sender that came before `kept` may have become armed only now, but `kept` stays.
                 first = source, kept
                 break
         if first is None:
@@ -240,7 +268,11 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return the name of a sender of speeds that the holder's zeros keep waiting, or ""."""
+        """Return which other sender sends speeds in vain while the holder sends zeros.
+
+        That is the name of its source, or words for another sender of the holder; "" if there is
+        none.
+        """
         for source in self._ranking:
             senders = (each for each in source.live(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
@@ -273,7 +305,7 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """Return the largest of `LASTING_S` that this duration has reached, 0.0 if none."""
+    """Return the largest of `LASTING_S` that a duration of `ns` has reached, s; 0.0 if none."""
     if ns < LASTING_S[0] * NS_PER_S:
         return 0.0  # as in nearly every step
     return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)

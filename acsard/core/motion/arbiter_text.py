@@ -22,8 +22,9 @@ REFUSED = {
 """The words for each reason to refuse a command."""
 
 MAX_SENDER = 124
-"""Characters of a sender's name. A public name has up to 57, and 67 with a certificate. A sender
-without an attachment is named after its key, which it may choose."""
+"""Number of characters of a sender's name that an event shows. A public name has up to 57, and 67
+with a certificate. A sender without an attachment is named after its key, which the sender may
+choose."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` of a speed never sends one; "After a clear" in deploy/ros2/README.md '
@@ -82,7 +83,7 @@ def missed(periods: int) -> Event:
 
 
 def refused(refusal: Refusal) -> Event:
-    """Return the event for a command that does not count, or not yet."""
+    """Return the event for a command that was refused, or that waits for the proof of its clock."""
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
@@ -90,17 +91,17 @@ def refused(refusal: Refusal) -> Event:
 
 
 class CommandEvents:
-    """The mode and the last commander that the log knows."""
+    """Creates the events for changes of the mode and of the commander."""
 
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""
-        """The source whose speeds do not move the robot, as last logged."""
+        """The source that was last logged because its speeds do not move the robot; "" if none."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
-        """Return the events for a change of the mode (with `why`) and of the commander.
+        """Return the events for a change of the mode, with the reason `why`, and of the commander.
 
-        The last commander counts however long ago it commanded.
+        The commander is compared with the last one that drove the robot, even if that was long ago.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:
@@ -115,7 +116,7 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return an event, once, if a source keeps sending speeds that do not move the robot."""
+        """Return one event when a source has sent speeds for a while that do not move the robot."""
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

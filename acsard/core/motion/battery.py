@@ -22,24 +22,24 @@ TIME_CONSTANT_S = 10.0
 A battery takes minutes from one level to the next, so the robot reacts soon enough."""
 
 SETTLE_S = 3.0
-"""Time of reports, s, after which the mean counts. It begins again after a silence. A motor start
-within this time lowers the mean by up to a tenth of the drop. A gap adds no more than one report.
-"""
+"""Time after which the mean decides the level, s. It begins again after a silence. A motor start
+within this time lowers the mean by up to a tenth of the drop. A gap between two reports adds at
+most `LONGEST_NS` to this time."""
 
 SILENT_S = 5.0
-"""Age, s, at which a value no longer counts. A board that reports its battery once a second may
-lose four reports."""
+"""Age at which the daemon drops a value, s. A board that reports its battery once a second may lose
+four reports in a row."""
 
 LONGEST_NS = 300_000_000
-"""Longest time for which one report stands in the mean, ns: that of a motor start. A single report
-from the moment of a motor start would otherwise weigh too much after a gap, or if reports are rare.
-The mean of a board that reports once a second is about three times as slow."""
+"""Longest time by which the mean weights one report, ns: the duration of a motor start. A single
+report from the moment of a motor start would otherwise weigh too much after a gap, or if reports
+are rare. If a board reports once a second, its mean is therefore about three times as slow."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The levels that a value can have, the best first."""
 
 MISSING = "the board has not reported its battery, but [battery] has thresholds"
-"""What is wrong if a battery with thresholds is never reported, in words."""
+"""The sentence for a battery that has thresholds but is never reported."""
 
 SILENT = f"the board has not reported its battery for {SILENT_S:g} s"
 
@@ -81,16 +81,18 @@ class Battery:
         self.stopped_now = False
         """Whether the level fell to "stop" in the last `look`."""
         self._values: dict[str, tuple[float, int]] = {}
-        """The last values by name, not older than `SILENT_S`, each with its time, ns."""
+        """The last values by name, each with its arrival, monotonic ns. Values older than
+        `SILENT_S` are removed."""
         self._known: BatteryLevel = "ok"
-        """The last level that was not "unknown". A silence does not end a stop."""
+        """The last level that was not "unknown". It stays during a silence, which does not end a
+        stop."""
         self._told: BatteryLevel | None = None
         """The level of the last event."""
         self._mean: float | None = None
         self._since_ns = self._mean_ns = 0
-        """Monotonic times of the first and the last report since a silence, ns."""
+        """Monotonic times of the first and the last report since the last silence, ns."""
         self._stood_ns = 0
-        """Time for which the reports since a silence stand in the mean, ns."""
+        """Sum of the times by which the mean weights the reports since the last silence, ns."""
 
     @property
     def held(self) -> bool:
@@ -99,17 +101,17 @@ class Battery:
 
     @property
     def why(self) -> str:
-        """Why the robot stops at the level "stop", in words that do not change."""
+        """Why the robot stops at the level "stop", in words without measured values."""
         return f"battery below {_threshold(self._config, 'stop')}"
 
     @property
     def mend(self) -> str:
-        """What ends the level "stop", in words that do not change."""
+        """What the operator must do to end the level "stop", in words without measured values."""
         config = self._config
         return f"charge it to {_with_unit(config, config.stop_below + config.hysteresis)}"
 
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
-        """Take the status lines since the last step, and return the event of a new level.
+        """Process the status lines since the last step, and return the event if the level is new.
 
         Args:
             reports: The status lines, each with its monotonic time of arrival, ns.
@@ -148,7 +150,8 @@ class Battery:
             self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
             self._stood_ns = 0
         elif at_ns > self._mean_ns:
-            # At first it is the plain mean of all reports.
+            # During the first `TIME_CONSTANT_S`, this is the plain mean of all reports, weighted by
+            # time.
             stood_ns = min(at_ns - self._mean_ns, LONGEST_NS)
             self._stood_ns += stood_ns
             span_ns = min(TIME_CONSTANT_S * NS_PER_S, self._stood_ns)

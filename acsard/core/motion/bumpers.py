@@ -1,13 +1,15 @@
 """Follows the bumpers that the board reports, and decides which motion they allow.
 
 A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"` it latches a stop,
-as the emergency stop does. With "away" it latches nothing: each sender must send a zero, and until
-the release the robot only drives straight away from the bumper, at most at `AWAY_SPEED`. No turn is
-allowed meanwhile, because a corner of the robot could sweep into the obstacle. A robot with four
-wheels cannot move sideways, so no motion leads away from the left or the right.
+as the emergency stop does. With "away" it latches nothing, but each sender must send a zero before
+the robot moves again. Until the bumper is released, the robot drives only straight away from it, at
+most at `AWAY_SPEED`. No turn is allowed until then, because a corner of the robot could sweep into
+the obstacle. A robot with four wheels cannot move sideways, so no motion leads away from the left
+or the right.
 
-A board that is silent about bumpers that it reported latches a stop in both cases. A bumper is not
-a safety function either: the status line may be lost or late.
+If a board has reported bumpers and falls silent about them, a stop is latched in both cases. A
+bumper is not a safety function, just as the emergency-stop input is not: the status line may be
+lost or late.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ AWAY_SPEED = 0.1
 """Highest speed away from a pressed bumper, m/s."""
 
 DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
-"""The sign of the speeds that lead away from a bumper, 0 if none does."""
+"""Sign of the linear speeds that lead away from a bumper at this place, 0 if none does."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
@@ -42,7 +44,12 @@ def missing(safety: SafetyConfig) -> str:
 
 
 def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
-    """Return which bumpers are pressed, by their places, or by their numbers without places."""
+    """Return words that list the pressed bumpers.
+
+    Args:
+        places: The configured places of the bumpers. If empty, the words use the bumpers' numbers.
+        pressed: Whether each bumper is pressed.
+    """
     numbers = [i for i, on in enumerate(pressed) if on]
     if not places:
         joined = " and ".join(str(i + 1) for i in numbers)
@@ -54,7 +61,8 @@ def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
 class Bumpers(BoardInput):
     """The state of all bumpers."""
 
-    # While a bumper is pressed, a silent board may not show another press.
+    # In contrast to `TABLE`, silence counts even while a bumper is pressed, because a silent board
+    # cannot report that another one is pressed.
     table = TABLE | {("pressed", "silence"): "silent"}
     silent, events = SILENT, ("bumper_pressed", "bumper_released")
 
@@ -68,7 +76,7 @@ class Bumpers(BoardInput):
 
     @property
     def limiting(self) -> bool:
-        """Whether a pressed bumper allows only some motion, and latches nothing."""
+        """Whether a bumper is pressed and limits the motion instead of latching a stop."""
         return self._away and self.state == "pressed"
 
     @property
@@ -78,14 +86,14 @@ class Bumpers(BoardInput):
 
     @property
     def held(self) -> str:
-        """Why a stop stays latched, in words; "" if the bumpers keep no latch."""
+        """The reason for which `clear` must not release a stop, in words; "" if there is none."""
         return self.why if self.latching else ""
 
     def away(self, twist: Twist) -> Twist | None:
-        """Return the part of a twist that the pressed bumpers allow.
+        """Return the part of a twist that the pressed bumpers allow, None if they allow none of it.
 
-        That is rest for rest, and the straight part within `AWAY_SPEED` for a twist that leads away
-        from every pressed bumper. It is None for every other twist.
+        For rest that is rest. For a twist that leads away from every pressed bumper, it is the
+        straight part, limited to `AWAY_SPEED`. Every other twist is forbidden.
         """
         if twist == REST:
             return REST
@@ -93,16 +101,18 @@ class Bumpers(BoardInput):
         return Twist(self._direction() * min(speed, AWAY_SPEED)) if speed > 0.0 else None
 
     def note(self) -> str:
-        """Return which motion the pressed bumpers allow, in words."""
+        """Return a sentence: which bumpers are pressed, and which motion they still allow."""
         allowed = ALLOWED.get(self._direction())
         if allowed is None:
             return f"{self.why}: no motion leads away, so the robot stands until the release"
         return f"{self.why}: only straight {allowed}, at most {AWAY_SPEED:g} m/s"
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return which bumpers a status line reports as pressed, None if it does not report them.
+        """Return whether each bumper is pressed according to a status line.
 
-        A line with the wrong number of bumpers may have lost a pressed one, so it releases none.
+        Return None if the line has no bumpers, or has the wrong number of them. Such a line may
+        have lost a pressed one, so it must not release any. Without configured places, a line with
+        a pressed bumper is accepted with any number.
         """
         bumpers = status.bumpers
         if bumpers is None:
@@ -114,15 +124,18 @@ class Bumpers(BoardInput):
         return None
 
     def words(self) -> str:
-        """Return which bumpers are pressed, as a reason."""
+        """Return words that list the pressed bumpers, as the reason of a stop."""
         return pressed_words(self._places, self.pressed or ())
 
     def advice(self) -> str:
-        """Return what follows from a press, for the log."""
+        """Return what the robot does or the operator must do after a press, for the log."""
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:
-        """Return the text that logs a release or, if `before` is "", the first report."""
+        """Return the text that logs a release or, if `before` is "", the first report.
+
+        `before` is the state of the bumpers before this report.
+        """
         if not before:
             count = len(self.pressed or ())
             return f"the board reports {many(count, 'bumper')}, and none is pressed"

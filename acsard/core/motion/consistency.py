@@ -1,13 +1,15 @@
-"""Holds the wheels against each other, against their commands and against a gyro.
+"""Compares the wheels with each other, with their commands and with a gyro.
 
-`ConsistencyChecks` is the one interface of these checks. For each line it tells odometry which
-wheels to believe, whether they slip, and by how far the gyro says that the robot turned:
+`ConsistencyChecks` is the one interface of these checks. For each feedback line it reports to the
+odometry which wheels to believe, whether they slip, and by how much the robot turned according to
+the gyro:
 
 - `wheel_faults.py` compares the two wheels of each side with each other and with their command. It
-  ignores one that is proved faulty, and soon calls it a fault, which stops the robot.
+  ignores a wheel whose encoder is proved faulty. If the contradiction lasts, it reports a fault,
+  which stops the robot.
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the believed wheels.
-- `learned_track.py` chooses the effective track by which the wheels turn the robot; a gyro that is
-  compared with them teaches it.
+- `learned_track.py` chooses the effective track by which the wheels turn the robot; the comparison
+  with a gyro teaches it.
 
 Each check uses the findings of another one, and only this module knows their order.
 """
@@ -43,7 +45,7 @@ class ConsistencyChecks:
                 teaches the track.
             kinematics: The kinematics of the base.
             encoder_counts: Counts per wheel turn, 0 if unknown.
-            feedback: The table `[feedback]`, by which wheels contradict their commands.
+            feedback: The table `[feedback]` with the wheels' response time and fault time.
         """
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
@@ -55,7 +57,7 @@ class ConsistencyChecks:
         self.turn: Turn | None = None
         """Turn of the last line according to the gyro; None if the wheels provide the turn."""
         self.on_trial = False
-        """Whether the gyro corrects the wheels' turn of the last line when it is proved."""
+        """Whether the gyro will correct the wheels' turn of the last line once it is proven."""
         self.slips = False
         """Whether the wheels slip: they contradict each other or the gyro."""
         self.events: list[Event] = []
@@ -68,20 +70,20 @@ class ConsistencyChecks:
         return status if self._track is None else replace(status, track_use=self._track.use)
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Take the gyro's samples since the last step, in order."""
+        """Store the gyro's samples since the last step, in order."""
         if self.gyro is not None:
             self.gyro.hear(samples)
 
     def forgive(self) -> None:
-        """Drop the corrections that are due to the pose, because it was set."""
+        """Drop the pending corrections of the pose by the gyro, because the pose was set."""
         if self.gyro is not None:
             self.gyro.forgive()
 
     def look(self, line: Feedback, rolled: Rolled) -> bool:
-        """Take a line and the wheel angles since the line before.
+        """Check a feedback line and `rolled`, the wheel angles since the line before it.
 
-        Return whether a wheel has proved faulty, so that the lines before must be recomputed
-        without it.
+        Return whether a wheel has proved faulty. The caller must then recompute the earlier lines
+        without this wheel.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -99,16 +101,16 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Note that the wheels' turn during the gyro's trial was corrected by `turn` rad.
+        """Record that the wheels' turn during the gyro's trial was corrected by `turn` rad.
 
-        Return the part of this correction that the gyro has already made.
+        Return the part of this correction that the gyro has already made, rad.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 
     def learn(self, turned: float) -> Track | None:
-        """Note by how far the last line turned the pose, rad.
+        """Record that the last line turned the pose by `turned` rad, and learn the track from it.
 
-        Return the track to use from now on, None if none is learned.
+        Return the track to use from now on, None if tracks are not learned.
         """
         gyro, track, self.events = self.gyro, self._track, self.wheels.events
         if gyro is None:

@@ -1,13 +1,14 @@
-"""Follows the inputs that the board reports, and decides when one of them counts as pressed.
+"""Follows the safety inputs that the board reports, and decides when one of them counts as pressed.
 
-`BoardInput` is the mechanism of each of them, `EmergencyStop` the emergency stop. `bumpers.py` has
-the bumpers. A board that has reported an input once must go on: if it is silent about it for
-`SILENT_S`, the input counts as pressed. A cable may be cut, or the emergency stop may have cut the
-board's own supply. `lifecycle.py` keeps the latch, which only `clear` releases.
+`BoardInput` has the common mechanism. `EmergencyStop` uses it for the emergency stop, and
+`bumpers.py` uses it for the bumpers. A board that has reported an input once must go on: if it is
+silent about it for `SILENT_S`, the input counts as pressed. A cable may be cut, or the emergency
+stop may have cut the board's own supply. `lifecycle.py` keeps the latch, which only `clear`
+releases.
 
 The emergency stop here is not the safety function. The hardware emergency stop cuts the motors by
-itself. The daemon only learns of it, commands zeros, and keeps the robot stopped after the button
-is released.
+itself. The daemon is only informed of that, commands zeros, and keeps the robot stopped after the
+button is released.
 """
 
 from __future__ import annotations
@@ -32,19 +33,20 @@ TABLE: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "ok"): "released",
     ("silent", "pressed"): "pressed",
 }
-"""Maps (state, sign) to the next state. Without an entry the state stays."""
+"""Maps (state, sign) to the next state. For a pair without an entry, the state does not change."""
 
 SILENT_S = 0.5
-"""Seconds without a report of the input after which it counts as pressed. A board reports it ten
-times a second, so five lines in a row are lost by then."""
+"""Seconds without a report of the input after which it counts as pressed. A board reports the input
+ten times a second, so five lines in a row are lost by then."""
 
 LATE_NS = 150_000_000
-"""Time between two steps, ns, that shows that this computer was late. The longest period is 100 ms.
-"""
+"""Time between two steps above which this computer was late, ns. The longest period that can be
+configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
-"""Time that a late computer still waits for the lines that came meanwhile, ns. Only one lateness
-between two reports is excused, so a computer that is always late does not wait for ever."""
+"""Further time, ns, in which the daemon reads the lines that arrived while this computer was late,
+before it calls the board silent. It grants this time only once between two reports, so a computer
+that is always late does not delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = f"the board reported no emergency-stop input for {SILENT_S:g} s, which counts as pressed"
@@ -56,7 +58,7 @@ MISSING = (
     'safety.estop = "required", but the microcontroller has not reported an emergency-stop input: '
     "does its firmware send status lines with `estop=`?"
 )
-"""Why the robot does not become ready, in words."""
+"""The sentence if the robot does not become ready because the board never reported the input."""
 
 DRIVER_FAULT = "the board reports a fault of a motor driver"
 DRIVER_MEND = "mend it, or switch the robot off and on"
@@ -68,7 +70,7 @@ class BoardInput(ABC):
 
     table = TABLE
     silent: str
-    """Why the robot is stopped if the board is silent about the inputs, in words."""
+    """The sentence for a robot that is stopped because the board is silent about the inputs."""
     events: tuple[EventName, EventName]
     """The names of the events of a press and of a release."""
 
@@ -79,7 +81,7 @@ class BoardInput(ABC):
         self.pressed: tuple[bool, ...] | None = None
         """Whether each input counts as pressed, None if the board has never reported them."""
         self.pressed_now = ""
-        """Why the last `look` began to count an input as pressed, "" if it did not."""
+        """The reason if an input began to count as pressed in the last `look`, otherwise ""."""
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
@@ -101,7 +103,7 @@ class BoardInput(ABC):
         return self.use == "required" and not self.state
 
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
-        """Take the status lines since the last step, and return the events of the changes.
+        """Process the status lines since the last step, and return the events of the changes.
 
         Args:
             reports: Each status line with its monotonic time of arrival, ns.
@@ -126,21 +128,24 @@ class BoardInput(ABC):
 
     @abstractmethod
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return which inputs a status line reports as pressed, None if it does not report them."""
+        """Return whether each input is pressed according to a status line.
+
+        Return None if the line does not report the inputs.
+        """
 
     @abstractmethod
     def words(self) -> str:
-        """Return which inputs are pressed, as a reason."""
+        """Return words that say which inputs are pressed, as the reason of a stop."""
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
         """Return the text that logs a release or, if `before` is "", the first report.
 
-        `before` is the state before it.
+        `before` is the state of the inputs before this report.
         """
 
     def advice(self) -> str:
-        """Return what follows from a press, for the log."""
+        """Return what the operator must do after a press, for the log."""
         return f"{self.mend}, then call srv/clear"
 
     def _take(self, sign: Sign, pressed: tuple[bool, ...]) -> list[Event]:
@@ -162,11 +167,14 @@ class EmergencyStop(BoardInput):
     silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether a status line reports a press, None if it does not have the input."""
+        """Return whether a status line reports a press, as a tuple of one.
+
+        Return None if the line does not report the input.
+        """
         return None if status.estop is None else (status.estop,)
 
     def words(self) -> str:
-        """Return the reason of a press."""
+        """Return the reason of the stop that a press causes."""
         return PRESSED
 
     def released(self, before: EstopState) -> str:

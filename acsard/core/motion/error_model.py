@@ -18,8 +18,8 @@ The errors of the parameters do not average out, so they are not noise (Borenste
 Measurement and Correction of Systematic Odometry Errors in Mobile Robots, 1996). `columns` gives
 the effect of each parameter on a step if the parameter is off by one standard deviation.
 
-`ErrorModel` has both for the settings and the track in use. The covariance of the pose
-(`uncertainty.py`) and that of the twist (`TwistUncertainty`) use it.
+`ErrorModel` has the noise and the columns for the settings and the track in use. The covariance of
+the pose (`uncertainty.py`) and that of the twist (`TwistUncertainty`) use both.
 """
 
 from __future__ import annotations
@@ -106,12 +106,15 @@ class ErrorModel:
         self.turn_by(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the noise of these settings from now on. The parameters' uncertainty stays."""
+        """Use the noise of these settings from now on.
+
+        The uncertainty of the parameters stays that of the settings at the start.
+        """
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
     def turn_by(self, learned: Track | None) -> None:
-        """Use this effective track from now on. None means that no track is ever learned."""
+        """Use this effective track from now on. None means that the daemon never learns a track."""
         self.track = self._kinematics.track * (learned or CONFIGURED).share
         """Effective track in use, m."""
         self.columns = columns(self._declared, self._kinematics, learned)
@@ -214,7 +217,7 @@ class TwistUncertainty:
         along += self._to_linear * quantum
         yaw += self._to_angular * quantum
         lateral = model.settings.twist_covariance_diagonal[1]
-        # Do not call `max` here: three calls take half as long as the lines above.
+        # Do not call `max` here: three calls take half as long as all lines above.
         return TwistVariances(
             along if along > LEAST else LEAST,
             lateral if lateral > LEAST else LEAST,
@@ -224,7 +227,7 @@ class TwistUncertainty:
     def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
         """Return the variances of a robot whose wheels have reported zero speed for `seconds` s.
 
-        `step` is as in `of`.
+        `step` is the quantization step of the wheel speeds, rad/s; 0 if unknown.
         """
         quantum = (max(self._count, step * self._period) / seconds) ** 2
         return TwistVariances(
@@ -242,5 +245,8 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return the variances if a gyro measures the turn rate, with the variance `angular`."""
+        """Return the variances if a gyro measures the turn rate.
+
+        `angular` is the variance of the turn rate by the gyro, rad2/s2.
+        """
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -1,8 +1,9 @@
-"""Throttles events into log lines: repeated events become one line per second with their number.
+"""Throttles events into log lines: repeated events of one name become one line per second, with the
+number of events.
 
-A few lines of one name may come at once, and then one per second. The events in between are counted
-and reported with the next line. So neither a client that floods the bus nor a wire that flaps can
-flood the log.
+At first a few lines of one name may be written at once, and after that one per second. The throttle
+counts the events in between and reports them with the next line. So neither a client that floods
+the bus nor a wire that flaps can flood the log.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from typing import get_args
 from acsard.core.values import NS_PER_S, Event, EventName, Level
 
 BURST = 5
-"""Lines of one name that may come at once: as fast as people press buttons."""
+"""Lines of one name that may be written at once: as fast as people press buttons."""
 
 MOST = 8
-"""Kinds and names that one line distinguishes. A stranger may send under any number of them."""
+"""Number of kinds, and of senders' names, that one line distinguishes. Any client may send under
+any number of names."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -39,7 +41,7 @@ class _Held:
         _count(self._by, event.by, event.count)
 
     def line(self) -> Event:
-        """Return all of them as one event, with the worst level and the text of the last."""
+        """Return the waiting events as one, with their worst level and the text of the last."""
         last, what = self.last, _numbered(self._kinds)
         if self.count > last.count and last.text:
             what = f"{what or f'{self.count} times'}; the last"
@@ -54,10 +56,11 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._free_ns: dict[EventName, int] = {}
-        """Time at which the lines of a name so far are paid for, at a second each."""
+        """Monotonic time at which the lines of a name that were written so far would be finished at
+        one per second, ns."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Take new events; return the events to log now, among these and the waiting ones."""
+        """Add new events; return the events to log now, both new and waiting ones."""
         if not (events or self._held):
             return ()
         for event in events:
@@ -66,7 +69,10 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line of this name may be written now, and if so charge it."""
+        """Return whether a line of this name may be written now. If so, count it as written.
+
+        `news` is true if the waiting events include news. Only then may several lines come at once.
+        """
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
             return False
@@ -79,7 +85,7 @@ NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
 
 
 def together(before: Event, line: Event) -> Event:
-    """Return two lines of one name as one, with the total number and the text of the last."""
+    """Merge two lines of one event name: the result has the total number and the last text."""
     count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))

@@ -1,20 +1,26 @@
-"""Decides whether a stamped command is fresh, by two clocks that nobody has compared.
+"""Decides whether a stamped command is fresh. The sender's clock is not synchronized with ours.
 
 The arrival by our clock minus the stamp by the sender's clock is the delay plus an unknown offset.
-The offset cancels out against the minimum of all delays: a command is stale if it took longer than
-the minimum by more than its timeout, or if its stamp lies before that of an accepted command.
+The offset cancels out if each delay is compared with the minimum of all delays. A command is stale
+if its delay exceeds the minimum by more than its timeout, or if its stamp lies before that of an
+accepted command. A clock is in one of two states:
 
-    new      the minimum is not known: the delays must stop falling first, as a backlog's never do
-    known    the minimum is believed, until a proof of another one ends
+    new      the minimum is not known: a proof must first show that the delays no longer fall, as
+             they do while a backlog arrives
+    known    the minimum is trusted, until a proof shows another one
 
-There are two kinds of clocks. A *steady* clock is never adjusted: our client, tools and page say so
-with `"steady": true`. Its command that looks late is late, and stays refused. A *foreign* clock may
-be set or slewed, which looks like a delay. A new delay that has proved constant is believed; the
-sender must return to neutral. What is forgiven in this way is bounded, because a congested network
-looks the same: `FORGIVE_NS`, refilled by 1 s a minute. Stamps that go back, or stand, and do so for
-more than one command show an adjustment that no network can cause, so it costs nothing. While the
-sender pauses, its clock may be set by any amount. Arrivals are monotonic: our own wall clock may
-step.
+There are two kinds of clocks. A *steady* clock is never adjusted. Our client, tools and web page
+declare that with `"steady": true`. If its command looks late, it is late and stays refused.
+
+A *foreign* clock may be set or slewed, which looks like a change of the delay. If the new delay
+proves constant, it is trusted, and the sender must return to neutral. A congested network can look
+the same, so the sum of the delays that are trusted in this way is bounded by a budget:
+`FORGIVE_NS`, refilled by 1 s a minute. An adjustment is visible, and costs no budget, if stamps go
+back or stand still for more than one command, because no network can cause that. After a pause of
+the sender, a rise of the delay is trusted even beyond the budget, because the clock may have been
+set by any amount.
+
+Arrivals are measured by the monotonic clock, because our own wall clock may be set.
 """
 
 from __future__ import annotations
@@ -24,76 +30,86 @@ from typing import Literal
 from acsard.core.values import NS_PER_S, Command
 
 DRIFT = 5000
-"""The two clocks drift apart by less than one part in 5000, twice the error of a bad crystal."""
+"""Largest drift between the two clocks: less than one part in 5000, twice the error of a bad
+crystal."""
 
 FORGET_NS = 250 * NS_PER_S
-"""After a pause of this length the drift may be 50 ms, so the clock is new again. A pause shows in
-the stamps; a network that holds everything back for as long leaves the clock known."""
+"""Pause after which the clock is new again, because the drift may be 50 ms by then, ns. The stamps
+must show the pause too. If only the arrivals show it, a network held the commands back, and the
+clock stays known."""
 
 KEEP_NS = 3600 * NS_PER_S
-"""A clock that was silent for this time is forgotten, to save memory."""
+"""Silence after which a clock is forgotten to save memory, ns."""
 
 EARLY_NS = NS_PER_S // 20
-"""Delays that fall by more than this are not jitter: a backlog pours in, or the clock was set."""
+"""A fall of the delay by more than this is not jitter: a backlog arrives, or the clock was set."""
 
 WAVER_NS = NS_PER_S
-"""Delays that rise by more than this are not jitter: the network held commands back."""
+"""A rise of the delay by more than this is not jitter, ns: the network held commands back."""
 
 EVEN, CREPT = 200, 20
-"""A proof allows the minimum of the delays to change by one part in this of the time it takes. The
-halves of that time are compared, so the slopes are twice that: 1 %, or 10 % for a clock that crept
-away, because NTP slews by up to 8.3 %."""
+"""A proof compares the minimum delays of its two halves. They may differ by the duration of the
+proof divided by `EVEN`, or by `CREPT` for a clock that crept away. The centres of the halves are
+half a duration apart, so the allowed slopes are 1 % and 10 %. NTP slews a clock by up to 8.3 %."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
-"""A delay creeps if it changes from one command to the next by no more than one part in `CREEP` of
-the time between them and `JITTER_NS`. Otherwise it jumps."""
+"""A delay creeps if its change between two commands is at most the time between them divided by
+`CREEP`, plus `JITTER_NS`. Otherwise it jumps."""
 
 LONGEST_PROOF_NS = 2 * NS_PER_S
-"""A proof takes the timeout of the source, but no longer than this."""
+"""Longest duration of a proof, ns. A proof takes the timeout of the source if that is shorter."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""A sender whose delay jumped must prove itself for this time. The jump is more likely a backlog
-that arrives in bursts than a clock that was set."""
+"""Least duration of the proof after a jump of the delay, ns. The jump is more likely a backlog that
+arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""A silence of this length ends a proof. A foreign clock may have been set by any amount while its
-sender paused for this time, by its own stamps and by the arrivals. Numbers tell a pause from
-commands that were lost."""
+"""Silence that ends a proof, ns. If both the stamps and the arrivals show a pause of this length, a
+foreign clock may have been set by any amount meanwhile. Sequence numbers distinguish a pause from
+lost commands."""
 
 STANDS_NS = 10_000
-"""Two stamps that are no further apart, of commands that did not arrive together, show a clock that
-was set back by the time between the arrivals. Zenoh's own clock never goes back: it advances by a
-fraction of a microsecond for each message until the wall clock has caught up."""
+"""Largest difference of two stamps that shows a clock set back, ns, if the two commands did not
+arrive together. The clock was then set back by the time between the arrivals. Zenoh's own clock
+never goes back: it advances by a fraction of a microsecond for each message until the wall clock
+has caught up."""
 
 APART_NS = NS_PER_S // 500
-"""Commands that arrive within this time of each other may have been sent together."""
+"""Commands that arrive within this time of each other may have been sent together, ns."""
 
 TOGETHER_NS = NS_PER_S // 2000
-"""Commands that arrive within this time of each other come out of one queue, the oldest first. A
-check waits for the last of them. No sender may send more than 1000 commands a second."""
+"""Commands that arrive within this time of each other come out of one queue, the oldest first, ns.
+A proof evaluates a half only when the last of them has arrived. No sender may send more than 1000
+commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
-"""How much later a foreign clock may become without an adjustment that shows: 1 s, and 1 s more for
-each minute."""
+"""Budget for rises of a foreign clock's delay without a visible adjustment: 1 s, in ns, and the
+number of seconds that refill it by one second."""
 
 MAX_CLOCKS = 1024
-"""Number of clocks that are remembered. The clock that was silent for longest is forgotten first.
-Senders may use this many names within 0.05 s before one at 20 Hz is forgotten."""
+"""Number of clocks that are remembered. Above it, the clock that was silent for longest is usually
+forgotten first. A client would have to use this many names within 0.05 s before the clock of a
+sender at 20 Hz is forgotten."""
 
 State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
-"""`fresh` counts. `unproven` does not count yet, nor does `first`, with which a proof begins.
-`stale` does not count. `set` counts, but the sender must return to neutral."""
+"""The verdict on a command. A `fresh` command counts, and a `stale` one does not. An `unproven` one
+does not count yet, and neither does the `first` one, with which a proof begins. After a `set` the
+command counts, but the sender must return to neutral."""
 
 
 class _Proof:
-    """A test that the delays have become constant, from one command on.
+    """A test whether the delays have become constant, starting with one command.
 
-    The minimum of the first half of the proof time is compared with that of the second. Through
-    jitter they differ. The proof of a clock that is known begins `again` with its second half.
-    For a new clock the last eight halves are looked at instead, in four pairs. Their minima must
-    differ by less than `EARLY_NS` and follow no trend: they fall while a backlog pours in, and rise
-    while a queue grows.
+    The test compares the minimum delays of halves of the proof time. Minima differ less than single
+    delays, which have jitter.
+
+    - For a known clock (`again`), the test compares the first half with the second. If it fails, it
+      begins again with its second half.
+    - For a new clock, it compares the first two halves. If they differ, it compares the last eight
+      halves in four pairs. The minima of the pairs must be as even as those of two halves, or
+      differ by at most `EARLY_NS` without a trend. They fall while a backlog arrives, and rise
+      while a queue grows.
     """
 
     def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
@@ -101,12 +117,13 @@ class _Proof:
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self._last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
-        """When each of the last halves began, and its minimum."""
+        """Start of each of the last halves, monotonic ns, and the minimum delay in it, ns."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
-        """Judge one more command; `failed` if the proof must begin again with it.
+        """Add a command with its delay, ns; return "failed" if the proof must begin again with it.
 
-        A command later than the least by more than the timeout proves nothing about itself.
+        A command cannot complete the proof if its delay exceeds the least one by more than the
+        timeout.
         """
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
@@ -123,7 +140,7 @@ class _Proof:
         return "proven" if proven and delay - self.least <= timeout_ns else "open"
 
     def _constant(self, at_ns: int) -> bool:
-        """Compare the halves that are over."""
+        """Return whether the minimum delays of the completed halves are constant."""
         minima, count = [least for _, least in self._halves], len(self._halves)
         lasted = at_ns - self._halves[0][0]
         if count == 2:
@@ -143,43 +160,47 @@ class _Proof:
 
 
 class _Clock:
-    """One clock, judged by the commands that it stamped."""
+    """One clock. The class estimates its minimum delay from the commands that it stamped."""
 
     def __init__(self, at_ns: int) -> None:
         self.state: State = "new"
         self.at_ns = at_ns
-        """Arrival of the last command."""
+        """Arrival of the last command, monotonic ns."""
         self.forgiven_ns = 0
-        """How much later the delays became by the last `set`, without an adjustment that shows."""
+        """Rise of the delay at the last `set` that no visible adjustment explains, ns."""
         self._stamp_ns = 0
         self._delay = 0
         self._number: int | None = None
         """Sequence number of the last command."""
         self._least = 0
-        """The minimum of the believed delays, which rises with the drift."""
+        """The minimum of the trusted delays, ns. It rises with the largest possible drift."""
         self._early = 0
-        """How much the minimum has fallen lately."""
+        """Amount by which the minimum has fallen recently, ns."""
         self._floor: int | None = None
-        """Lowest delay of a steady clock, which rises with the drift; None for a foreign clock."""
+        """Lowest delay of a steady clock, ns, which rises with the largest possible drift. None for
+        a foreign clock."""
         self._before: int | None = None
-        """Delay before the first adjustment that showed since the clock was last prompt."""
+        """Delay before the first visible adjustment since a command was last on time, ns; None
+        without one."""
         self._shown = 0
-        """Sum of the visible clock adjustments since then, ns."""
+        """Sum of the visible adjustments of the clock since a command was last on time, ns."""
         self._doubted: tuple[int, int, int] | None = None
-        """An adjustment that the next command must confirm, because the network may have swapped
-        or repeated a command: the delay before it, its amount, and the stamp before it."""
+        """An adjustment that the next command must confirm, because the network may have swapped or
+        repeated a command. The numbers are the delay before it, its amount, and the stamp before
+        it, all in ns."""
         self._paused = False
-        """Its sender has paused since then, so any adjustment may have happened."""
+        """Whether the sender has paused since a command was last on time. Its clock may then have
+        been set by any amount."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
         self._accepted: tuple[int, int] | None = None
-        """Stamp and sequence number of the last accepted command."""
+        """Stamp and sequence number (-1 without one) of the last accepted command."""
 
     @property
     def was_known(self) -> bool:
-        """Whether a command of this clock was accepted, so that its floor and order are known.
+        """Whether a command of this clock was accepted: its lowest delay and order are known.
 
-        A proof that begins again does not change that.
+        This stays true if a proof begins again.
         """
         return self._accepted is not None
 
@@ -208,21 +229,28 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """Return whether a newer command was accepted. Without numbers, equal stamps pass."""
+        """Return whether a newer command was accepted than the one with this stamp and number.
+
+        Of two commands with equal stamps and without numbers, none is newer.
+        """
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return how much later than the lowest delay a command of a steady clock came."""
+        """Return by how much this delay of a steady clock exceeds the lowest one, ns.
+
+        `silence` is the time since the command before, ns.
+        """
         floor = delay if self._floor is None else self._floor + silence // DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
 
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int | None) -> None:
-        """Note a pause, or stamps that go back or stand, unless the numbers show a loss.
+        """Record a pause of the sender, or an adjustment: stamps that go back or stand still.
 
-        Stamps that go back or stand count once the next command confirms it: its stamp goes back
-        too, stands, or has still not caught up.
+        The next command must confirm the adjustment: its stamp goes back too, stands still, or has
+        not caught up yet. Nothing is recorded if the numbers show that commands were lost.
+        `silence` is the time since the command before, ns.
         """
         doubted, self._doubted = self._doubted, None
         if number is not None and self._number is not None and number != self._number + 1:
@@ -258,7 +286,7 @@ class _Clock:
             self._least = min(self._least, delay)
             self._forget_adjustments()
             return "fresh"
-        if steady:  # the minimum was that of a backlog
+        if steady:  # the known minimum was that of a backlog
             self.state, self._proof = "new", None
             return self._prove(delay, at_ns, silence, timeout_ns)
         proof, needed_ns, share = self._proof, min(timeout_ns, LONGEST_PROOF_NS), CREPT
@@ -276,7 +304,10 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
-        """Believe the proven delay if an adjustment showed or a pause hid it, or by the budget."""
+        """Trust the proven delay, if something allows it, and return the verdict.
+
+        A visible adjustment, a pause of the sender or the rest of the budget allows a larger delay.
+        """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
         if self._before is not None:
@@ -288,7 +319,7 @@ class _Clock:
         return self._believe(proof, "set")
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Let the budget grow with the time. It has no limit while the clock is refused."""
+        """Let the budget grow with the time, up to `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -308,17 +339,23 @@ class Freshness:
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Foreign clocks that were never believed. A silence ends their proof without a trace."""
+        """Foreign clocks of which no command was accepted yet. After a silence of `GAP_NS` they are
+        forgotten."""
         self._unproved: dict[str, _Clock] = {}
-        """Steady clocks that were never believed. Their lowest delay holds from the first command
-        on."""
+        """Steady clocks of which no command was accepted yet. They are kept over a silence, because
+        their lowest delay is valid from the first command on."""
         self._numbers: dict[str, tuple[int, int]] = {}
-        """Number and arrival of the last command of each sender that numbers without stamps."""
+        """Number and arrival, ns, of the last command of each sender that sends numbers without
+        stamps."""
         self.forgiven_ns = 0
-        """How much later foreign clocks became in all, without an adjustment that shows, ns."""
+        """Sum of all rises of foreign clocks' delays that no visible adjustment explains, ns."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
-        """Return whether the command counts. Without a stamp it is as old as its arrival."""
+        """Return the verdict on a command.
+
+        A command without a stamp is never too old, but it is stale if its number is out of order.
+        `timeout_ns` is the timeout of its source.
+        """
         if command.stamp_ns is None:
             return self._in_order(command)
         name, at_ns = command.clock or command.source, command.arrived_ns
@@ -337,7 +374,10 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command) -> Verdict:
-        """Judge a command without a stamp by its number. A sender that paused may start again."""
+        """Return the verdict on a command without a stamp, by its sequence number.
+
+        After a pause of `GAP_NS` the sender may start again with lower numbers.
+        """
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
@@ -351,10 +391,11 @@ class Freshness:
         return "fresh"
 
     def _forget(self, now_ns: int) -> None:
-        """Forget the clocks that were silent for long, and any above the limit.
+        """Forget clocks that were silent for long, and one more if there are over `MAX_CLOCKS`.
 
-        Above the limit, the first to go is a silent clock that was never believed.
-        A recording begins with all clocks, which the loop writes in one step.
+        That one is a steady clock without an accepted command that was silent for `GAP_NS`, or else
+        the clock that was silent for longest. The number is limited because a recording begins with
+        all clocks, which the loop writes in one step.
         """
         limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
         for held, silent_ns in limits:
@@ -369,5 +410,8 @@ class Freshness:
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """Return the clock that was silent for longest: each command moves its clock to the end."""
+    """Return the clock that was silent for longest.
+
+    It is the first one, because each command moves its clock to the end.
+    """
     return next(iter(held.values()))

@@ -1,11 +1,11 @@
-"""Fills gaps in the feedback: the angles that the wheels rolled meanwhile, and their uncertainty.
+"""Fills gaps in the feedback: it estimates the wheel angles in a gap, and their uncertainty.
 
-`Rolling` computes the angles since the last feedback line that was believed, by the first of these
-sources that exists: the encoder counts of the line, whole counts that its speeds show, speed times
-time. Each moment and each count is used exactly once. If no line reported a time, the first half of
-this time gets the speed before it, and the second half the speed after it. If the daemon has
-commanded rest because of the silence, the earlier speed counts only until then. The motion during
-implausible lines is computed with the next plausible one.
+`Rolling` computes the wheel angles since the last plausible feedback line. It uses the first of
+these sources that exists: the encoder counts of the line, whole counts that its speeds show, speed
+times time. Each moment and each count is used exactly once. In a time that no line covers, the
+speed before it is assumed for the first half and the speed after it for the second half. If the
+daemon has commanded rest during the silence, the speed before it is assumed only until that
+command. The motion during implausible lines is computed with the next plausible line.
 
 `Gaps` estimates how much the true motion in a gap differs from a constant acceleration between the
 two known speeds.
@@ -22,44 +22,44 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Implausible lines over which the robot is assumed to have kept its speed.
-
-They are lines of at most `MAX_LOST_S` s, or at most `MAX_LOST` lines of any length.
-"""
+"""Limits for implausible lines in a row over which the robot is assumed to have kept its speed:
+either at most `MAX_LOST_S` s in all, or at most `MAX_LOST` lines of any duration."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 GUESS = Twist(0.125, 0.5)
-"""Standard deviation of the acceleration that is assumed at first, m/s2 and rad/s2.
+"""Standard deviation of the acceleration that is assumed before any measurement, m/s2 and rad/s2.
 
-It is an eighth of the default limits, which random driving with these limits rarely exceeds.
+It is an eighth of the default limits. Random driving with these limits rarely exceeds it.
 """
 
 SPAN = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Weight of the assumption, and largest number of spans that count: a minute of driving."""
+"""Weight of `GUESS`, in spans, and the largest weight of the mean over all spans: a minute of
+driving."""
 
 GROWTH = 5
 """Power of the time with which the variance in a gap grows (`Gaps`)."""
 
 
 class Rolled(Struct, frozen=True, gc=False):
-    """Wheel angles since the last line that was believed, rad, in the order of `WHEELS`."""
+    """Wheel angles since the last plausible line, rad, in the order of `WHEELS`."""
 
     pieces: tuple[Motors, ...]
-    """The angles by speeds, in the order of time. Each piece is an arc, and no piece is empty."""
+    """The angles that follow from speeds, in the order of time. Each piece becomes an arc of the
+    path. No piece is zero for all wheels."""
     turned: Motors
-    """The angles by encoder counts, from before the `pieces`."""
+    """The angles by encoder counts. In time they lie before `pieces`."""
     seen: Motors
-    """The angles in `seconds` by the line's own speeds or counts, with their rounding errors."""
+    """The angles in `seconds` by the speeds or counts of this line, with their rounding errors."""
     seconds: float
     """Duration of `seen`, s."""
     bridged: float
-    """Part of `seconds` that no line reported, s. It was filled."""
+    """Part of `seconds` that no line covers and gap filling has filled, s."""
     unknown: float
-    """Further time in which the motion of the robot is unknown, s."""
+    """Further time, in addition to `seconds`, in which the motion of the robot is unknown, s."""
     known: float
     """Duration of `pieces` and `turned` together, s; 0 if a part of the motion is unknown."""
 
@@ -71,8 +71,8 @@ class Rolling:
         """Start. After `quiet` s without feedback the daemon commands rest."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
-        """Durations, s: of implausible lines without counts, of the gaps before them, and of
-        implausible lines with counts."""
+        """Three durations, s: that of implausible lines without counts, that of the gaps before
+        these lines, and that of implausible lines with counts."""
         self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:
@@ -86,9 +86,9 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
-        """Return the angles up to a plausible line.
+        """Return the angles up to a plausible line, and forget the implausible lines before it.
 
-        `before` has the wheel speeds of the last line that was believed, rad/s.
+        `before` has the wheel speeds of the last plausible line, rad/s.
         """
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
@@ -96,7 +96,8 @@ class Rolling:
             seen = times(speeds, dt)
             pieces = _some(seen if line.counted is None else line.counted)
             return Rolled(pieces, NOWHERE, seen, dt, 0.0, 0.0, dt)
-        # Fill in lost lines without counts with the speed of this line, unless they last too long.
+        # For implausible lines without counts, assume the speed of this line, unless they last too
+        # long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, unknown, known = self._turned, unknown + self._gap, lost + self._counted + dt
@@ -141,9 +142,9 @@ class Gaps:
     The robot may change its acceleration at any time, so s^2 itself grows with t, and the variance
     with t^5 (`GROWTH`).
 
-    s is measured while lines come: in each span of a fifth of a second, the motion is compared with
-    the motion at the mean of the first and the last speed. The limits of the acceleration are not
-    used, because few drives are near them.
+    `follow` measures s while lines arrive without gaps. In each span of a fifth of a second, it
+    compares the motion with that at the mean of the first and the last speed. The configured
+    acceleration limits are not used, because few drives come near them.
 
     The deviation is never larger than the motion at the faster of both speeds. A robot that stood
     before and after a gap has therefore not moved.
@@ -156,12 +157,12 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Start a new span with the speeds `twist`, and discard the span before."""
+        """Start a new span with the speeds `twist`, and discard the unfinished span."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """Take a line that reports `twist` for the last `dt` s."""
+        """Measure the acceleration with a line that reports `twist` for the last `dt` s."""
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)
         self._seconds += dt
@@ -181,10 +182,11 @@ class Gaps:
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
     def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances that a filled gap adds: of the distance m2, of the turn rad2.
+        """Return the variances that a filled gap adds: the distance (m2) and the turn (rad2).
 
-        The gap lasts `seconds` s. Gaps that follow each other count as one longer gap. `before` and
-        `after` are the speeds before and after this gap.
+        The gap lasts `seconds` s. Gaps that directly follow each other count as one longer gap, and
+        the result is then only the increase. `before` and `after` are the speeds before and after
+        this gap.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)
@@ -193,7 +195,7 @@ class Gaps:
         return max(0.0, along - given[0]), max(0.0, yaw - given[1])
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances of the motion in a gap: of the distance m2, of the turn rad2.
+        """Return the variances of the motion in a gap: the distance (m2) and the turn (rad2).
 
         The gap lasts `seconds` s, and `before` and `after` are the speeds before and after it.
         """

@@ -5,12 +5,13 @@ gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro
 does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison
 with the wheels gives its delay and the effective track (`gyro_match.py`).
 
-Until both have agreed in a turn, the heading is that of the wheels, and it is corrected afterwards.
-A gyro that reads the opposite, degrees or nothing is reported and not used (`gyro_trial.py`). If a
-gyro is silent or out of all proportion to the wheels, the heading is that of the wheels.
+Until gyro and wheels have agreed in a turn, the heading comes from the wheels, and the gyro
+corrects it afterwards. A gyro that reads the opposite sign, degrees or zero is reported and not
+used (`gyro_trial.py`). If a gyro is silent, or its rate is out of all proportion to the wheels, the
+heading comes from the wheels.
 
-The module remembers the angle that it has returned, not the time. A sample that comes late, or is
-held back for a moment, is part of the next line's turn, so such errors do not add up.
+The module remembers the angle that it has returned, not the time. A sample that arrives late, or is
+held back for a moment, is included in the turn of the next line, so such errors do not add up.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from acsard.core.motion.learned_track import LEAST, Track
 from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
 
 REST_S = 0.2
-"""Seconds of four zero speeds after which the robot stands."""
+"""Time for which all four wheels must report zero speed before the robot counts as standing, s."""
 
 SILENT_NS = NS_PER_S // 5
 """Age of the last sample at which the gyro is silent, ns. Until then its last rate continues."""
 
 LATEST_NS = NS_PER_S // 4
-"""Delay of a stamp above which the sender's clock was set, ns."""
+"""Delay of a sample above which its sender's clock is assumed to have been set, ns."""
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Least and greatest delay of the gyro against the wheels, ns."""
@@ -46,11 +47,11 @@ SLIP_S = 0.5
 """Seconds after the last contradiction for which the wheels still count as slipping."""
 
 MOST_SLIP_S = 5.0
-"""Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is stuck, or no
-gyro."""
+"""Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is stuck, or is not
+a gyro."""
 
 ENOUGH_BLOCKS = 20.0
-"""Blocks of turning after which the ratio to the wheels is believed."""
+"""Number of blocks of turning (`gyro_match.py`) after which the ratio to the wheels is believed."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
@@ -70,7 +71,7 @@ WORDS: dict[GyroDoes, str] = {
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """The turn of the robot since the line before: rad, and its variance, rad2.
+    """The turn of the robot since the line before: `angle` is in rad, and `variance` in rad2.
 
     The variance does not include the error of the gyro's scale, which does not average out
     (`uncertainty.py`).
@@ -79,50 +80,51 @@ class Turn(Struct, frozen=True, gc=False):
     angle: float
     variance: float
     rate: float
-    """The turn rate that the gyro measures, rad/s. The angle may include late samples, so it is not
-    dt times this rate."""
+    """The turn rate that the gyro measures, rad/s. `angle` may include late samples, so it need not
+    be this rate times the duration of the line."""
     rate_variance: float
     wheels: float | None = None
     """The angle that the wheels would report for this turn, including their skid, rad."""
     slips: bool = False
-    """Whether the wheels slip: lately they reported another turn than the gyro."""
+    """Whether the wheels slip: recently they reported another turn than the gyro."""
 
 
 class Gyro:
-    """One gyro. The caller passes its samples to `hear` and calls `turn` for each line."""
+    """One gyro. The caller passes its samples to `hear`, and calls `turn` for each line."""
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
-        """The track that the gyro before this one taught."""
+        """The effective track that an earlier gyro has shown, None without one."""
         self.owes = False
-        """Whether the turn of the last line came from the wheels and the gyro corrects it after its
-        trial."""
+        """Whether the turn of the last line came from the wheels, and the gyro will correct it once
+        it is proven."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Events of the last `turn`, for the log."""
         self._begin()
 
     def _begin(self) -> None:
-        """Start with an unknown gyro, of which neither bias nor delay nor direction is known."""
+        """Start over with a gyro whose bias, delay and direction are unknown."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples later than the last line."""
+        """Samples that are later than the last line, each with its time, monotonic ns."""
         self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
-        """Time of the last sample that was taken."""
+        """Time of the last sample in `_angle`, monotonic ns; None before the first one."""
         self._rate = 0.0
         self._angle = self._given = 0.0
-        """Angle turned by all samples taken, and the part of it that was returned, rad."""
+        """Angle of all samples until the last line, and the part of it that `turn` has returned,
+        rad."""
         self._variance = 0.0
-        """Variance of the angle that was not returned yet, rad2."""
+        """Variance of the angle that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
-        """Variance of the last sample."""
+        """Variance of the rate now, rad2/s2."""
         self._hole = False
-        """Whether a part of the turn since the last line, or in it, was not received."""
+        """Whether samples are missing since the last line, or the gyro was silent at that line."""
         self.forgive()
 
     @property
@@ -134,14 +136,14 @@ class Gyro:
 
     @property
     def learned(self) -> Track | None:
-        """The effective track that the gyro shows, None until the robot has turned for a while."""
+        """The effective track that the gyro shows; None until the robot has turned for a while."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
             return self._learned
         return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Take the samples since the last step, in order."""
+        """Store the samples since the last step, in order."""
         for sample in samples:
             if sample.anew:
                 # The track belongs to the wheels and the floor, whichever gyro measured it.
@@ -151,10 +153,13 @@ class Gyro:
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the turn until a line of the time `at_ns`, or None if the wheels must provide it.
+        """Return the turn from the last line until this one, None if the wheels must provide it.
 
-        `wheels` is the turn from the wheels in rad over `dt` s. `still` means that all four wheels
-        stood. After a gap `dt` is 0, and the turn is that of the whole gap.
+        Args:
+            at_ns: Monotonic time of this line, ns.
+            dt: Time since the last line, s; 0 after a gap. The result then covers the whole gap.
+            wheels: The turn in `dt` according to the wheels, rad.
+            still: Whether all four wheels stood.
         """
         self.events, self.owes = [], False
         self._rest_s = self._rest_s + dt if still else 0.0
@@ -187,15 +192,15 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
-        """Drop the owed correction, because the pose was set."""
+        """Drop the pending correction of the pose, for example because the pose was set."""
         self._owed = self._owed_variance = 0.0
-        """Excess of the gyro's turn over the wheels' during the trial, rad, owed to the pose if the
-        gyro is proven; and its variance."""
+        """Correction of the pose that is pending while the gyro is on trial: the gyro's turn minus
+        the wheels' turn, rad, and its variance, rad2. It is applied if the gyro is proven."""
 
     def taken_back(self, turn: float) -> float:
-        """Note that the wheels' turn of lines that this gyro `owes` has changed by `turn` rad.
+        """Record that the wheels' turn of lines that this gyro `owes` has changed by `turn` rad.
 
-        Return the part of this change that the gyro has already corrected.
+        Return the part of this change that the gyro has already corrected, rad.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -205,9 +210,9 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return when a sample was measured, by our clock and up to a constant.
+        """Return when a sample was measured, in ns of our monotonic clock plus a constant.
 
-        Its stamp has no jitter.
+        The sample's stamp improves its time of arrival, because the stamp has no jitter.
         """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
@@ -220,7 +225,7 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _take(self, until_ns: int, resting: bool) -> None:
-        """Add up the samples until a time. At rest they update the bias instead."""
+        """Add the samples until `until_ns` to the angle. At rest they update the bias instead."""
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
         while heard and heard[0][0] <= until_ns:
@@ -242,11 +247,10 @@ class Gyro:
     # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Test a gyro that is not proven yet.
+        """Test the gyro if it is not proven yet; return whether the wheels provide this turn.
 
-        Return whether this line's turn comes from the wheels.
-
-        It does, except at rest, where the wheels would not notice that a person turns the robot.
+        While the gyro is not proven, they do, except at rest: the wheels do not show that a person
+        turns the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:

@@ -27,9 +27,10 @@ LEAST_NOISE = 1e-5
 """Smallest standard deviation of a sample, rad/s. A gyro that repeats one value is coarse."""
 
 ANEW_S = 1.0
-"""Time at rest with another constant bias after which the other bias is used, s.
+"""Time at rest with another constant reading after which that reading becomes the bias, s.
 
-The gyro has restarted or became warm, or the robot was turned while the first bias was learned.
+The gyro has then restarted or become warm, or the robot was turned while the first bias was
+learned.
 """
 
 LEARNING = 0.02
@@ -56,11 +57,11 @@ class Bias:
         return self._rested_s >= KNOWN_S
 
     def drift(self, dt: float) -> None:
-        """Let `dt` s pass, in which the bias may drift."""
+        """Increase the variance by the possible drift of the bias in `dt` s."""
         self.variance += WALK * WALK * dt
 
     def rest(self, rate: float, variance: float, dt: float) -> bool:
-        """Learn from a sample while the wheels stand. Return False if the sample shows a turn.
+        """Learn from a sample while the wheels stand; return False if the sample shows a turn.
 
         Args:
             rate: the turn rate of the sample, rad/s.

@@ -1,9 +1,9 @@
 """Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
 A gyro that is mounted upside down, reads degrees or is disconnected reports another turn than the
-wheels. So does a sound gyro if the wheels slip. Which of the two is wrong depends on the past: a
-gyro that has never agreed with the wheels in a turn is not believed yet. Skidding wheels turn the
-robot by less than they roll, so the two need to agree only within wide bounds.
+wheels. So does a sound gyro if the wheels slip. The past decides which of the two is wrong: a gyro
+that has never agreed with the wheels in a turn is not believed yet. Wheels that skid turn the robot
+by less than they roll, so gyro and wheels need to agree only within wide bounds.
 """
 
 from __future__ import annotations
@@ -11,26 +11,27 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate by the wheels, rad/s. A line at this rate or above to the other side is a new turn, not
-a difference of one count."""
+"""Turn rate according to the wheels, rad/s. If a line has at least this rate to the other side, a
+new turn begins. A slower one may only be a difference of one encoder count."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
-"""Mean turn rate by the wheels, rad/s, over this many s; a slower motion is not a turn. With
-unequal tyres the wheels report a turn on a straight, so below `LEAST_RATE` a gyro that reads
-nothing is not called dead."""
+"""Smallest mean turn rate according to the wheels, rad/s, and the time of the mean, s. A slower
+motion is not a turn. With unequal tyres the wheels report a turn while the robot drives straight.
+Therefore a gyro that reads zero is called dead only above `LEAST_RATE`."""
 
 PROPORTIONS = (0.25, 2.5)
-"""Range of the robot's true turn divided by the turn from the wheels, for any skidding."""
+"""Range of the robot's true turn divided by the turn according to the wheels, on any floor."""
 
 PROVED, REFUTED = 0.1, 0.4
 """Turn to one side according to the wheels, rad, in which a gyro is proven or refuted. Refuting
 takes more, because the gyro may be late."""
 
 REFUTED_S = 0.3
-"""Seconds of turning before a gyro is refuted. No gyro is as late as that."""
+"""Least time of turning before a gyro is refuted, s. No gyro has so long a delay."""
 
 DEGREES = (15.0, 150.0)
-"""The range for a gyro that reads degrees: as wide a range around 57.3."""
+"""Range of the ratio to the wheels for a gyro that reads degrees. The ratio is about 57.3 times
+that of a sound gyro."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
@@ -45,10 +46,11 @@ class Trial:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """Turn from the wheels, duration, and turn from the gyro in this stretch: rad, s, rad."""
+        """The present stretch: turn according to the wheels, rad; duration, s; turn according to
+        the gyro, rad."""
         self._fast = self._fast_gyro = 0.0
-        """Turns by wheels and gyro over the stretches that were fast enough to call a gyro dead,
-        rad."""
+        """Turns according to wheels and gyro, rad, over all stretches of this turn that were fast
+        enough to call a gyro dead."""
 
     @property
     def open(self) -> bool:
@@ -56,9 +58,9 @@ class Trial:
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Take the robot's turn of one line according to wheels and gyro, rad in `dt` s.
+        """Add the robot's turn in one line of `dt` s according to wheels and gyro, rad.
 
-        `certain` is False while the gyro's bias is uncertain. The only verdict is then "in
+        `certain` is False while the gyro's bias is unknown. The only possible verdict is then "in
         degrees".
         """
         self._stretch += wheels
@@ -72,7 +74,7 @@ class Trial:
                 self._fast_gyro += self._stretch_gyro
             self._stretch = self._stretch_s = self._stretch_gyro = 0.0
         if wheels * self._wheels < 0.0 and abs(wheels) >= LEAST_RATE * dt:
-            # In a turn to the other side a late gyro still reports the turn before.
+            # At the start of a turn to the other side, a late gyro still reports the turn before.
             self._begin()
             return
         self._wheels += wheels
@@ -90,7 +92,7 @@ class Trial:
         self._wheels = self._gyro = self._seconds = self._fast = self._fast_gyro = 0.0
 
     def _says_nothing(self) -> bool:
-        """Return whether the gyro reads nothing in turns that are too fast for a straight."""
+        """Return whether the gyro reads about zero in turns too fast to be a straight drive."""
         fast, gyro = self._fast, self._fast_gyro
         if abs(self._stretch) >= LEAST_RATE * self._stretch_s:
             fast, gyro = fast + self._stretch, gyro + self._stretch_gyro

@@ -40,22 +40,23 @@ class Kinematics:
         return (self._left_radius + self._right_radius) / 2
 
     def wheel_speeds(self, twist: Twist) -> WheelSpeeds:
-        """Return the wheel speeds of this twist by equations (1) to (3)."""
+        """Return the wheel speeds that cause this twist, by equations (1) to (3)."""
         half = twist.angular * self.track / 2
         left = (twist.linear - half) / self._left_radius
         right = (twist.linear + half) / self._right_radius
         return WheelSpeeds(right, left, left, right)
 
     def twist(self, speeds: WheelSpeeds) -> Twist:
-        """Return the twist of these wheel speeds by equations (1) to (3)."""
+        """Return the twist that these wheel speeds cause, by equations (1) to (3)."""
         linear, angular = self.moved(speeds.as_tuple())
         return Twist(linear, angular)
 
     def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
         """Return the distance (m) and the turn (rad) of the base for these wheel angles (rad).
 
-        `wheels` is in the order of `WHEELS`. For wheel speeds the result is a twist. The method is
-        faster than `twist`, because each feedback line needs it several times.
+        `wheels` is in the order of `WHEELS`. For wheel speeds (rad/s), the result is a linear speed
+        (m/s) and a turn rate (rad/s). This method is faster than `twist`, because each feedback
+        line needs it several times.
         """
         front_right, front_left, rear_left, rear_right = wheels
         left = self._left_radius * (front_left + rear_left) / 2

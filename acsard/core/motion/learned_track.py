@@ -2,8 +2,8 @@
 
 While a gyro measures the heading, each turn shows the true effective track (`gyro_match.py`). When
 the gyro is silent, this learned track is better than the configured one, which may come from
-another floor. It is used if `[odometry] learned_track` is true, if it is certain enough, and if it
-is within bounds. It affects only later turns, so the pose does not jump.
+another floor. The learned track is used if `[odometry] learned_track` is true, if it is certain
+enough, and if it is within bounds. It affects only later turns, so the pose does not jump.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ It is half of `gyro_match.FINE`, the error of a single moment, because a drive h
 """
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
-"""Relative standard deviations below which the track becomes known, and above which unknown."""
+"""Relative standard deviation below which the track becomes known, and the one above which it
+becomes unknown."""
 
 BOUNDS = (0.5, 2.5)
 """Range of the learned track, divided by the configured one.
@@ -31,7 +32,7 @@ slippery ones. Beyond the range, one of the two tracks must be wrong.
 INWARDS = 1.05
 """Factor by which the track must be inside the range before it is used.
 
-Without it, a track near a bound could be used and not used in turn.
+Without this hysteresis, a track near a bound could alternately be used and not be used.
 """
 
 NOTES: dict[TrackUse, str] = {
@@ -48,7 +49,7 @@ class Track(Struct, frozen=True):
     share: float = 1.0
     """The track divided by the configured one."""
     deviation: float = 0.0
-    """Relative standard deviation.
+    """Relative standard deviation of the track.
 
     It is 0 for the configured track, whose standard deviation is a setting of `[odometry]`.
     """
@@ -68,10 +69,10 @@ class LearnedTrack:
         self.used = CONFIGURED
         """The track in use."""
         self.event: Event | None = None
-        """The event of the last `look`, or None if it did not change the use."""
+        """The event if the last `look` changed the use, otherwise None."""
 
     def look(self, learned: Track | None) -> None:
-        """Choose the track. `learned` is the track learned so far, or None without one."""
+        """Choose the track to use. `learned` is the track learned so far, None without one."""
         before, self.event = self.use, None
         self.use = _use(learned, before)
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
@@ -91,7 +92,10 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Return the learned and the configured multiplier in words, and which one is in use."""
+    """Return the learned and the configured multiplier in words, and which one is in use.
+
+    `multiplier` is the configured track divided by the wheel separation.
+    """
     value = learned.share * multiplier
     configured = "" if use == "used" else " in use"
     return (
@@ -101,9 +105,10 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
 
 
 def tracks(gyro: GyroStatus, multiplier: float) -> str:
-    """Return the same words for the state of the gyro, or "" if no track is learned yet.
+    """Return the learned and the configured multiplier in words, from the state of the gyro.
 
-    `multiplier` is the configured track divided by the wheel separation.
+    `multiplier` is the configured track divided by the wheel separation. The result is "" if no
+    track is learned yet.
     """
     if gyro.track is None:
         return ""

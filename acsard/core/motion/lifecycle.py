@@ -1,18 +1,18 @@
 """Holds the latches and the other facts, and derives the mode from both.
 
 A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
-time, and only `activate` releases `inactive`. Neither may release a stop or a `deactivate` that its
-sender has not seen, however late the network delivers it:
+time, and only `activate` releases `inactive`. Neither request may release a stop or a `deactivate`
+that its sender has not seen, even if the network delivers the request late:
 
 - A request that names a number releases the latch with exactly this number.
-- A request without a number is refused until `LOOK_FIRST_S` after the last stop or `deactivate`,
-  and after the start. A clear may release a fault that its sender has not seen, because a fault
-  that persists latches again.
+- A request without a number is refused if less than `LOOK_FIRST_S` has passed since the last stop
+  or `deactivate`, or since the start of the daemon. A `clear` may release a fault that its sender
+  has not seen, because a fault that persists latches again.
 - A request that arrived before the latch was set never releases it.
 
 A pressed emergency stop at the robot, a pressed bumper and an empty battery latch a stop too, and a
-fault of a motor driver latches a fault. Nothing releases a latch while the board reports one of
-them. `emergency_stop.py`, `bumpers.py` and `battery.py` decide how long such a cause lasts.
+fault of a motor driver latches a fault. `clear` releases nothing while one of these causes lasts.
+`emergency_stop.py`, `bumpers.py` and `battery.py` decide how long such a cause lasts.
 
 `modes.py` derives the mode. `core/robot.py` decides how the wheels follow it.
 """
@@ -28,13 +28,15 @@ from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, re
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0
-"""Seconds in which a request must name the latch: a sent packet seldom takes longer."""
+"""Seconds after a stop, a `deactivate` or the start in which a request must name the number of the
+latch. The network seldom takes longer to deliver a packet."""
 
 LONG_AGO_NS = -(2**62)
-"""Monotonic time before every other one."""
+"""Monotonic time before every other one, ns."""
 
 _DAYS_TO_1970 = 719_468
-"""Days from 0000-03-01 to 1970-01-01; years that begin in March end with the leap day."""
+"""Days from 0000-03-01 to 1970-01-01. The calculation starts years in March, so the leap day is the
+last."""
 
 _DAYS_PER_400_YEARS = 146_097
 
@@ -43,73 +45,86 @@ class Lifecycle:
     """Latches and mode of one robot. A request that is not allowed raises `RefusedError`."""
 
     def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start in the mode of these latches, or switched off if `active` is False."""
+        """Start with these latches, of which an earlier run may have kept some.
+
+        If `active` is False, the robot is also switched off until the first `activate`.
+        """
         self.latches = latches
         self.mode = Mode.WAITING
         self._shutting_down = self._linked = self._commanded = False
         self._dormant = not active
-        """True until the first `activate`, with `control.auto_activate = false`."""
+        """Whether the robot still waits for its first `activate` (`control.auto_activate = false`).
+        """
         found = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in found if latch is not None], default=0)
         self._numbered = False
-        """True from the first latch of this run on, which has a number that no earlier run used."""
+        """Whether this run has set a latch. The number of the first one is chosen so that no
+        earlier run used it."""
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
-        """Monotonic times at which the last stop and the last fault were latched."""
+        """Monotonic times at which the last stop and the last fault were latched, ns."""
         self._cleared_ns = LONG_AGO_NS
-        """Monotonic time at which a fault over a stop was last cleared."""
+        """Monotonic time at which a fault was last cleared, ns. A stop may have been latched beside
+        it."""
         self._stop_asked_ns = LONG_AGO_NS
-        """Monotonic time at which the last stop arrived."""
+        """Monotonic time at which the request for the last stop arrived, ns."""
         self._off_ns = LONG_AGO_NS
-        """Monotonic time at which the robot was last switched off."""
+        """Monotonic time at which the robot was last switched off, ns."""
         self._held = self._mend = ""
-        """Why the board lets nothing release a latch, in words, and what to do about it; "" while
-        it lets a clear release one."""
+        """Why `clear` may release nothing, in words, and what the operator must do about it. Both
+        are "" if the reports of the board forbid no clear."""
         self._freed_ns = LONG_AGO_NS
-        """Monotonic time of the step in which the board last began to let a clear release one."""
+        """Monotonic time of the step in which the reports of the board last began to permit a
+        clear, ns."""
         self._began_ns: int | None = None
-        """Monotonic time of the first step, None before it."""
+        """Monotonic time of the first step, ns; None before that step."""
         self._derive()
 
     # facts
 
     def begin(self, now: Instant) -> None:
-        """Note that a step begins; only the first one counts."""
+        """Record the time `now` as the start of the first step. Later calls change nothing."""
         if self._began_ns is None:
             self._began_ns = now.mono_ns
 
     def link(self, up: bool) -> None:
-        """Note whether the link to the board is up."""
+        """Record whether the link to the board is up, and derive the mode."""
         if up is not self._linked:
             self._linked = up
             self._derive()
 
     def command(self, fresh: bool) -> None:
-        """Note whether there is a command to follow."""
+        """Record whether there is a command to follow, and derive the mode."""
         if fresh is not self._commanded:
             self._commanded = fresh
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop under a new number that no client asked for. `why` is a whole sentence."""
+        """Latch a stop for a cause that the board reports, under a new number.
+
+        `why` is the reason as a whole sentence.
+        """
         self._stopped_ns = self._stop_asked_ns = now.mono_ns
         self._latch(stop=self._made(now, "", why))
 
     def hold(self, why: str, mend: str, now_ns: int) -> None:
-        """Note why the board lets nothing release a latch, "" if it lets, and what to do then.
+        """Record whether the reports of the board forbid a clear.
 
-        `now_ns` is the monotonic time of this step.
+        Args:
+            why: Why nothing may be cleared, "" if the board permits a clear.
+            mend: What the operator must do about it, "" if the board permits a clear.
+            now_ns: Monotonic time of this step, ns.
         """
         if self._held and not why:
             self._freed_ns = now_ns
         self._held, self._mend = why, mend
 
     def leave(self) -> None:
-        """Note that the daemon is going down."""
+        """Record that the daemon is going down."""
         self._shutting_down = True
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault; return False and keep the earlier one if a fault is latched already."""
+        """Latch a fault for the reason `why`; return False and keep an earlier one."""
         if self.latches.fault is not None:
             return False
         self._faulted_ns = now.mono_ns
@@ -119,7 +134,15 @@ class Lifecycle:
     # requests
 
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
-        """Latch a stop under a new number, unless a later stop is latched already."""
+        """Latch a stop under a new number, and return the answer for the client.
+
+        If the latched stop was requested at the same time or later, that stop stays.
+
+        Args:
+            by: Name of the client, "" if unknown.
+            asked_ns: Monotonic time at which the request arrived.
+            now: Both clocks at this step.
+        """
         repeated = self.latches.stop is not None and asked_ns <= self._stop_asked_ns
         if not repeated:
             self._stopped_ns, self._stop_asked_ns = now.mono_ns, asked_ns
@@ -131,10 +154,10 @@ class Lifecycle:
         return "stopped and latched; srv/clear releases it"
 
     def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
-        """Release the fault, or else the stop; return the answer, or "" if none was latched.
+        """Release the fault, or else the stop, and return the answer; "" if none was latched.
 
         Args:
-            number: The latch that the sender has seen, None if the request names none.
+            number: Number of the latch that the sender has seen, None if the request has none.
             asked_ns: Monotonic time at which the request arrived.
             now: Both clocks at this step.
         """
@@ -145,7 +168,8 @@ class Lifecycle:
         if latch is None:
             return ""
         if asked_ns <= self._freed_ns:
-            # The step may have taken longer than a press, and the call may have come during it.
+            # This call may have arrived before the release, and the press may have been shorter
+            # than a step.
             raise RefusedError("this call came before the release: call srv/clear again")
         if number is None:
             self._require_seen_stop(asked_ns)
@@ -196,26 +220,30 @@ class Lifecycle:
         return True
 
     def deactivate(self, by: str, now: Instant) -> str:
-        """Switch the robot off under a new number, also if it is off already."""
+        """Switch the robot off under a new number, even if it is off already; return the answer.
+
+        `by` is the name of the client, "" if unknown.
+        """
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
         self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
         return "inactive: ramping to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
-        """Keep these limits, which `set` made lower than in the configuration file."""
+        """Record beside the latches the limits that `set` lowered below the configuration file."""
         if limits != self.latches.lowered:
             self.latches = replace(self.latches, lowered=limits)
 
     @property
     def why(self) -> str:
-        """Why the mode is `fault`, `stopped` or `inactive`, with the call that changes it."""
+        """The reason of the mode `fault`, `stopped` or `inactive`, with the call that ends it."""
         latches, held = self.latches, self._held
         if latches.next is not None:
             fault, stop = latches.fault, latches.stop
             parts = [] if fault is None else [f"{fault.why}, latched {_when(fault)}"]
             if held and held not in [latch.why for latch in (fault, stop) if latch]:
-                # A client has stopped the robot since an input was pressed, or another one was.
+                # The cause that lasts is not the latched one: since then a client has stopped the
+                # robot, or the board has reported another cause.
                 parts.append(held)
             if stop is not None:
                 parts.append(_said(stop))
@@ -256,7 +284,10 @@ class Lifecycle:
         )
 
     def _require_seen_stop(self, asked_ns: int) -> None:
-        """Raise `RefusedError` if the sender of a clear may not know the stop that is latched."""
+        """Raise `RefusedError` if the sender of a clear may not know the latched stop.
+
+        `asked_ns` is the monotonic arrival of the request.
+        """
         stop = self.latches.stop
         if stop is None:
             return
@@ -269,7 +300,14 @@ class Lifecycle:
         self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
 
     def _require_seen(self, latch: Latch, set_ns: int, asked_ns: int, call: str) -> None:
-        """Raise `RefusedError` if this latch is so new that the sender may not know it."""
+        """Raise `RefusedError` if the latch is so new that the sender may not know it.
+
+        Args:
+            latch: The latch that the request would release.
+            set_ns: Monotonic time at which this run set it; long ago if an earlier run did.
+            asked_ns: Monotonic time at which the request arrived.
+            call: Name of the service, for the message.
+        """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
         if since >= LOOK_FIRST_S * NS_PER_S:
@@ -277,8 +315,8 @@ class Lifecycle:
         age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
         came = f"the robot was {_stopped(latch)} {age_s:.1f} s ago"
         if set_ns < began_ns:
-            # The monotonic clock does not reach back before the start, and the wall clock may have
-            # been set since.
+            # An earlier run set the latch. Its age is unknown, because the monotonic clock may have
+            # restarted and the wall clock may have been set since.
             came = f"the daemon started {age_s:.1f} s ago and the robot is still {_stopped(latch)}"
         raise RefusedError(
             f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, "
@@ -287,14 +325,15 @@ class Lifecycle:
 
 
 def number_after_restart(kept: int, now: Instant) -> int:
-    """Return a number for a latch that no earlier run of the daemon has given to another latch.
+    """Return a number for a new latch that no earlier run of the daemon gave to another latch.
 
-    A latch that was released is not in the latch file. If the wall clock went back, the number that
-    follows the kept ones may be the number of such a latch, and a late `clear` of that one would
-    release the new one. The time since the computer started makes the two numbers differ.
+    The latch file does not contain latches that were released. If the wall clock went back, a
+    number just above the kept ones may be that of a released latch. A late `clear` of that latch
+    would then release the new one. Adding the time since the computer started makes the two numbers
+    differ.
 
     Args:
-        kept: The largest number of the latches that were kept, or less than 1 without any.
+        kept: The largest number of the latches in the latch file, or less than 1 without any.
         now: Both clocks at this step.
     """
     number = now.wall_ns // 1_000_000
@@ -309,7 +348,7 @@ def _not_in_force(number: int, still: str, call: str) -> str:
 
 
 def _stopped(latch: Latch) -> str:
-    """Return the reason of a stop or of switching off as the end of "the robot is still"."""
+    """Return the reason of a latch as the end of the sentence "the robot is still ..."."""
     return latch.why if _asked_for(latch) else f"stopped ({latch.why})"
 
 
@@ -323,13 +362,13 @@ def _asked_for(latch: Latch) -> bool:
 
 
 def _said(latch: Latch) -> str:
-    """Return the words for a stop or for switching off, with the time."""
+    """Return the reason of a latched stop or `deactivate` in words, with its time."""
     if not _asked_for(latch):
         return f"{latch.why} (latched {_when(latch)})"
     return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"
 
 
-# A latched robot says in each step when it was latched.
+# The daemon publishes the time of a latch in every step, so the text is cached.
 @lru_cache(8)
 def utc(wall_ns: int) -> str:
     """Return a time given in ns since 1970 as `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""

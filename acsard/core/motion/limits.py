@@ -1,8 +1,9 @@
-"""Limits a wished twist: speed, wheel saturation, acceleration, deceleration and jerk.
+"""Limits a requested twist: speed, wheel saturation, acceleration, deceleration and jerk.
 
-There are two ways to move. `follow` obeys a commander, each axis by its own limits. `coast` goes to
-rest without one, and both axes fall together, so that no wheel's speed ever grows on the way
-(invariant 2). Jerk limits speeding up only, because comfort must not delay braking.
+There are two ways to move. `follow` obeys a commander and limits each axis by itself. `coast`
+brings the robot to rest without a commander. It reduces both axes in the same proportion, so that
+no wheel becomes faster meanwhile (invariant 2 of the package `acsard`). The jerk limit applies only
+to speeding up, because comfort must not delay braking.
 """
 
 from __future__ import annotations
@@ -31,18 +32,20 @@ class _State(Struct, frozen=True):
 
 
 class Limiter:
-    """The last allowed twist, moved by the limits."""
+    """Moves the allowed twist towards a requested one, step by step and within the limits."""
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self.state = _State(REST, 0.0, 0.0)
-        """The whole memory. Restoring it undoes a step whose line did not leave."""
+        """All that the limiter remembers of earlier steps. The daemon restores an earlier value to
+        undo a step whose command line was not written to the port."""
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:
-        """Use these limits from now on. A twist above them falls by the deceleration.
+        """Use these limits from now on.
 
-        A lower wheel speed limit holds at once, so it may change only at rest.
+        A twist above them slows down at the configured deceleration. A lower limit of the wheel
+        speed takes effect at once, so the caller may lower it only at rest.
         """
         self._linear = _Axis(
             limits.linear_speed,
@@ -60,16 +63,16 @@ class Limiter:
         )
         self._wheel_speed = limits.wheel_speed
         self._wished = self._goal = REST
-        """The last wished twist, and the same twist within the limits of speed."""
+        """The last requested twist, and the same twist within the limits of speed."""
 
     @property
     def twist(self) -> Twist:
-        """The twist that was allowed last."""
+        """The last allowed twist."""
         return self.state.twist
 
     def follow(self, wished: Twist, dt: float) -> Twist:
-        """Move towards the finite twist `wished` for `dt` s; return the twist to apply."""
-        if wished is not self._wished:  # a sender repeats its command less often than the daemon
+        """Move towards the finite twist `wished` for `dt` s, and return the twist to apply."""
+        if wished is not self._wished:  # the daemon steps more often than a sender sends
             self._wished = wished
             self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
         goal, now = self._goal, self.state
@@ -79,16 +82,17 @@ class Limiter:
         angular, slope_w = _approach(
             now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
         )
-        # Each axis moves at its own pace, so the two together can ask more of a wheel than at
-        # either end.
+        # Each axis moves at its own rate. On the way both together may need a faster wheel than at
+        # the start or at the goal.
         twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)
         self.state = _State(twist, slope_v, slope_w)
         return twist
 
     def coast(self, dt: float, stop: bool = False) -> Twist:
-        """Fall towards rest for `dt` s in a straight line; `stop` brakes by the stop limits.
+        """Slow down for `dt` s, both axes in the same proportion; return the twist to apply.
 
-        A negative `dt` changes nothing, because it must not speed up the robot.
+        If `stop` is true, the stop decelerations apply. A negative `dt` changes nothing, because it
+        must not speed up the robot.
         """
         dt, twist = max(0.0, dt), self.twist
         seconds = max(
@@ -127,10 +131,14 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    """Return `speed` after `dt` s on the way to `goal`, and the slope used, within the limits."""
+    """Return `speed` after `dt` s on the way to `goal`, and the slope (change of speed per s) used.
+
+    `slope` is the slope of the step before.
+    """
     if dt <= 0.0:
         return speed, slope
-    # Pass zero in two parts: slowing down is deceleration, and speeding up afterwards is not.
+    # Split a change of direction at zero: slowing down is limited as deceleration, and speeding up
+    # again as acceleration.
     target = 0.0 if speed * goal < 0 else goal
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
@@ -138,19 +146,19 @@ def _approach(
         slope = slope if slope * wanted > 0 else 0.0  # left over from braking
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
-        # The slope may not fall faster than jerk allows unless it would pass the goal. It also
-        # never exceeds the acceleration, which may have been lowered.
+        # The slope may fall faster than jerk allows only if it would pass the goal otherwise. It
+        # never exceeds the acceleration limit, which may have been lowered.
         most = min(axis.acceleration, max(most, abs(slope) - step))
     used = max(-most, min(most, wanted))
-    # Landing exactly: wanted * dt need not give the difference back in floating point.
+    # Return the goal itself if it is reached: in floating point, speed + wanted * dt may miss it.
     return (target if used == wanted else speed + used * dt), used
 
 
 def _flattenable(away: float, step: float, dt: float) -> float:
-    """Return the steepest slope from which falling by `step` every `dt` ends within `away`.
+    """Return the steepest slope that can still fall to zero before the speed has changed by `away`.
 
-    The slopes s, s - step and so on over n more periods add up to dt ((n + 1) s - step n (n + 1) /
-    2).
+    The slope falls by `step` in each period of `dt` s. The slopes s, s - step and so on over n more
+    periods add up to dt ((n + 1) s - step n (n + 1) / 2).
     """
     n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)
     return (away / dt + step * n * (n + 1) / 2.0) / (n + 1)

@@ -8,8 +8,9 @@
     driving   the robot follows a fresh command
     ready     the robot is active and linked, and it follows no command
 
-The first line that holds is the mode. Only a latch that `lifecycle.py` sets or releases, the link
-and the commands change it, so the mode itself needs no memory and no transitions.
+The first mode whose condition holds is the robot's mode. Only a latch that `lifecycle.py` sets or
+releases, the link and the commands change it, so the mode itself needs no memory and no
+transitions.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from acsard.core.values import AcsardError, Verb
 
 
 class Mode(StrEnum):
-    # Enum's own hash is ten times slower, and every step looks the mode up.
+    # Enum's own hash is ten times slower, and every step looks up the mode in a dictionary.
     __hash__ = str.__hash__
 
     SHUTDOWN = "shutdown"

@@ -1,14 +1,16 @@
-"""The neutral-first rule for one sender: whether it may drive, by what it has sent.
+"""The neutral-first rule for one sender: whether it may drive, decided by the commands that it has
+sent.
 
-A sender is armed by a zero, never by a pause, and it stays armed until arming is asked for again:
+A zero arms a sender, and a pause never does. The sender stays armed until `require_neutral`:
 
-- A zero of a sender with an identity of its own arms it at once, also right behind its speeds.
-- Several programs may share an identity (a bridge, a plain key). Then a zero arms it when no speed
-  has followed for `commands.neutral_pause`. Further zeros and silence change nothing. Otherwise the
-  zero of one program would release another one that never stopped.
+- If no other program shares the sender's identity, a zero arms it at once, even directly after
+  speeds.
+- Several programs may share an identity (a bridge, a plain key). Then a zero arms the identity only
+  if no speed follows for `commands.neutral_pause`. Further zeros and silence do not change this
+  time. Without the pause, the zero of one program would arm another program that never stopped.
 
 This module holds one sender's last command and its arming. `arbiter.py` decides which sender is
-followed and asks for arming again. `freshness.py` decides whether a command counts.
+followed and when a sender must be armed again. `freshness.py` decides whether a command counts.
 """
 
 from __future__ import annotations
@@ -25,25 +27,28 @@ class Sender:
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Arrival of the zero of a shared identity that no speed has followed yet."""
+        """Arrival of a zero of a shared identity after which no speed has come yet, ns; None
+        without one."""
         self._proven_zero_ns: int | None = None
         self.name = ""
         self.twist = REST
         self.arrived_ns: int | None = None
-        """Arrival of the last command that counted since arming was last asked for."""
+        """Arrival of the last command that counted, ns; None without one since `require_neutral`.
+        """
         self.came_ns = 0
-        """Arrival of the first command after the sender was last silent: the first sender wins."""
+        """Arrival of the command that ended the sender's last silence, ns. The arbiter prefers the
+        sender that came first."""
         self.zeros_ns: int | None = None
-        """Arrival of the first zero since the last speed, or None if the last was a speed."""
+        """Arrival of the first zero since the last speed, ns; None if a speed came last."""
         self.ros = False
-        """The last command came from ROS."""
+        """Whether the last command came from ROS."""
         self.shared = False
-        """Several programs may share this identity."""
+        """Whether several programs may share this identity."""
         self.noticed_ns = 0
-        """Arrival of the last message, whether it counted or not."""
+        """Arrival of the last message, ns, even if that message did not count."""
         self._doubted_ns: int | None = None
         self.doubt: Verdict = "unproven"
-        """Why the last command that did not count was refused by its stamp."""
+        """The verdict on the stamp of the last command that did not count."""
 
     def use(self, timeout_ns: int, pause_ns: int) -> None:
         """Apply this command timeout and this `commands.neutral_pause` from now on."""
@@ -54,7 +59,7 @@ class Sender:
         return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns
 
     def doubtful(self, now_ns: int) -> bool:
-        """Return whether its stamps are the reason that its commands do not count now."""
+        """Return whether recent commands do not count because of their stamps."""
         return self._doubted_ns is not None and now_ns - self._doubted_ns <= self._timeout_ns
 
     def armed(self, now_ns: int) -> bool:
@@ -63,34 +68,41 @@ class Sender:
         return self._armed
 
     def require_neutral(self) -> None:
-        """Forget the last command and ask for a zero again."""
+        """Forget the last command, and require a zero again if the neutral-first rule is on."""
         self.arrived_ns = self._zero_ns = self._proven_zero_ns = None
         self._armed = self._proven_armed = not self._neutral_first
 
     def unlearn(self) -> None:
-        """Forget the zeros whose stamps were never proven: they may come from a backlog."""
+        """Undo the arming by zeros whose stamps were never proven.
+
+        Such zeros may come from a backlog.
+        """
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def notice(self, at_ns: int) -> None:
-        """Take note of a message that does not count: it may have been a speed."""
+        """Record that a message arrived at `at_ns` that does not count.
+
+        It may have been a speed.
+        """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
         self.noticed_ns = at_ns
 
     def missed(self) -> None:
-        """Take note of messages that were lost unread: each may have been a speed."""
+        """Record that messages were lost before they were read. Each may have been a speed."""
         self._zero_ns = self._proven_zero_ns = None
 
     def refuse(self, command: Command, why: Verdict) -> None:
-        """Take note of a command that is stale."""
+        """Record a command that does not count, with the verdict `why` on its stamp."""
         self.notice(command.arrived_ns)
         self._doubt(command, why)
 
     def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
-        """Take a command that counts, or that will count once its clock is proven.
+        """Accept a command that counts, or that will count once the clock of its stamps is proven.
 
-        A zero that arrived before `since_ns`, when arming was last asked for, does not arm.
-        A zero of an unproven clock arms once that clock is proven, unless `unlearn` comes first.
+        A zero that arrived before `since_ns`, the time of the last `require_neutral`, does not arm.
+        A zero of an unproven clock arms once that clock is proven, unless `unlearn` is called
+        before.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
@@ -104,7 +116,7 @@ class Sender:
             self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
             if zero and unarmed:
-                self.arrived_ns = None  # a speed before the zero that arms must not count by it
+                self.arrived_ns = None  # this zero must not make an earlier speed count
             self._doubt(command, verdict)
             return
         self._proven_armed, self._proven_zero_ns = self._armed, self._zero_ns
@@ -122,7 +134,7 @@ class Sender:
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:
-        """Arm a shared identity if no speed has followed its zero for the pause."""
+        """Arm a shared identity if no speed has followed its zero for `commands.neutral_pause`."""
         if self._zero_ns is not None and now_ns - self._zero_ns >= self._pause_ns:
             self._armed = True
             if self._proven_zero_ns == self._zero_ns:

@@ -46,22 +46,22 @@ TAKEN_BACK = 128
 
 
 class Step(Struct, frozen=True, gc=False):
-    """The part of the way that one line added."""
+    """The motion that one feedback line added to the pose. It is kept to recompute the pose."""
 
     pose: Pose
     """The pose before the line."""
     pieces: tuple[Motors, ...]
-    """How far the wheels turned in it, rad."""
+    """Angles by which the wheels turned in the line, rad, one set for each arc."""
     gyro: Turn | None
-    """The turn that a gyro measured, None without a gyro."""
+    """The turn that a gyro measured, None if the wheels provided it."""
     speeds: WheelSpeeds
-    """The speeds in the line."""
+    """The wheel speeds in the line."""
     turn: float
-    """Change of the heading, rad."""
+    """Change of the heading by the line, rad."""
     on_trial: bool
     """Whether a gyro on trial will correct the turn when the gyro is proven."""
     share: float = 1.0
-    """The track by which the wheels turned the robot, as a share of the configured one."""
+    """The effective track in use, divided by the configured one."""
 
 
 class Odometry:
@@ -81,16 +81,18 @@ class Odometry:
             odometry: The table `[odometry]`.
             kinematics: The kinematics of the base.
             encoder_counts: Counts per wheel turn, 0 if unknown.
-            feedback: The table `[feedback]`, by which wheels contradict their commands.
+            feedback: The table `[feedback]` with the wheels' response time and fault time.
             quiet: Duration of silence after which the daemon commands rest, s.
         """
         self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
-        """Counts at rest whose direction is not clear yet, rad."""
+        """Wheel angles at rest that are held back from the pose because the direction of their
+        counts is not clear yet, rad."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
-        """Quantization steps of the last line, and the largest known one of them, rad/s."""
+        """Quantization steps of the wheels in the last line, and the largest known one of them,
+        rad/s."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -100,21 +102,25 @@ class Odometry:
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
         """The last lines, for recomputation."""
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
-        """Angle that no wheel turns between the edges of one count, rad."""
+        """Angle of two encoder counts, rad. A wheel at rest that rocks between the edges of one
+        count reports no larger angle."""
         self._still = 0.0
-        """Seconds without any wheel speed."""
+        """Time for which all wheel speeds have been zero, s."""
         self.twist = REST
-        """Twist of the last feedback."""
+        """Twist of the last feedback line."""
         self.speeds = STILL
-        """Wheel speeds of the last feedback."""
+        """Wheel speeds of the last feedback line."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
-        """Number of gaps in which the robot moved and the pose stood still, their duration in s,
-        and the time that gap filling covered in s."""
+        """Number of gaps in which the robot moved but the pose stood still, the sum of their
+        durations, s, and the sum of the times that gap filling covered, s."""
         self.travelled = 0.0
         """Distance since the start, forwards and backwards, m."""
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use these variances from now on, and those of the start at the next `set_pose`."""
+        """Use the variances of these settings from now on.
+
+        The variances of the start take effect at the next `set_pose`.
+        """
         self._errors.use(odometry)
 
     def turn_by(self, track: Track) -> None:
@@ -141,25 +147,30 @@ class Odometry:
         return self._path.pose
 
     def missed(self) -> dict[str, int]:
-        """Return counters of the time that no line reported, without those that are 0."""
+        """Return counters of the time that no feedback line covers, without those that are 0.
+
+        The keys are the number of gaps in which the pose stood still, their duration in ms, and the
+        time that gap filling covered in ms.
+        """
         ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
-        """Pass over an impossible line and leave its motion to the next one.
+        """Store an impossible line without using it; the next possible line includes its motion.
 
-        Counts are cumulative, so they lose nothing. Without counts only the time of the line is
+        Counts are cumulative, so none is lost. Without counts only the duration of the line is
         kept.
         """
         self._rolling.skip(feedback)
 
     def fold(self, feedback: Feedback) -> Estimate:
-        """Advance the pose by one feedback line: by its counts, else by its speeds times dt.
+        """Advance the pose by one feedback line, and return the new estimate.
 
-        After a gap without counts only the uncertainty grows. At rest the pose stays: a single
-        count is added only when its direction is clear. If a gyro provides the turn since the line
-        before, the wheels provide only the distance. The other wheel of the side replaces a faulty
-        wheel, also in the lines before.
+        The wheel angles come from the counts of the line, otherwise from its speeds times dt. After
+        a gap without counts only the uncertainty grows. At rest a single count is added only when
+        its direction is clear. If a gyro provides the turn since the line before, the wheels
+        provide only the distance. If a wheel proves faulty, the other wheel of its side replaces
+        it, also in the earlier lines in which it was wrong.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
@@ -199,15 +210,15 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles to advance by.
+        """Return the wheel angles by which to advance the pose, rad.
 
-        At rest, hold counts until their direction is clear.
+        At rest, hold counts back until their direction is clear.
         """
         turned = rolled.turned
         if self._held != NOWHERE:
             turned = plus(self._held, turned)
         if turned == NOWHERE:
-            self._held = NOWHERE  # the count has come back
+            self._held = NOWHERE  # the wheel has turned back
             return rolled.pieces
         if at_rest and max(map(abs, turned)) <= self._unsettled:
             self._held = turned
@@ -216,7 +227,7 @@ class Odometry:
         return (turned, *rolled.pieces)
 
     def _take_back(self) -> None:
-        """Recompute the last lines in which a wheel, now found faulty, was wrong.
+        """Recompute the pose from the recent lines in which a wheel, now found faulty, was wrong.
 
         The pose jumps by the error, except for the part that a gyro has corrected or will correct.
         """
@@ -239,10 +250,10 @@ class Odometry:
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
     ) -> list[tuple[float, float]]:
-        """Return the arcs (m, rad) for these wheel angles; equations (4) to (7) are linear.
+        """Return the arcs, each as distance (m) and turn (rad), for these wheel angles in rad.
 
-        A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
-        one.
+        Equations (4) to (7) hold for angles because they are linear. If a gyro provides the turn,
+        there is one arc for all pieces. Otherwise the track is `share` of the configured one.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         moved = [kinematics.moved(believed(one)) for one in pieces]
@@ -257,7 +268,14 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance by wheel angles in rad, one arc for each piece; return the turn, rad."""
+        """Advance the pose by wheel angles in rad, and return its turn, rad.
+
+        Args:
+            pieces: The wheel angles, one set for each arc.
+            turn: The turn that a gyro measured, None if the wheels provide it.
+            speeds: The wheel speeds in the line, rad/s.
+            slips: Whether the wheels slip.
+        """
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
@@ -272,7 +290,11 @@ class Odometry:
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Add the uncertainty of a filled gap, or else measure how twists change between lines."""
+        """Add the uncertainty of a filled gap, or else measure how twists change between lines.
+
+        `bridged` is the duration of the filled gap, s, and 0 without one. `before` and `twist` are
+        the twists of the line before and of this line.
+        """
         if bridged > 0.0:
             self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
@@ -296,7 +318,10 @@ class Odometry:
         return variances
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
-        """Account for `seconds` of unknown motion between two twists. The pose stands still."""
+        """Add the uncertainty of `seconds` s of unknown motion. The pose does not move.
+
+        `before` and `after` are the twists before and after this time.
+        """
         if before != REST or after != REST:
             self.gaps += 1
             self.unseen += seconds

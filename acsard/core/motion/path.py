@@ -17,7 +17,7 @@ TAU_REST = 2.4492935982947064e-16
 
 
 class Path:
-    """A path that consists of arcs, of which only the last pose is kept."""
+    """A path of arcs. The object keeps only the last pose of the path."""
 
     def __init__(self) -> None:
         self.set(Pose())

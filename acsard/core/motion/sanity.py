@@ -1,9 +1,9 @@
-"""Checks whether feedback is possible.
+"""Checks whether feedback is physically possible.
 
-`Sanity` rejects a line that shows a wheel turning or changing faster than any wheel can; the line
-is not used, and several in a row are a fault. More than one in a hundred cause a warning: either
-the wire is bad or the bound is, and true lines are lost. `wheel_faults.py` judges whether the
-wheels obey their commands.
+`Sanity` rejects a line in which a wheel turns, or changes its speed, faster than any wheel can. The
+daemon does not use such a line, and several in a row are a fault. If more than one line in a
+hundred is impossible, it logs a warning: either the wire damages lines, or a bound is too low and
+true lines are rejected. `wheel_faults.py` checks whether the wheels obey their commands.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ SLACK = 2.0
 """rad/s. Below this, coarse encoders and a robot at rest look like any fault."""
 
 STEPS = 2
-"""Counts by which two reports may differ besides the wheel's motion: each may be off by one."""
+"""Counts by which two reports may differ without a motion of the wheel: each may be off by one
+count."""
 
 SHORTEST_S = 0.004
-"""Time between two lines of a host that catches up after a stall, s. One count in it is a high
-speed."""
+"""Shortest time between two lines, s: that of a host that catches up after a stall. A single count
+in this time looks like a high speed."""
 
 
 class Sanity:
-    """The judgement of feedback, line by line. It remembers the last possible line."""
+    """Checks feedback line by line, and remembers the last possible line."""
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
@@ -44,9 +45,10 @@ class Sanity:
         self._since = 0.0
         self._impossible = 0
         self._lines = self._dropped = 0
-        """Lines of the present window, and the impossible ones among them."""
+        """Numbers of all lines and of impossible lines in the present window."""
         self.warning: Event | None = None
-        """The warning of the last line about too many impossible ones, if it was due."""
+        """The warning that too many lines are impossible, if the last line caused it; otherwise
+        None."""
 
     def forget(self) -> None:
         """Start over, because the link was lost or a fault has been cleared."""
@@ -58,10 +60,10 @@ class Sanity:
         return self._impossible >= REPEATED
 
     def impossible(self, feedback: Feedback) -> str:
-        """Return why no robot can have sent this line, "" if one can.
+        """Return why this line is impossible for any robot, "" if it is possible.
 
-        A change of speed is judged against the last possible line and the time since, so a real
-        step is believed as soon as it could have happened.
+        A change of speed is compared with the last possible line and the time since then. Therefore
+        a real jump of the speed is accepted as soon as it could have happened.
         """
         self._since += max(feedback.dt, feedback.since)
         if feedback.gap:
@@ -75,7 +77,10 @@ class Sanity:
         return ""
 
     def _count(self, why: str) -> None:
-        """Count a line in the window, with the reason if it is impossible; make a due warning."""
+        """Count a line in the window, and set the warning if it is due.
+
+        `why` is the reason if the line is impossible, otherwise "".
+        """
         self._lines += 1
         self.warning = None
         if why:
@@ -105,11 +110,11 @@ class Sanity:
         rows = zip(WHEELS, wheels, then_wheels, line.steps, turned or wheels, strict=True)
         for name, now, then, step, angle in rows:
             size, change = abs(now), abs(now - then)
-            # Unless the steps are proven counts they allow no excess speed: a faulty encoder may
-            # show any steps.
+            # A quantization step allows excess speed only if it is proved by counts. A faulty
+            # encoder may show any step.
             room = 0.0
             if line.count and turned is not None:
-                # Of n counts in a short time, n - 1 certainly lie in it.
+                # If the line has n counts, n - 1 of them certainly lie in its time.
                 room = size * min(1.0, line.count / abs(angle)) if angle else size
                 step = max(step, line.count / SHORTEST_S)
             elif turned is not None and step < math.inf:

@@ -76,7 +76,7 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return an error after the robot has moved by `dx`, `dy` m in odom."""
+    """Return the error, in the axes at the robot, after the robot moved by `dx`, `dy` m in odom."""
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 

@@ -17,8 +17,8 @@ w = n + W p, with these symbols:
 - x and n: the errors from noise on the path before and on the stretch, with covariances P and Q.
 - p: the errors of the parameters in standard deviations, independent and normal. p_i is one of
   them.
-- J and W: the effects of the parameters on the path before and on the stretch, with one column for
-  each parameter. J_i and W_i are columns.
+- J and W: the effects of the parameters on the path before and on the stretch, with one column, J_i
+  or W_i, for each parameter.
 
 The term [e, w] / 2 then adds these errors to x and y. Sums are over all stretches:
 
@@ -28,10 +28,9 @@ The term [e, w] / 2 then adds these errors to x and y. Sums are over all stretch
                                 C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, half of it for i = k
 
 Each p_i is independent of the rest and has the mean 0, so these sums are uncorrelated with each
-other and with e. Of the last two terms of the series only the part
-from noise is used. Without parameters the result is equation 55 of Barfoot & Furgale, Associating
-Uncertainty with Three-Dimensional Poses for Use in Estimation Problems, IEEE Transactions on
-Robotics 30 (2014).
+other and with e. From the last two terms of the series, only the part from noise is used. Without
+parameters the result is equation 55 of Barfoot & Furgale, Associating Uncertainty with
+Three-Dimensional Poses for Use in Estimation Problems, IEEE Transactions on Robotics 30 (2014).
 """
 
 from __future__ import annotations
@@ -65,9 +64,10 @@ class SecondOrder:
         self._noise: Vector = ORIGIN
         """Covariance (xx, xy, yy) of the sum of all [x, n] / 2 and M_i."""
         self._with_x: list[tuple[Vector, Vector]] = []
-        """E[M_i x'] for each i, with the rows x and y."""
+        """E[M_i x'] for each parameter i, with the rows x and y."""
         self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik."""
+        """C_ik for each pair of parameters, m. The keys are the indices, of which the first is not
+        smaller."""
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
@@ -77,7 +77,7 @@ class SecondOrder:
         """
 
     def widen(self) -> None:
-        """Add a parameter that has had no effect so far."""
+        """Add a parameter that has had no effect on the pose so far."""
         self._with_x.append((ORIGIN, ORIGIN))
         i = len(self._with_x) - 1
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}

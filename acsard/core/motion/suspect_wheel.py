@@ -1,13 +1,13 @@
 """Decides whether a suspect wheel has a faulty encoder, by its command or a gyro.
 
 A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
-opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if it
-is further than the other wheel from an independent reference. That is the turn by a gyro, or else
-the command: a healthy wheel is between its command and the speed that a slow wheel would have
-reached by now. Without a reference nothing is decided: a person who pushes the robot may turn one
-wheel and not the other.
+opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if an
+independent reference differs more from it than from the other wheel of its side. The reference is
+the turn by a gyro, or else the command: the speed of a healthy wheel lies between its command and
+the speed that a slow wheel would have reached by now. Without a reference nothing is decided: a
+person who pushes the robot may turn one wheel and not the other.
 
-`Suspect` judges a wheel that contradicts the other one of its side. `Stuck` watches every wheel,
+`Suspect` tests a wheel that contradicts the other one of its side. `Stuck` tests every wheel,
 because a stuck encoder agrees with the other wheel until the command changes.
 """
 
@@ -19,32 +19,36 @@ from typing import Literal
 from acsard.core.motion.wheel_witness import Expected
 
 FAULT_S, FAULT_LINES = 0.025, 2
-"""Seconds and lines for which the sign must last: three lines at 100 Hz, so one bad reading is not
-enough."""
+"""Time, s, and number of lines for which the sign must last: three lines at 100 Hz, so one bad
+reading is not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""Counts and rad by which the other wheel must have turned further meanwhile."""
+"""The two terms of the angle by which the other wheel must have turned further meanwhile: encoder
+counts and rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""Counts and rad after which even a slow wheel has left its speed. A sound wheel cannot have
-repeated one speed by then. If the other wheel has followed the command, this one is stuck."""
+"""The two terms of the angle, encoder counts and rad, by which even a slow wheel must have turned
+more or less than at its old speed. A sound wheel cannot still repeat that speed by then. If the
+other wheel has followed the command, this one is stuck."""
 
 LEAVES = 0.05
-"""rad/s by which a command must differ from that at the first repetition."""
+"""Least difference of the command from that at the first repetition of a speed, rad/s."""
 
 VOTE = 1 / 3
-"""Share of the difference between the two wheels by which this one must be further off."""
+"""Least share of the difference between the two wheels by which the suspect wheel must be further
+from the reference."""
 
 HAND_S = 0.3
-"""Seconds of one repeated speed without a command that no hand can produce."""
+"""Time for which a wheel must repeat one speed without a command to be called stuck, s. A hand
+cannot turn a wheel so evenly."""
 
 DEAD, REVERSED = 0.1, 0.3
-"""Shares of the other wheel's turn: below the first a wheel is dead, and this close to the opposite
-it is reversed."""
+"""Shares of the other wheel's turn. A wheel that turns by less than the first share is dead. A
+wheel whose turn differs from the opposite by less than the second share is reversed."""
 
 STUCK = 0.3
-"""Least difference for a stuck wheel, as a share of the faster wheel's turn. A smaller one is slip
-next to a wheel at a steady speed."""
+"""Least difference between the two wheels for a stuck one, as a share of the faster wheel's turn. A
+smaller difference is slip beside a wheel at a steady speed."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 
@@ -56,13 +60,17 @@ WORDS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    """The turns of both wheels, and the range of a true turn by one reference, rad."""
+    """The summed turns of both wheels, and the range of the true turn by one reference, rad."""
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
 
     def add(self, own: float, other: float, low: float, high: float) -> None:
-        """Add one line."""
+        """Add one line.
+
+        `own` and `other` are the turns of the suspect wheel and the other one, and `low` and `high`
+        are the range of the true turn, all in rad.
+        """
         self._own += own
         self._other += other
         self._low += low
@@ -75,7 +83,7 @@ class _Ballot:
 
     @property
     def vote(self) -> float:
-        """The suspect's part of the error, from 1 (all of it) to -1 (all is the other wheel's)."""
+        """The suspect's part of the error: 1 for all of it, -1 if all is the other wheel's."""
         return (self._off(self._own) - self._off(self._other)) / (self.apart or 1.0)
 
     @property
@@ -88,28 +96,32 @@ class _Ballot:
 
 
 class Suspect:
-    """The test of one wheel that shows the sign of a fault, line by line."""
+    """The test, line by line, of one wheel that contradicts the other one of its side."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Start over: the wheel shows no sign."""
+        """Start over, without a sign."""
         self.sign: WheelFault | None = None
         self._lines = 0
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
         self._begun: float | None = None
-        """Angle that the wheel turned in the first line, rad."""
+        """Size of the angle that the wheel turned in the first line of the test, rad; None before
+        it."""
         self._known = False
-        """Whether the command was a reference in any line."""
+        """Whether the command was a reference in any line of the test."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
-        """Return whether the wheel shows a sign of a fault, after a line of `dt` s.
+        """Add a line, and return whether the wheel shows a sign of a fault.
 
-        `own` and `other` are the angles by which this wheel and its partner turned in the line, and
-        `count` is the angle of an encoder count, rad.
-        `same` means that the wheel repeats the speed of the line before.
+        Args:
+            own: The angle by which this wheel turned in the line, rad.
+            other: The angle by which the other wheel of its side turned, rad.
+            same: Whether this wheel repeats the speed of the line before.
+            dt: Duration of the line, s.
+            count: Angle of an encoder count, rad.
         """
         sign = self._sign(own, other, same, count)
         if sign != self.sign:
@@ -121,9 +133,10 @@ class Suspect:
         return sign is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
-        """Return the sign.
+        """Return the sign, None without one.
 
-        An earlier sign is kept where all signs look alike: through zero and at rest.
+        The earlier sign is kept where all signs look alike: at rest, and when the speed crosses
+        zero.
         """
         if self.sign == "stuck" and same:
             return "stuck"
@@ -142,7 +155,16 @@ class Suspect:
         expected: Expected,
         gyro: float | None,
     ) -> None:
-        """Add the references for this line; `gyro` is the true turn by a gyro, rad, or None."""
+        """Compare both wheels with the references in this line.
+
+        Args:
+            own: The angle by which this wheel turned in the line, rad.
+            other: The angle by which the other wheel of its side turned, rad.
+            dt: Duration of the line, s.
+            count: Angle of an encoder count, rad.
+            expected: The command, and the speed of a wheel that follows it slowly.
+            gyro: The true angle of this side according to a gyro, rad, or None.
+        """
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
         # The sound wheels of a slow robot still turn against a command that has changed its sign,
@@ -155,9 +177,9 @@ class Suspect:
             self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether this wheel is faulty, and not the other wheel of its side.
+        """Return whether this wheel is faulty, rather than the other wheel of its side.
 
-        `count` is the angle between two encoder counts, rad.
+        `count` is the angle of an encoder count, rad.
         """
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
@@ -169,17 +191,18 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return whether a tyre cannot explain the difference to a wheel at a steady speed."""
+        """Return whether slip beside a wheel at a steady speed cannot explain the difference."""
         return self.sign != "stuck" or ballot.share >= STUCK
 
 
 class Stuck:
-    """The test of one wheel for a speed that stays although command and other wheel change.
+    """The test of one wheel for a speed that stays the same although it must change.
 
     At a steady speed a stuck encoder reports the same as a sound one. Nothing can detect it then,
     and it does not harm the pose. When the command changes, a sound wheel must report another
-    speed, even a slow wheel once it has gone a few counts further than the old speed would take
-    it. If the other wheel of the side has followed the command, the command itself was obeyed.
+    speed. Even a slow wheel must, once its angle differs by a few counts from that at the old
+    speed. If the other wheel of the side has followed the new command, the motors obeyed it, so
+    this encoder is stuck.
     """
 
     def __init__(self) -> None:
@@ -190,7 +213,7 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether the command, rad/s, differs from that at the first repetition."""
+        """Return whether `command`, rad/s, differs from that at the first repetition."""
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
@@ -198,7 +221,7 @@ class Stuck:
 
         Args:
             same: Whether the wheel turns and repeats the speed of the line before.
-            apart: Angle that the other wheel turned more in the line, rad.
+            apart: Angle by which the other wheel turned further in the line, rad.
             dt: Duration of the line, s.
             count: Angle of an encoder count, rad.
             expected: The command, and the speed of a wheel that follows it slowly.
@@ -221,19 +244,23 @@ class Stuck:
 
 
 def stands(own: float, other: float) -> bool:
-    """Return whether a wheel that turned `own` rad stands, or nearly, beside the `other`."""
+    """Return whether a wheel that turned `own` rad stands, compared with the `other` one, rad."""
     return own == 0.0 or abs(own) <= DEAD * abs(other)
 
 
 def reverses(own: float, other: float, count: float) -> bool:
-    """Return whether a wheel reports the opposite of the other one, apart from encoder counts."""
+    """Return whether a wheel that turned `own` rad reports about the opposite of the other one.
+
+    `other` is the turn of the other wheel, and `count` the angle of an encoder count, both in rad.
+    """
     return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
 
 
 def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:
-    """Return whether an earlier line with these speeds may belong to the same fault.
+    """Return whether the fault may already have been present in an earlier line.
 
-    `now` is the present speed.
+    `own` and `other` are the speeds of the faulty wheel and of the other one in that line, rad/s.
+    `now` is the present speed of the faulty wheel, rad/s.
     """
     if fault == "reversed":
         return own * other <= 0.0

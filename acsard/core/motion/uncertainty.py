@@ -28,7 +28,7 @@ The noise of a turn depends on |dyaw|. On a straight drive, the encoder counts o
 at different times, so the heading turns back and forth by one count. The sum of |dyaw| over all
 feedback lines would count this as turning, and make the variance of yaw 2 to 4 times too large. The
 heading therefore has a dead band of one count, like the backlash of a gear: only turns beyond it
-count.
+add to the noise.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ MAX_VARIANCE = 1e9
 """Largest variance, m2 or rad2. It means "unknown", and it keeps the numbers finite for years."""
 
 COARSE_COUNTS = 400
-"""Encoder counts per wheel turn that are assumed if none are configured. Few have fewer."""
+"""Encoder counts per wheel turn that are assumed if none are configured. Few encoders have less."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
@@ -85,7 +85,8 @@ class PoseUncertainty:
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
-        """Motion in odom and distance rolled since the last update of the second-order terms, m."""
+        """Motion along the x and y axes of odom, and distance that the wheels rolled, since the
+        last update of the second-order terms, m."""
         self.set(0.0)
 
     def bend(self) -> None:
@@ -171,13 +172,13 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Add variances to the last step: `along` m2 in its direction and `yaw` rad2 of heading."""
+        """Add variances to the last step: `along` in its direction, m2, and `yaw` in turn, rad2."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
 
     def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
-        """Account for a gap in the feedback, over which the pose did not move.
+        """Add the uncertainty of a gap in the feedback, during which the pose was not updated.
 
         The motions that the pose missed in several gaps add up instead of averaging out, so they
         have a column of J like a parameter.
@@ -197,7 +198,7 @@ class PoseUncertainty:
         self._columns = [*self._columns]
         gone_on = plus(self._columns[self._of_gaps], (c * distance, s * distance, turn))
         self._columns[self._of_gaps] = gone_on
-        # An unknown arc may lead to either side.
+        # The unknown motion may be an arc to the left or to the right, so add a variance sideways.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
         way_along, way_yaw, both = self._model.noise.of(distance, turn, abs(turn))
         p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)

@@ -1,19 +1,22 @@
 """Decides which wheel is faulty and which side slips.
 
-Each wheel has one way from suspicion to a fault. The wheels of a side check each other
-(`wheel_residual.py`). If they contradict each other, and one of them shows the sign of a faulty
-encoder and an independent reference contradicts it (`suspect_wheel.py`), the pose ignores that
-wheel and the other one stands in. It counts again when both have agreed for a while. If instead it
-contradicts the other one for `feedback.fault_time` of commanded motion, it is a fault. So is a
-wheel that contradicts its command for this time (`wheel_witness.py`): the other one may do so too.
+The two wheels of a side are compared with each other (`wheel_residual.py`). If they contradict each
+other, one of them may have a faulty encoder: it shows the sign of one, and an independent reference
+contradicts it (`suspect_wheel.py`). The pose then ignores this wheel and uses the other one in its
+place.
 
-Every other contradiction is slip, and so is a fault until it is proven. A side always keeps one
-wheel. A wheel that is blocked or dragged looks like one with a dead encoder and is ignored too,
-because the other wheel shows the way driven.
+- If both wheels agree again for `BACK_S` of rolling, the pose uses the ignored wheel again.
+- If the ignored wheel contradicts the other one and its command for `feedback.fault_time` instead,
+  it is a fault.
+- A wheel that contradicts its command for this time is a fault too (`wheel_witness.py`), because
+  both wheels of a side may be wrong and agree.
 
-A wheel that turns after a rest without a command is turned by something else: a hand, or a slope.
-That is reported but is never a fault, because a fault could only send the zero that is being sent
-anyway.
+Every other contradiction counts as slip, and so does a faulty encoder until it is proven. A side
+always keeps one wheel. A wheel that is blocked or dragged looks like one with a dead encoder, so it
+is ignored too. The other wheel shows the distance driven.
+
+If a wheel turns after a rest without a command, a hand or a slope turns it. That is reported, but
+it is never a fault, because the daemon could only react to it with the zero that it already sends.
 """
 
 from __future__ import annotations
@@ -31,28 +34,29 @@ from acsard.core.motion.wheel_witness import FAULTS, SLACK, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
-"""rad. Range in which the angle of a count is learned if none is configured. A wheel that turns
-slowly reports one count or none per line."""
+"""Range in which the angle of one encoder count is learned if it is not configured, rad. A wheel
+that turns slowly reports one count or none per line."""
 
 RECUR, SOUGHT = 3, 1000
-"""Number of times that a small angle must recur within this number of lines to be a count. Damage
-makes one."""
+"""Number of times that a small angle must recur to be taken as a count, and number of lines in
+which it must do so. A single small angle may come from a damaged line."""
 
 LEAST = 0.005
-"""rad/s. A line reports a smaller speed as zero."""
+"""Smallest speed that a feedback line can report, rad/s. It reports a smaller one as zero."""
 
 ROLLED_S, REPEATED_S = 0.2, 1.0
-"""Seconds for which wheels must turn by hand before it is reported, and least seconds between two
-reports. A robot that rocks to rest is not pushed."""
+"""Time for which wheels must turn without a command before it is reported, and least time between
+two such reports, s. A robot that rocks to rest is not being pushed."""
 
 SLIP_S = 0.5
-"""Seconds after the last contradiction for which a side still counts as slipping."""
+"""Time after the last contradiction for which a side still counts as slipping, s."""
 
 SLIP_REPORTED_S = 0.1
-"""Seconds of contradiction after which a slip is logged."""
+"""Duration of a contradiction after which a slip is logged, s."""
 
 BACK_S = 0.5
-"""Seconds for which an ignored wheel must agree, while rolling, to count again."""
+"""Duration of rolling for which an ignored wheel must agree with the other one before the pose uses
+it again, s."""
 
 Same = tuple[bool, bool, bool, bool]
 """Whether each wheel repeats the speed of the line before, in `WHEELS` order."""
@@ -64,7 +68,7 @@ LEFT, RIGHT = (1, 2), (0, 3)
 
 
 class _Side:
-    """Two wheels of a side: what they should do, which is ignored, and whether they slip."""
+    """The two wheels of one side: their expected speed, which is ignored, and whether they slip."""
 
     def __init__(self, name: str, wheels: tuple[int, int]) -> None:
         self.name, self.wheels = name, wheels
@@ -77,7 +81,7 @@ class _Side:
         """Index of the ignored wheel: 0 for the front one, 1 for the rear one, None without one."""
         self._fault: WheelFault = "dead"
         self.late = False
-        """Whether a wheel that counts turns too slowly."""
+        """Whether a wheel that is not ignored turns too slowly."""
         self._out_s = 0.0
         """Seconds for which the ignored wheel has contradicted the other one and its command."""
         self.slip_s = self._odd_s = self._agreed_s = 0.0
@@ -86,7 +90,7 @@ class _Side:
 
     @property
     def left_out(self) -> str:
-        """The ignored wheel's name, "" if both count."""
+        """The name of the ignored wheel, "" without one."""
         return "" if self.out is None else WHEELS[self.wheels[self.out]]
 
     @property
@@ -103,7 +107,7 @@ class _Side:
 
     @property
     def slow(self) -> list[str]:
-        """The wheels that turn too slowly, each with its ratio; an ignored wheel is none."""
+        """Names of the wheels that turn too slowly, each with its ratio, except an ignored one."""
         return [
             f"{WHEELS[self.wheels[i]]} {witness.ratio:.0%}"
             for i, witness in enumerate(self.witnesses)
@@ -117,7 +121,15 @@ class _Side:
             part.forget()
 
     def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
-        """Hold both wheels against the command; return whether there is evidence of a fault."""
+        """Compare both wheels with their command; return whether there is evidence of a fault.
+
+        Args:
+            seen: The reported speeds of all wheels, rad/s.
+            dt: Time since the line before, s.
+            most: Largest duration for which one line is evidence, s.
+            count: Angle of an encoder count, rad.
+            still: Whether all wheels are commanded to stand.
+        """
         i, j = self.wheels
         front, rear = self.witnesses
         bad = front.look(seen[i], self.expected, dt, most, count, still)
@@ -126,7 +138,10 @@ class _Side:
         return bad or self._out_s > 0.0
 
     def fault(self, seen: Motors, limit: float) -> str:
-        """Return the fault that has lasted longer than `limit` s in words, "" without one."""
+        """Return the words for a fault that has lasted longer than `limit` s, "" without one.
+
+        `seen` has the reported speeds of all wheels, rad/s, for the words.
+        """
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
             if i == self.out:
@@ -141,7 +156,7 @@ class _Side:
         return ""
 
     def agree(self, dt: float) -> None:
-        """Take a line in which the wheels agree."""
+        """Process a line of `dt` s in which the two wheels agree."""
         if self.suspected:
             self.suspected = False
             for suspect in self._suspects:
@@ -159,7 +174,14 @@ class _Side:
             self.out, self._out_s, self.residual.learns = None, 0.0, True
 
     def stands_still(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
-        """Test for a stuck encoder; return whether a wheel is ignored from now on."""
+        """Test both wheels for a stuck encoder; return whether the pose now ignores one of them.
+
+        Args:
+            turned: The angles of all wheels in this line, rad.
+            same: Whether each wheel repeats the speed of the line before.
+            dt: Duration of the line, s.
+            count: Angle of an encoder count, rad.
+        """
         if self.out is not None:
             return False
         for i, stuck in enumerate(self._stuck):
@@ -180,13 +202,24 @@ class _Side:
         count: float,
         by_gyro: float | None,
     ) -> bool:
-        """Take a line in which they contradict; return whether a wheel is ignored from now on."""
+        """Process a line in which the two wheels contradict each other.
+
+        Return whether the pose now ignores a wheel, or another one than before.
+
+        Args:
+            turned: The angles of all wheels in this line, rad.
+            same: Whether the front and the rear wheel repeat the speed of the line before.
+            dt: Duration of the line, s.
+            count: Angle of an encoder count, rad.
+            by_gyro: The angle of this side according to a gyro, rad; None without a trusted one.
+        """
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
             against = self.witnesses[self.out].speed * self.expected.commanded < 0.0
             if fault == "stuck" or (fault == "reversed" and against):
                 self._out_s += dt
-        # Which of two wheels is reversed may have been wrong on a slow robot.
+        # A finding that a wheel is reversed may be wrong on a slow robot, so the test goes on after
+        # it.
         if fault in ("dead", "stuck"):
             return False
         self.suspected = True
@@ -208,7 +241,10 @@ class _Side:
         return False
 
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
-        """Return whether the ignored wheel may already have been wrong in an earlier line."""
+        """Return whether the ignored wheel may already have been wrong in an earlier line.
+
+        `before` has the speeds of that line and `now` those of the last line, rad/s.
+        """
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
@@ -229,7 +265,7 @@ class _Side:
 
 
 class WheelFaults:
-    """The checks of all wheels: the wheels to ignore, and whether any slips."""
+    """Checks all wheels, and decides which to ignore and whether any slips."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
         """Start.
@@ -243,20 +279,20 @@ class WheelFaults:
         self._count = math.tau / counts if counts else COARSEST
         self._seeking, self._period = not counts, PERIOD
         self._least, self._looked = [COARSEST] * RECUR, 0
-        """The smallest angles, rad, that front wheels turned in one line, among the last `_looked`
-        lines."""
+        """The `RECUR` smallest angles by which a front wheel turned in one line, rad, among the
+        last `_looked` lines."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
-        """Whether the wheels of a side contradict each other now, or did half a second ago."""
+        """Whether the wheels of a side contradict each other, or did so in the last half second."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
-        """The message of the last line about wheels turned by hand, or ""."""
+        """The message if the last line shows that a hand or a slope turns wheels, otherwise ""."""
         self._late = False
         """Whether a wheel turns too slowly."""
         self._found: _Side | None = None
-        """The side in which the last line proved a fault."""
+        """The side with the wheel that is ignored since the last line, None without one."""
         self.events: list[Event] = []
         """Events of the last line."""
 
@@ -273,7 +309,10 @@ class WheelFaults:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """Return four wheel values with ignored wheels replaced by their partners, rad or rad/s."""
+        """Return four wheel values in which the other wheel of the side replaces an ignored one.
+
+        The values are angles, rad, or speeds, rad/s.
+        """
         if not self._leaves_out:
             return wheels
         said = list(wheels)
@@ -290,10 +329,14 @@ class WheelFaults:
             side.forget()
 
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
-        """Hold a line `dt` s after the one before against the command; call it before `look`.
+        """Compare a line with the command. Call this before `look`.
 
-        `commanded` is the commanded speeds, rad/s, None if the motors have no power; `seen` is the
-        reported ones. Return the fault that the lines prove, naming the wheel, or "".
+        Return the fault that the lines prove in words, with the name of the wheel, or "".
+
+        Args:
+            commanded: The commanded speeds, rad/s; None if the motors have no power.
+            seen: The speeds in the line, rad/s.
+            dt: Time since the line before, s.
         """
         self.pushed = ""
         if commanded is None:
@@ -305,7 +348,8 @@ class WheelFaults:
         left.expected.follow(commanded.front_left, front_left, rear_left, dt, lag)
         right.expected.follow(commanded.front_right, front_right, rear_right, dt, lag)
         still = abs(commanded.front_left) < LEAST and abs(commanded.front_right) < LEAST
-        # After a stall of the host, one line stands for the whole stall and must prove no fault.
+        # After a stall of the host, one line covers the whole stall. It alone must not prove a
+        # fault.
         most, count = limit / LINES_OF_EVIDENCE, self._count
         bad_left = left.watch(speeds, dt, most, count, still)
         bad_right = right.watch(speeds, dt, most, count, still)
@@ -315,7 +359,7 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Report, at intervals, wheels that turn after a rest against their command."""
+        """Report, but not in every line, wheels that turn after a rest without a command."""
         fastest = 0.0
         if still:
             fastest = max([
@@ -335,10 +379,15 @@ class WheelFaults:
     def look(
         self, turned: Motors, speeds: WheelSpeeds, dt: float, turn: float | None = None
     ) -> bool:
-        """Take a line: the turned angles, rad, in `dt` s, and its speeds.
+        """Compare the wheels of each side in a line; return whether the pose now ignores a wheel.
 
-        `turn` is the turn of the wheels that agrees with a trusted gyro, rad. Return whether a
-        wheel is ignored from now on; then call `was_faulty` for the lines before.
+        If it does, the caller must call `was_faulty` for the earlier lines.
+
+        Args:
+            turned: The angles of the wheels in the line, rad.
+            speeds: The speeds in the line, rad/s.
+            dt: Duration of the line, s.
+            turn: The turn that the wheels should show according to a trusted gyro, rad, or None.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -380,7 +429,7 @@ class WheelFaults:
         return self._found is not None
 
     def _standing(self, turned: Motors, same: Same, dt: float) -> _Side | None:
-        """Return the side with a stuck encoder, None without one."""
+        """Return the side in which this line shows a stuck encoder, None without one."""
         left = self._left.stands_still(turned, same, dt, self._count)
         right = self._right.stands_still(turned, same, dt, self._count)
         return self._right if right else self._left if left else None
@@ -395,11 +444,14 @@ class WheelFaults:
         return Event("wheel_fault", text, "warning", kind="slow")
 
     def was_faulty(self, before: WheelSpeeds) -> bool:
-        """Return whether the wheel that the last line proved faulty was wrong in that line too."""
+        """Return whether the wheel that is ignored since the last line was already wrong before.
+
+        `before` has the speeds of an earlier line, rad/s.
+        """
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of a count.
+        """Learn the angle of an encoder count.
 
         The smallest angle per line that recurs is at least one count.
         """
@@ -415,9 +467,14 @@ class WheelFaults:
                 self._seeking = self._count > FINEST
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        """Return the angle of the left (0) or right (1) side by the gyro and the other side, rad.
+        """Return the angle of one side according to the gyro and the other side, rad.
 
-        It counts only while the other side agrees.
+        The result is valid only while the two wheels of the other side agree.
+
+        Args:
+            i: The side whose angle is returned: 0 for the left one, 1 for the right one.
+            turned: The angles of all wheels, rad.
+            turn: The turn that the wheels should show according to the gyro, rad.
         """
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(

@@ -10,20 +10,21 @@ harmless effects explains the difference:
 - One motor reacts later than the other.
 - The speeds in a feedback line have two decimals.
 
-The comparison uses sums of wheel angles over the last moments, in which older angles have less
-weight. The wheels contradict each other if
+The comparison uses sums of recent wheel angles, in which older angles have less weight
+(`MEMORY_S`). The wheels contradict each other if
 
     |D - r A| > SHARE A + COUNTS c + LEAST
 
-D is the sum of front minus rear, A is the sum of the side's angle, r is the learned fraction, and c
-is the angle of an encoder count, all in rad but r. They slip if |D - r A| also exceeds this limit
-by LAG_S |v - its mean|, the effect of a motor that reacts later, where v is the speed of the side.
+D is the sum of front minus rear, rad, A is the sum of the side's angle, rad, r is the learned
+fraction, and c is the angle of an encoder count, rad. They slip if |D - r A| exceeds this limit by
+more than LAG_S |v - mean of v|, the effect of a motor that reacts later. v is the speed of the
+side, rad/s.
 
-Two wheels at unknown positions within a count can differ by two counts without slip. A slip by the
-fraction s at v rad/s therefore cannot be certain before 2 c / (s v). With 96 counts per turn, a
-slip of a tenth at 10 rad/s takes 0.13 s, and 0.26 s if the fraction SHARE may come from the tyres.
-With COUNTS and sums that forget, such a slip is found within 0.2 s above 22 rad/s, and never below
-11.5 rad/s.
+Two wheels at unknown positions within a count can differ by two counts without slip. Therefore a
+slip by the fraction s at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per
+turn, a slip of a tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if the tyres may cause
+the fraction SHARE of it. With COUNTS and sums that forget, such a slip is found within 0.2 s above
+22 rad/s, and never below 11.5 rad/s.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ SHARE = 0.05
 """Allowed difference as a fraction of the angle: half of the slip of 10 % that must be found."""
 
 COUNTS = 1.2
-"""Allowed difference in encoder counts. Wheels at any positions within a count rarely exceed it."""
+"""Allowed difference in encoder counts. Wheels without slip rarely exceed it."""
 
 LAG_S = 0.03
 """Allowed delay of one motor behind the other, s."""
@@ -49,28 +50,30 @@ UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
-"""Time constants with which the fraction is learned, s: normally, and from a contradiction."""
+"""Time constants of learning the fraction, s: while the wheels agree, and while they do not."""
 
 SLOWEST = 1.0
 """Wheel speed below which the fraction is not learned, rad/s."""
 
 WILD = 0.1
-"""Fraction towards which a contradiction is learned. A slip ends soon, unlike a flat tyre."""
+"""Fraction towards which the learned one moves while the wheels contradict each other. A slip ends
+soon, unlike the effect of a flat tyre."""
 
 
 class Residual:
-    """The sums of one side, and the fraction that was learned."""
+    """Compares the two wheels of one side, and learns the fraction by which they differ."""
 
     def __init__(self) -> None:
         self.ratio = 0.0
         """Learned fraction by which the front wheel turns more than the rear one."""
         self.learns = True
         self.slips = False
-        """In a contradiction, whether the difference is too large for a motor that reacts later."""
+        """Whether the difference is too large for a motor that reacts later. Valid only while the
+        wheels contradict each other."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
-        """Take a feedback line, and return whether the wheels agree.
+        """Add a feedback line, and return whether the wheels agree.
 
         Args:
             front: the angle of the front wheel, rad.
@@ -87,7 +90,7 @@ class Residual:
         self._net = keep * (self._net + mean)
         most = SHARE * way + COUNTS * count + LEAST
         if abs(total) > most:
-            # One motor may react later than the other while the speed changes.
+            # While the speed changes, a motor that reacts later causes a further difference.
             late = LAG_S * abs(mean / dt - self._net / MEMORY_S)
             self.slips = abs(total) > most + late
             self._learn(math.copysign(WILD, off * mean) * dt / DOUBTED_S)

@@ -1,13 +1,14 @@
-"""Holds wheels against their commands, and decides when a wheel is a fault.
+"""Compares wheels with their commands, and collects the evidence that a wheel is faulty.
 
 `Expected` is the one model of a healthy wheel: a first-order lag behind the command of its side.
-`wheel_faults.py` asks it which of two wheels is wrong, and `Witness` asks it whether a wheel obeys.
-The bounds around it leave room for load, slip and coarse encoders. Only behaviour that no healthy
-wheel shows is evidence, and evidence must last.
+`suspect_wheel.py` uses it to decide which of two wheels is wrong, and `Witness` uses it to decide
+whether a wheel obeys. The bounds around the expected speed leave room for load, slip and coarse
+encoders. Only behaviour that no healthy wheel shows is evidence, and evidence must last.
 
-A wheel that stands, turns against its command or turns too fast obeys as long as its speed nears
-the command. A wheel that turns the right way and too slowly is a warning with its ratio: its load,
-its battery or `feedback.response_time` may be the cause.
+If a wheel stands, turns against its command or turns too fast, it still counts as obeying while its
+speed approaches the command. If a wheel turns in the right direction but too slowly, the daemon
+logs a warning with the ratio of the speeds: the load, the battery or `feedback.response_time` may
+be the cause.
 """
 
 from __future__ import annotations
@@ -16,22 +17,24 @@ import math
 from typing import Literal
 
 SLACK = 2.0
-"""rad/s. Below this, coarse encoders and a robot at rest look like any fault."""
+"""Speed below which coarse encoders and a robot at rest look like any fault, rad/s."""
 
 COMMANDED = 0.3
-"""rad/s. A slower command shows little about which wheel is right."""
+"""Smallest command that shows which wheel is right, rad/s."""
 
 SLOWEST = 3.0
-"""Response times after which even the wheels of a slow robot follow their command."""
+"""Response time of a slow robot's wheels, as a multiple of `feedback.response_time`."""
 
 CLEAR = 1.0
-"""rad/s. A speed is the mean over the time in which one encoder count is this speed."""
+"""Speed that sets the smoothing of the measured speed, rad/s. The time constant is the time in
+which a wheel at this speed turns by one encoder count."""
 
 NEARER = 1.0
-"""rad/s by which a wheel that contradicts its command must near it to count as obeying."""
+"""Amount by which the speed of a wheel that contradicts its command must approach the command to
+count as obeying, rad/s."""
 
 RATIO_S = 2.0
-"""Seconds of driving over which a wheel's way is compared with the expected one."""
+"""Duration of driving over which a wheel's angle is compared with the expected one, s."""
 
 TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
 """Ratios below which a wheel is too slow, and above which it no longer is."""
@@ -49,20 +52,28 @@ FAULTS: dict[FaultKind, str] = {
 
 
 class Expected:
-    """The speed that healthy wheels of one side have by their command, rad/s."""
+    """The speed that healthy wheels of one side have according to their command, rad/s."""
 
     def __init__(self) -> None:
         self.commanded = self.speed = self._slow = 0.0
         self._begins = self.settled = self.clear = False
 
     def forget(self) -> None:
-        """Start over at the speed of the next line: the wheels may still coast."""
+        """Start over, with the speed of the next line as the expected one.
+
+        The wheels may still coast.
+        """
         self.commanded, self._begins, self.clear = 0.0, True, False
 
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
-        """Take the command and the reported speeds of a line, rad/s, after `dt` s.
+        """Update the expected speeds with a line, `dt` s after the one before.
 
-        `lag` is the response time of a healthy wheel, s.
+        Args:
+            commanded: The commanded speed of this side, rad/s.
+            front: The reported speed of the front wheel, rad/s.
+            rear: The reported speed of the rear wheel, rad/s.
+            dt: Time since the line before, s.
+            lag: Response time of a healthy wheel, s.
         """
         if self._begins:
             self._begins = False
@@ -72,9 +83,9 @@ class Expected:
         self.commanded = commanded
         follows = speed * commanded > 0.0
         self.clear = follows and min(abs(speed), abs(commanded)) >= COMMANDED
-        """Whether a wheel turns clearly in the direction of the command by now."""
+        """Whether a healthy wheel must turn clearly in the direction of the command by now."""
         self.settled = follows and slow * commanded > 0.0
-        """Whether even a slow wheel turns in this direction."""
+        """Whether even a slow wheel must turn in the direction of the command by now."""
 
 
 class Witness:
@@ -84,24 +95,25 @@ class Witness:
         self.driven = False
         """Whether the wheel turned on command and has not come to rest since the command ended."""
         self.ratio = 1.0
-        """Angle that the wheel turned the right way, as a share of the expected one, in the last
-        `RATIO_S` s of driving."""
+        """Angle that the wheel turned in the right direction during the last `RATIO_S` s of
+        driving, divided by the expected angle."""
         self.slow = False
-        """Whether the wheel turns the right way, but too slowly."""
+        """Whether the wheel turns in the right direction, but too slowly."""
         self.forget()
 
     def forget(self) -> None:
-        """Start over. A wheel that has not come to rest yet still must."""
+        """Start over, but remember whether the wheel must still come to rest."""
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
         self._seen, self._begins = 0.0, True
         self.evidence: dict[FaultKind, float] = dict.fromkeys(FAULTS, 0.0)
         """Seconds for which the wheel has shown each fault."""
         self._suspected = False
-        # Infinity lets the first line count as nearing. With 0, a wheel that was already too fast
-        # would never count as slowing down: slow motors latched "runaway" that way.
+        # Infinity lets the first line count as approaching the command. With 0, a wheel that was
+        # already too fast would never count as slowing down: slow motors latched "runaway" that
+        # way.
         self._nearest = math.inf
-        """Speed away from the command when the wheel last neared it, rad/s."""
+        """Speed away from the command when the wheel last approached the command, rad/s."""
         self._wrong = False
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0
@@ -109,10 +121,15 @@ class Witness:
     def look(
         self, seen: float, expected: Expected, dt: float, most: float, count: float, still: bool
     ) -> bool:
-        """Take a line that reports `seen` rad/s; return whether there is evidence.
+        """Check a line that reports `seen` rad/s; return whether it is evidence of a fault.
 
-        The line is at most `most` s of evidence. `count` is the angle of an encoder count, rad.
-        `still` means that all wheels should stand.
+        Args:
+            seen: The reported speed of this wheel, rad/s.
+            expected: The expected speed of the wheels of this side.
+            dt: Time since the line before, s.
+            most: Largest duration for which one line is evidence, s.
+            count: Angle of an encoder count, rad.
+            still: Whether all wheels are commanded to stand.
         """
         goal, command = expected.speed, expected.commanded
         if self._begins:

@@ -1,11 +1,11 @@
-"""The table of the topics in an MCAP file and in a live viewer: name, ROS type, and its definition.
+"""The table of topics in MCAP files and live viewers: name, ROS type and message definition.
 
 Each topic is encoded as CDR and has its message definition (`ros2msg` of MCAP), so Foxglove,
 Lichtblick and PlotJuggler can read it. No topic may have another encoding, because `ros2 bag play`
 refuses such a file.
 
 ROS has no type for `state`, so this topic has a type of the package `acsard` (`shapes.py`). `ros2
-bag play` reports that it leaves out the topic, and the other programs show it. The names and types
+bag play` leaves out the topic and reports that, and the programs above show it. The names and types
 of all other topics come from `transports.py`. The definitions are those of ROS 2 Jazzy and later.
 """
 
@@ -25,7 +25,7 @@ from acsard.core.ros.shapes import Log, State, state
 from acsard.core.ros.transports import PUBLISHED
 
 OURS = "acsard/msg/"
-"""Prefix of the types that ROS does not have. A file contains their definitions as well."""
+"""Prefix of the types that ROS does not have. An MCAP file has their definitions as well."""
 
 Field = tuple[str, str]
 """Type and name of a field."""
@@ -95,8 +95,9 @@ acsard/msg/RobotState: \
 """
 """Message definitions, one type in each line.
 
-A line has the name of the type, a colon, and the constants as `type NAME=value` and the fields as
-`type name` or `type name default`, separated by commas. `[]` marks a sequence and `[n]` an array.
+A line has the name of the type, a colon, and a list separated by commas. The list has constants as
+`type NAME=value`, and fields as `type name` or `type name default`. `[]` marks a sequence and `[n]`
+an array.
 """
 
 
@@ -110,13 +111,13 @@ def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
 
 
 _DECLARED = _parsed(_TEXT)
-"""The constants and fields of each type, in order, each as its type and the rest of its line."""
+"""The constants and fields of each type, in order, each as its type and the text after the type."""
 
 DEFINITIONS: dict[str, tuple[Field, ...]] = {
     name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
     for name, declared in _DECLARED.items()
 }
-"""The fields of each type, in order."""
+"""The fields of each type, in order, without the constants."""
 
 RULE = "=" * 80
 
@@ -129,7 +130,7 @@ def schema_text(name: str) -> str:
 
 
 def nested(name: str) -> tuple[str, ...]:
-    """Return the types of the fields of a type and of their fields, in the order of first use."""
+    """Return all types that a type contains, at any depth, in the order of their first use."""
     return tuple(dict.fromkeys(_nested(name)))
 
 
@@ -157,12 +158,12 @@ SOURCE = "<source>"
 
 
 class Channel(Struct, frozen=True):
-    """A topic. If its name contains `<source>`, it is one topic for each source of commands."""
+    """A topic. If its name contains `<source>`, there is one such topic for each command source."""
 
     name: str
     """Topic name relative to the namespace."""
     native: str
-    """Native key with the same content."""
+    """Native key with the same messages."""
     schema_name: str
     """ROS type as `pkg/msg/Name`."""
     message: type[Struct]
@@ -200,7 +201,7 @@ LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 """The events, each as one log message."""
 
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""The commands of each source. A stamp is the time of arrival."""
+"""The commands of each source. The stamp of a message is the arrival time of the command."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
 """The channels of the messages that `Report` builds, by native key."""
@@ -211,6 +212,6 @@ CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
     """Return the channels on which a robot publishes.
 
-    `silent` has the native keys without content, as `transports.left_out` returns them.
+    `silent` has the native keys to leave out, as `transports.left_out` returns them.
     """
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

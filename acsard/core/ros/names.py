@@ -96,11 +96,12 @@ class Qos(Struct, frozen=True):
     depth: int = 10
     """Number of samples that are kept."""
     transient: bool = False
-    """Whether a subscriber that comes later receives the kept samples."""
+    """Whether a subscriber that joins later receives the kept samples."""
     best_effort: bool = False
-    """False means reliable.
+    """Whether the endpoint is best effort; if not, it is reliable.
 
-    A best-effort subscription accepts every publisher, and a reliable one only reliable publishers.
+    A best-effort subscription accepts every publisher. A reliable subscription accepts only
+    reliable publishers.
     """
 
 
@@ -116,11 +117,11 @@ class Node(Struct, frozen=True):
 
     @property
     def token(self) -> str:
-        """Token of the node itself, which has the number 0 in its session."""
+        """Liveliness token of the node itself, which has the number 0 in its session."""
         return f"{self._head}/0/NN/%/{_mangled('/' + self.namespace)}/{self.name}"
 
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
-        """Return the token of an endpoint.
+        """Return the liveliness token of an endpoint.
 
         Args:
             number: the number of the endpoint in its session, from 1.
@@ -140,7 +141,7 @@ class Node(Struct, frozen=True):
 
 
 def rmw_qos(qos: Qos) -> str:
-    """Return a QoS profile in the form of rmw_zenoh_cpp, which leaves out default values."""
+    """Return a QoS profile as rmw_zenoh_cpp writes it. Default values are left out."""
     depth = "" if qos.depth == RMW_DEFAULT_DEPTH else qos.depth
     reliability = "2" if qos.best_effort else ""
     return f"{reliability}:{'1' if qos.transient else ''}:,{depth}:,:,:,,"
@@ -159,7 +160,7 @@ def bridge_presence(zid: str) -> str:
 def bridge_token(zid: str, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
     """Return the token with which a ros2dds bridge announces an endpoint.
 
-    The arguments are those of `Node.endpoint_token`, and the id of the Zenoh session.
+    `zid` is the id of the Zenoh session. The other arguments are those of `Node.endpoint_token`.
     """
     head = f"{bridge_presence(zid)}/{kind}/{_in_one_chunk(bridge_key(name))}"
     head += f"/{_in_one_chunk(type_name)}"

@@ -1,10 +1,10 @@
 """Offers the configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
 
-A parameter has the name of its key in `acsard.toml`, with dots between table and key. The settings
-in `core/config/live.py` can be set. This module only decodes a request to set parameters; the robot
-accepts or refuses it. The description and the range of a parameter come from the types of
-`core/config/settings.py`, which the configuration is checked with. The module also has the types of
-rcl_interfaces, because no other module uses them.
+A parameter has the name of its key in `acsard.toml`, with dots between table and key. Only the
+settings in `core/config/live.py` can be set. This module only decodes a request to set parameters.
+The robot accepts or refuses it. The description and the range of a parameter come from the types in
+`core/config/settings.py`. The module also has the types of rcl_interfaces, because no other module
+uses them.
 """
 
 from __future__ import annotations
@@ -88,9 +88,10 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 
 
 def kind_of(name: str) -> inspect.Type:
-    """Return the declared type of a setting.
+    """Return the declared type of the setting with the dotted key `name`.
 
-    The name of a source stands in place of its index. Raises `KeyError` if the name is a table's.
+    The key has the name of a source in place of its index. Raises `KeyError` for the name of a
+    table.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
@@ -110,15 +111,16 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List of parameters to set, longer than the list of all parameters.
+"""List of parameters to set.
 
-A longer list would take too much time of one control step.
+The bound is above the number of all parameters. Decoding a longer list would take too much of the
+time of a control step.
 """
 Many = Annotated[list[T], Meta(max_length=256)]
-"""List of names. It may be longer, because names take less time to decode."""
+"""List of names. It may be longer than `Some`, because names take less time to decode."""
 
 MAX_REQUEST_BYTES = 16384
-"""Largest size of a request in bytes. A list of the longest names fits."""
+"""Largest size of a request, bytes. The longest allowed list of names fits."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
@@ -161,13 +163,13 @@ class ListRequest(Struct, frozen=True):
     """Request to list parameters."""
 
     prefixes: Many[str]
-    """Prefixes of the names to list; without any, all names are listed."""
+    """Prefixes of the names to list. If there are none, all names are listed."""
     depth: Unsigned64
-    """Largest number of dots in a name, after its prefix; 0 means any number."""
+    """Largest number of parts, separated by dots, that a name has after its prefix; 0: any."""
 
 
 class ListReply(Struct, frozen=True):
-    """Reply with parameter names and their prefixes."""
+    """Reply with parameter names, and with their prefixes: the parts before the last dot."""
 
     names: list[str]
     prefixes: list[str]
@@ -216,20 +218,19 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters, which only the robot can answer."""
+"""The services that set parameters. `Parameters` cannot answer them, because the robot decides."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
     """Return the reply to a request that is refused.
 
-    Without a reply, the client would wait for ever. A reply to a request that sets parameters has a
-    result with the reason for each parameter. Other replies have no field for a reason, so they are
-    empty, as in rclcpp.
+    Without a reply, the client would wait for ever. The reply to a request that sets parameters has
+    the reason. Other replies have no field for a reason, so they are empty, as in rclcpp.
 
     Args:
         service: the name of the service.
-        why: the reason.
-        request: the payload of the request.
+        why: the reason of the refusal.
+        request: the payload of the request, which shows how many parameters it sets.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -248,7 +249,10 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 
 
 class Parameters:
-    """Answers the parameter services that only read, from the tables of a configuration."""
+    """Answers the services that only read parameters.
+
+    The values come from the tables of a configuration.
+    """
 
     def __init__(self, tables: Mapping[str, object]) -> None:
         self._values = {name: _value(value) for name, value in flat(tables)}
@@ -260,7 +264,10 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """Return the reply to a request, both in CDR. Raises `CdrError` if it is not valid."""
+        """Return the reply to a request. Raises `CdrError` if the request is not valid.
+
+        `payload` is the request in CDR, and the reply is in CDR as well.
+        """
         return self._services[service](payload)
 
     def _list(self, asked: ListRequest) -> ListReply:
@@ -302,9 +309,10 @@ def wished(payload: bytes) -> dict[str, Plain]:
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
-    """Return the reply to a request to set parameters, with the same result for each of them.
+    """Return the reply to a request to set parameters.
 
-    The robot applies all parameters or none. `payload` is that of the request.
+    The robot sets all parameters or none, so the reply has the same result for each of them.
+    `payload` is the request in CDR. Raises `CdrError` if it is not valid.
     """
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":

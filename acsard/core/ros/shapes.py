@@ -1,6 +1,6 @@
-"""Converts the messages whose fields in ROS differ from the native ones: log messages and `state`.
+"""Converts messages whose fields differ in ROS from the native ones: log messages and `state`.
 
-CDR has no maps, so the counters are a list. NaN stands for null (`cdr_types.py`).
+CDR has no maps, so the counters are a list. Null is encoded as NaN (`cdr_types.py`).
 """
 
 from __future__ import annotations
@@ -40,29 +40,32 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""Pattern of the start of a text into which `event_throttle.py` has combined several events."""
+"""Pattern of the beginning of a text in which `event_throttle.py` has combined several events."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""
 
 
 def log(event: Event | LogEvent, stamp: Time) -> Log:
-    """Return an event as a log message."""
+    """Convert an event to a log message with the time `stamp`."""
     by = f" (by {event.by})" if event.by else ""
     text = f"{event.text}{by}{how_often(event.text, event.count)}"
     return Log(stamp, LEVELS.get(event.level, 20), event.name, text)
 
 
 def how_often(text: str, count: int) -> str:
-    """Return the suffix of an event's text with the number of occurrences, such as " (3 times)".
+    """Return the number of occurrences to append to an event's text, such as " (3 times)".
 
-    It is "" for a single occurrence, and for a text that begins with its own number.
+    Returns "" for a single occurrence, and for a text that already begins with the number.
     """
     return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
 
 
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
-    """Return a source's command as a message of `cmd_vel_in/<source>`, stamped with its arrival."""
+    """Convert the command of a source to a message of `cmd_vel_in/<source>`.
+
+    The header of the message has the time `arrived` and the frame id `frame`.
+    """
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
     )
@@ -85,7 +88,7 @@ class Source(Struct, frozen=True):
 
 
 class State(Struct, frozen=True):
-    """`RobotState` as acsard/msg/RobotState, without the latencies."""
+    """A message of the ROS type acsard/msg/RobotState, with most fields of `RobotState`."""
 
     header: Header
     mode: str
@@ -113,7 +116,7 @@ class State(Struct, frozen=True):
 
 
 def state(message: RobotState) -> State:
-    """Return a `RobotState` as acsard/msg/RobotState."""
+    """Convert a native `RobotState` to a message of the ROS type acsard/msg/RobotState."""
     return State(
         header=Header(message.stamp),
         mode=message.mode,

@@ -1,8 +1,8 @@
 """The table of the robot's ROS topics and services, with the native key of each.
 
-A message on a ROS key means the same as on its native key, in both directions. Both transports use
-this table: the bridge zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw"). The bus declares
-its endpoints from it.
+A message on a ROS key means the same as on its native key, in both directions. The table serves two
+transports: zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw"). The bus declares its ROS
+endpoints from this table.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ class Endpoint(Struct, frozen=True):
     latched: bool
     """True if a new subscriber receives the last message at once."""
     type: str
-    """ROS type of the messages. A key of the bridge with two types has the first of them."""
+    """ROS type of the messages; the first type if a key of the bridge accepts two types."""
 
     @property
     def encoding(self) -> str:
         """Zenoh Encoding to assume for an incoming sample, because samples of ROS have none.
 
-        A key of the bridge does not name the type: the length of a sample shows whether it is a
-        Twist or a TwistStamped.
+        For the bridge, the encoding does not name the type, because a key may accept two types. The
+        length of a sample shows whether it is a Twist or a TwistStamped.
         """
         cdr = encoding_name("cdr")
         return f"{cdr};{self.type}" if self.transport == "rmw" else cdr
@@ -93,7 +93,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Prefix of the parameter services, which have no native key. The native tree has `config`."""
+"""Prefix of the parameter services in `RosName.native`. They have no native key; `config` is the
+native key with the same content."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -116,22 +117,23 @@ SOURCES = {
 """The command source of each topic that commands the robot."""
 
 URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
-"""The robot's description. A recording does not have it, so it is not in `PUBLISHED`."""
+"""The topic of the robot's URDF. It is not recorded, so it is not in `PUBLISHED`."""
 
 SLOWER = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 """Subscription to Nav2's speed filter."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
-"""Subscription to a gyro. It is best effort, so it also accepts drivers with SensorDataQoS."""
+"""Subscription to a gyro. It is best effort, so that it also accepts gyro drivers that publish with
+SensorDataQoS."""
 
 
 def left_out(config: Config) -> frozenset[str]:
-    """Return the native keys on which this daemon neither publishes nor listens.
+    """Return the native keys that a daemon with this configuration does not use.
 
-    ROS tools must not show them as topics.
+    The daemon does not announce them, so that ROS tools do not show them as topics.
     """
     silent = set() if config.odometry.publish_tf else {"tf"}
-    # The simulated robot has a gyro of its own.
+    # The simulated robot has a gyro of its own, so the daemon does not subscribe to one.
     if not config.odometry.gyro or config.mcu.simulated:
         silent.add(IMU)
     if not (config.lidar.publish_tf or config.footprint.publish_tf):
@@ -144,8 +146,8 @@ def left_out(config: Config) -> frozenset[str]:
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
     """Return the topics and services of a robot.
 
-    A topic that accepts both types of twists is in the result twice, once for each type. `silent`
-    has the native keys to leave out, as `left_out` returns them.
+    A topic that accepts both types of twists appears twice, once for each type. `silent` has the
+    native keys to leave out, as `left_out` returns them.
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
@@ -175,7 +177,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
 
 
 def in_ros_words(text: str, ros: RosConfig) -> str:
-    """Return a text with the ROS names of services: srv/clear becomes /acsard/clear."""
+    """Replace native names of services by their ROS names: srv/clear becomes /acsard/clear."""
     return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
 
 
@@ -183,7 +185,7 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
     """Return the ROS keys of the transports that are switched on.
 
     Args:
-        ros: the configuration.
+        ros: the table `[ros]` of the configuration.
         zid: the id of the Zenoh session.
         silent: the native keys to leave out, as `left_out` returns them.
     """
@@ -197,7 +199,10 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
 
 
 def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
-    """Return the tokens that announce the node and the bridge. `zid` is the id of the session."""
+    """Return the tokens that announce the node and the bridge to ROS.
+
+    `zid` is the id of the Zenoh session.
+    """
     tokens = []
     if ros.bridge and ros.announce:
         tokens.append(bridge_presence(zid))
@@ -212,9 +217,9 @@ def command_keys(ros: RosConfig) -> tuple[str, ...]:
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:
-    """Return the tokens that claim the ROS names on which this daemon takes commands.
+    """Return the tokens with which this daemon claims the ROS name `cmd_vel`.
 
-    Two daemons with a common token would both obey the same `cmd_vel`, so the second one does not
+    Two daemons with the same token would both follow the same `cmd_vel`, so the second one does not
     start. The tokens are in acsard's own tree, because not every daemon announces itself to ROS,
     and because other ROS nodes may have the same names.
     """

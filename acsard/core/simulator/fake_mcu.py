@@ -1,4 +1,4 @@
-"""Simulates the board: its side of the serial protocol, byte by byte, with the times of the bytes.
+"""Simulates the board: its side of the serial protocol, with the time of each byte on the wire.
 
 Without faults the simulated board does what the daemon expects of a board. It boots with stopped
 motors, obeys only complete valid lines, stops the motors after 300 ms without a valid line, and
@@ -42,20 +42,19 @@ STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
-"""Battery of six cells: its voltage when empty, the rise to a full one, V, and its resistance, ohm.
-"""
+"""Battery of six cells: voltage when empty, V; additional voltage when full, V; resistance, ohm."""
 
 REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
-"""Current at rest, A, and the current for each rad/s of each wheel, A."""
+"""Current at rest, A, and additional current for each rad/s of each wheel, A."""
 
 START_AMPS, START_NS = 10.0, 300 * MS
 """Additional current while the motors start, A, and its duration, ns. The voltage drops by 2 V."""
 
 NEVER_NS = 2**62
-"""Monotonic time after every other one."""
+"""Monotonic time that is never reached, ns."""
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Times from the end of a line to the start of its answer, ms. The board uses them in turn."""
+"""Times from the end of a line to the start of its answer, ms. The board uses one after another."""
 
 
 class FakeMcu(Faults):
@@ -72,7 +71,7 @@ class FakeMcu(Faults):
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns
-        """Monotonic time of the last `advance`, and time up to which the vehicle has moved."""
+        """Monotonic time of the last `advance`, and time up to which the vehicle has moved, ns."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -90,7 +89,8 @@ class FakeMcu(Faults):
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last lines that the board received, valid or not, each with the time of its end."""
+        """The last lines that the board received, valid or not. The time is that of their end, ns.
+        """
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False
@@ -98,15 +98,19 @@ class FakeMcu(Faults):
         self._bumpers = "." * (len(config.safety.bumpers) or 4)
         """The bumpers in a status line while none is pressed."""
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
-        """The faults of the inputs, each with its begin and end, ns, the field of the status line
-        and its value, `silent` for none. The last one that is on decides, but several bumpers may
-        be pressed at once. A field is in the line if a fault names it."""
+        """The faults of the inputs: begin (ns), end (ns), field of the status line, and its value.
+
+        The value `silent` leaves the field out of the line. If several faults of a field are on,
+        the last one decides, except that several bumpers may be pressed at once. The line has only
+        the fields that a fault names.
+        """
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
-        """Charge of the battery, 0 to 1, and its capacity, As."""
+        """Charge of the battery, 0 to 1, and its capacity, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
-        """Times at which the charge was last computed, and at which no motor was commanded."""
+        """Time at which the charge was last computed, and last time at which no motor was
+        commanded, both ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -128,7 +132,10 @@ class FakeMcu(Faults):
     # Time.
 
     def receive(self, now_ns: int, data: bytes) -> None:
-        """Take bytes that the host wrote. They arrive at the board at the rate of the wire."""
+        """Accept bytes that the host wrote at `now_ns`.
+
+        They arrive at the board at the rate of the wire.
+        """
         start, taken = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
@@ -141,7 +148,7 @@ class FakeMcu(Faults):
         self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
 
     def next_ns(self) -> int | None:
-        """Return the time of the next event, or None."""
+        """Return the monotonic time of the next event, ns, or None if there is none."""
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
@@ -180,7 +187,7 @@ class FakeMcu(Faults):
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
         """Reset the board.
 
-        Its motors stop, it ignores its input for `deaf_ns`, and it sends noise meanwhile.
+        The board stops the motors and ignores its input for `deaf_ns` ns. Meanwhile it sends noise.
         """
         self._now_ns = now_ns
         self._events.clear()
@@ -269,7 +276,11 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the bytes that the USB adapter passes to the host now. It keeps the others."""
+        """Return the bytes that the USB adapter passes to the host now, and keep the other bytes.
+
+        `what` is "sent" if the board has sent `data`, or "batch" if the adapter's timer has
+        expired.
+        """
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
@@ -302,7 +313,7 @@ class FakeMcu(Faults):
         if now_ns - since >= SHORTEST_WINDOW_NS:
             counts = self._encoders()
             if counts == before and self.frozen is None:
-                # No motor has turned by a count, so faults of gains and swapped wires show nothing.
+                # No motor has turned by a count, so wrong gains and swapped wires have no effect.
                 self._moved, self._measured = [0] * 4, [0.0] * 4
                 self._window = (now_ns, counts)
                 return [0.0] * 4
@@ -329,7 +340,7 @@ class FakeMcu(Faults):
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
     def _tell_inputs(self, now_ns: int) -> None:
-        """Send a status line with the inputs, without those that it is silent about."""
+        """Send a status line with the inputs, without the fields with the value `silent`."""
         fields: dict[str, str] = {}
         for begin_ns, end_ns, name, value in self._inputs:
             before = fields.setdefault(name, self._bumpers if name == "bumpers" else "ok")
@@ -345,7 +356,7 @@ class FakeMcu(Faults):
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
     def _tell_battery(self, now_ns: int) -> None:
-        """Send a status line with the battery, after it was drained since the last one."""
+        """Drain the battery for the time since the last call, and send a status line about it."""
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
@@ -359,7 +370,7 @@ class FakeMcu(Faults):
         self._tell(now_ns, {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge})
 
     def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
-        """Send a status line at once when an input changes."""
+        """Schedule a status line for each time at which a fault of an input begins or ends."""
         for change_ns in (begin_ns, end_ns):
             if self._now_ns <= change_ns < NEVER_NS:
                 self._schedule(change_ns, "status", b"")
@@ -371,43 +382,50 @@ class FakeMcu(Faults):
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Report an emergency stop that is pressed in `after_s` s, for `length_s` s (0: it stays).
+        """Report an emergency stop that is pressed after `after_s` s, for `length_s` s.
 
-        Before and after that it is released.
+        Before and after that it is released. With a length of 0 it stays pressed.
         """
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Report a released emergency stop, and nothing about it between these times."""
+        """Report a released emergency stop, but stop reporting it after `after_s` s.
+
+        The board reports it again `length_s` s later, or never if `length_s` is 0.
+        """
         return self._input("estop", "silent", after_s, length_s)
 
     def bumpers(self) -> Fault:
-        """Report released bumpers: those of `safety.bumpers`, or four if it is empty."""
+        """Report released bumpers: those of `safety.bumpers`, or four if that setting is empty."""
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Report that bumper `number` is pressed in `after_s` s, for `length_s` s (0: it stays).
+        """Report that bumper `number` is pressed after `after_s` s, for `length_s` s.
 
-        The first bumper of the board has the number 1.
+        The first bumper of the board has the number 1. With a length of 0 it stays pressed.
         """
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Report released bumpers, and nothing about them between these times."""
+        """Report released bumpers, but stop reporting them after `after_s` s.
+
+        The board reports them again `length_s` s later, or never if `length_s` is 0.
+        """
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Report a fault of a motor driver between these times, and motor drivers without fault
-        before and after them.
+        """Report a fault of a motor driver after `after_s` s, for `length_s` s.
+
+        Before and after that the motor drivers have no fault. With a length of 0 the fault stays.
         """
         return self._input("driver", "fault", after_s, length_s)
 
     @contextmanager
     def battery(self, percent: float, minutes: float) -> Iterator[None]:
-        """Report a battery ten times a second. It begins with this charge, %, and is drained.
+        """Report a battery ten times a second. It has `percent` % of its charge at first.
 
-        A full one lasts `minutes` while the robot stands, and shorter while it drives.
+        A full battery lasts `minutes` minutes while the robot stands, and less while it drives.
         """
         clock = b"battery %d" % next(self._order)
         self._schedule(self._now_ns + STATUS_NS, "battery", clock)
@@ -438,7 +456,10 @@ class FakeMcu(Faults):
 
     @contextmanager
     def free_running(self, period_s: float = 0.1) -> Iterator[None]:
-        """Report every `period_s` s instead of answering, unpadded and with a trailing comma."""
+        """Report every `period_s` s instead of answering lines.
+
+        The reports have unpadded speeds and a trailing comma.
+        """
         period_ns = int(period_s * NS_PER_S)
         # The name of the clock is new, so that events of an older clock are ignored.
         clock = b"clock %d" % next(self._order)

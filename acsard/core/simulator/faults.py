@@ -1,7 +1,7 @@
-"""The faults of the simulated board and its wire. Each is a method that returns a `with` block.
+"""The faults of the simulated board and its wire. Each fault is a method for a `with` statement.
 
-This module has the switches, and `fake_mcu.py` implements their effects. No fault is random: a
-fault of lines affects every n-th line.
+This module has the switches of the faults, and `fake_mcu.py` implements their effects. No fault is
+random. A fault that affects only some lines affects every n-th line.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ WATCHDOG_NS = 300_000_000
 
 
 class Faults:
-    """The switches of all faults. A `with` block turns a fault on, and off at its end."""
+    """The switches of all faults. A fault is on inside its `with` block."""
 
     def __init__(self) -> None:
         self.muted = False
@@ -72,7 +72,7 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        """Set these switches, after the vehicle has moved up to now with the old values."""
+        """Move the vehicle up to now with the old values, then set these switches."""
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)
@@ -81,12 +81,15 @@ class Faults:
         """Move the vehicle up to now. The subclass with the vehicle implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event of kind `what`, and return whether its number is a multiple of `every`."""
+        """Count an event of kind `what`, and return whether the fault affects this event.
+
+        The fault affects every `every`-th event, or none if `every` is 0.
+        """
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
 
     def _damaged(self, data: bytes) -> bytes:
-        """Return the data that the wire delivers. It may have one flipped bit."""
+        """Return `data` as the wire delivers it. The fault `bit_errors` may flip one bit."""
         if not data or not self._hit("bit", self.bit_error):
             return data
         place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
@@ -98,11 +101,11 @@ class Faults:
         return block
 
     def mute(self) -> Fault:
-        """Receive and drive, but answer nothing."""
+        """Receive lines and drive, but send no reply and no status line."""
         return self._with(muted=True)
 
     def noise(self, data: bytes = b"\x00\xff~") -> Fault:
-        """Send other bytes in front of each reply."""
+        """Send the bytes `data` in front of each reply."""
         return self._with(noise_bytes=data)
 
     def partial_line(self) -> Fault:
@@ -118,40 +121,40 @@ class Faults:
         return self._with(stuck=wheel)
 
     def frozen_encoder(self, wheel: int) -> Fault:
-        """Report that motor `wheel` (0 to 3 for a to d) keeps turning at its present speed."""
+        """Report that motor `wheel` (0 to 3 for a to d) keeps its last measured speed."""
         return self._with(frozen=wheel)
 
     @contextmanager
     def swapped_wheels(self, wheel: int, other: int) -> Iterator[None]:
-        """Swap the wheels of two channels, both motor and encoder."""
+        """Swap the wheels of two channels (0 to 3 for a to d), both motor and encoder."""
         with self.swapped_motors(wheel, other), self.swapped_encoders(wheel, other):
             yield
 
     def swapped_motors(self, wheel: int, other: int) -> Fault:
-        """Swap the motors of two channels."""
+        """Swap the motors of two channels (0 to 3 for a to d)."""
         return self._with(drivers=_swapped(self.drivers, wheel, other))
 
     def swapped_encoders(self, wheel: int, other: int) -> Fault:
-        """Swap the encoders of two channels."""
+        """Swap the encoders of two channels (0 to 3 for a to d)."""
         return self._with(encoders=_swapped(self.encoders, wheel, other))
 
     @contextmanager
     def reversed_wheel(self, wheel: int) -> Iterator[None]:
-        """Reverse both the motor and the encoder of a wheel, as if it were mounted backwards."""
+        """Reverse the motor and the encoder of channel `wheel` (0 to 3 for a to d)."""
         with self.reversed_motor(wheel), self.reversed_encoder(wheel):
             yield
 
     def reversed_motor(self, wheel: int) -> Fault:
-        """Swap the two leads of a motor."""
+        """Swap the two leads of the motor of channel `wheel` (0 to 3 for a to d)."""
         return self._with(drives=[-d if i == wheel else d for i, d in enumerate(self.drives)])
 
     def reversed_encoder(self, wheel: int) -> Fault:
-        """Swap the A and B signals of an encoder."""
+        """Swap the A and B signals of the encoder of channel `wheel` (0 to 3 for a to d)."""
         signs = enumerate(self.encoder_signs)
         return self._with(encoder_signs=[-s if i == wheel else s for i, s in signs])
 
     def dead_motor(self, wheel: int) -> Fault:
-        """Keep a motor from turning."""
+        """Keep the motor of channel `wheel` (0 to 3 for a to d) from turning."""
         return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
 
     def pushed(self, speed: float) -> Fault:
@@ -163,7 +166,7 @@ class Faults:
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
 
     def sparse_replies(self, period_s: float = 0.1) -> Fault:
-        """Answer at most one line in `period_s` s."""
+        """Answer at most one line every `period_s` s."""
         return self._with(reply_gap_ns=int(period_s * NS_PER_S))
 
     def wrong_baud(self, baud_rate: int) -> Fault:
@@ -187,7 +190,7 @@ class Faults:
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
-        """Ignore the text after the fourth value: obey checked lines, but answer plain ones."""
+        """Ignore the text after the fourth value: obey checked lines, but send plain replies."""
         return self._with(understand=protocol.prefix)
 
     def plain_only(self) -> Fault:
@@ -211,17 +214,17 @@ class Faults:
         return self._with(any_feeds=True)
 
     def lost_replies(self, every: int = 5) -> Fault:
-        """Lose each n-th reply on the way to the host, where n is `every`."""
+        """Lose every n-th reply on the way to the host, where n is `every`."""
         return self._with(lose_reply=every)
 
     def lost_commands(self, every: int = 5) -> Fault:
-        """Lose each n-th line on the way to the board, where n is `every`."""
+        """Lose every n-th line on the way to the board, where n is `every`."""
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip one bit in each n-th line of either direction, where n is `every`.
+        """Flip one bit in every n-th line, where n is `every`. The bit is different each time.
 
-        It is a different bit each time.
+        The lines of both directions are counted together.
         """
         return self._with(bit_error=every)
 
@@ -233,11 +236,11 @@ class Faults:
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:
-        """Hold back all bytes to the host for `length_s` s, once in `every_s` s."""
+        """Hold back all bytes to the host for `length_s` s, once every `every_s` s."""
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
     def _stalled_until(self, now_ns: int) -> int:
-        """Return the end of the present stall, or `now_ns` without a stall."""
+        """Return the end of the present stall, ns, or `now_ns` if there is no stall."""
         if not self.stall_every_ns:
             return now_ns
         began_ns = now_ns // self.stall_every_ns * self.stall_every_ns

@@ -62,12 +62,12 @@ def plain_only(line: bytes) -> Command | None:
 
 
 def prefix(line: bytes) -> Command | None:
-    """Decode a line as a firmware would that ignores the text after the four values."""
+    """Decode a line like firmware that ignores the text after the four values."""
     return _plain(line[:PLAIN])
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line like old firmware: each value with a comma after it counts, in any line."""
+    """Decode a line like old firmware, which obeys each value that a comma follows, in any line."""
     values = {}
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]
@@ -100,7 +100,13 @@ def _value(word: bytes) -> float:
 
 @lru_cache(1024)
 def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
-    """Return the plain part of a reply."""
+    """Return the plain part of a reply, without a line end.
+
+    Args:
+        speeds: The speeds of the motors a to d, rad/s.
+        separator: The text between two values.
+        unpadded: Whether a speed below ten has only one integer digit.
+    """
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
         form % (motor, "n" if speed < 0 else "p", min(abs(speed), 99.99))
@@ -115,7 +121,7 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
     Args:
         text: the plain part of the reply.
         sequence: the two digits of the command's sequence number.
-        sample: the milliseconds and the four encoder counts, or nothing for a reply without them.
+        sample: the milliseconds and the four encoder counts, or empty for a reply without them.
     """
     body = b"#" + sequence
     if sample:
@@ -127,7 +133,10 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
 
 
 def status(fields: Mapping[str, str], check: bool) -> bytes:
-    """Return the status line with these fields, such as `{"estop": "ok"}`."""
+    """Return the status line with these fields, such as `{"estop": "ok"}`.
+
+    `check` says whether the line gets a checksum.
+    """
     text = "".join(["!status", *(f" {name}={value}" for name, value in fields.items())]).encode()
     return text + (b"*%04X" % _crc(text) if check else b"") + b"\r\n"
 
@@ -135,8 +144,9 @@ def status(fields: Mapping[str, str], check: bool) -> bytes:
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
-    `counts` are the encoder counts per wheel turn. `sample` says whether the firmware can add
-    sample fields to its replies.
+    `counts` is the number of encoder counts per wheel turn. `watchdog_ms` is the silence after
+    which the board stops the motors, ms. `sample` says whether the firmware can add sample fields
+    to its replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

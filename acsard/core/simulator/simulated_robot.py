@@ -1,6 +1,6 @@
 """Observes the true state of the simulated robot a hundred times per second, and simulates a gyro.
 
-The board does not use these observations. Its feedback has only the speeds of its encoders.
+The board does not use these observations. The motion that it reports comes only from its encoders.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from acsard.core.simulator.noise import gauss
 from acsard.core.values import NS_PER_S, Pose
 
 LOOK_NS = NS_PER_S // 100
-"""Time between two observations, and between two samples of the gyro."""
+"""Time between two observations, and between two samples of the gyro, ns."""
 
 
 class Sight(Struct, frozen=True):
@@ -43,10 +43,10 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """Pairs of time and angle turned, as far back as the gyro needs."""
+        """Pairs of a time (ns) and the angle turned until then (rad), as old as the gyro needs."""
 
     def next_ns(self) -> int:
-        """Return the time of the next event or observation."""
+        """Return the monotonic time of the next event or observation, ns."""
         due_ns = super().next_ns()
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
@@ -72,9 +72,9 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """Return the angle that the robot has turned up to this time, rad.
+        """Return the angle that the robot has turned up to `at_ns`, rad.
 
-        Before the first observation it is that of the first observation.
+        For a time before the oldest observation, return the angle of that observation.
         """
         before_ns, before = self._history[0]
         if at_ns <= before_ns:

@@ -9,7 +9,7 @@ from acsard.core.simulator.simulated_robot import Sight
 FRAME = "sim"
 """Frame of the true pose: the pose at the start of the simulator.
 
-No transform connects it with `odom`, so no program takes the true pose for odometry.
+No transform connects it with `odom`, so no program can mistake the true pose for odometry.
 """
 
 
@@ -21,7 +21,7 @@ def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
 
 
 def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
-    """Return the measurement of the gyro.
+    """Return the turn rate that the gyro measured, as an Imu message without other measurements.
 
     Args:
         sight: the observation.

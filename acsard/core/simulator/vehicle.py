@@ -26,10 +26,10 @@ from acsard.core.simulator.noise import uniform
 from acsard.core.values import Pose
 
 GRIP_S = 0.25
-"""Time after which the wheels get another grip on the floor, s."""
+"""Time after which the random grip of the wheels on the floor changes, s."""
 
 HANDS_S = 0.1
-"""Time constant with which a person who pushes the robot changes its speed, s."""
+"""Time constant with which the speed of the robot changes when a person pushes it, s."""
 
 
 class Vehicle:
@@ -57,9 +57,10 @@ class Vehicle:
         """Fraction of each set point that the motors do not reach, 0 to 1."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
-        """Let `dt` s pass with the present set points.
+        """Move the robot for `dt` s with the present set points.
 
-        If `push` is a number, a person pushes the robot at `push` m/s instead.
+        If `push` is a number, a person pushes the robot straight at `push` m/s, and the set points
+        have no effect.
         """
         if dt <= 0.0:
             return
@@ -94,7 +95,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that is not lost because wheels skid at present."""
+        """Return the present fraction of a turn that is not lost to skidding wheels, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

@@ -1,1 +1,1 @@
-"""Shell package that owns the Zenoh sessions: access rules, receiving, publishing and replying."""
+"""The Zenoh sessions: access rules, receiving, publishing and replying."""

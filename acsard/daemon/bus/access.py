@@ -5,9 +5,10 @@ Zenoh denies every message that no rule allows.
 - Zenoh checks the rules at the end of a link: at the daemon's session or, over TLS, at the session
   of the TLS gateway. It knows only the neighbour on that link, so a client behind a router has the
   permissions of the router.
-- A rule allows a key expression if one of the rule's key expressions includes it. A query with a
-  wildcard therefore needs a rule with a wildcard.
-- A client over TLS may use exact keys only, because a few wildcards can take all the time of Zenoh.
+- A rule allows a message if one of the rule's key expressions includes the key expression of the
+  message. A query with a wildcard therefore needs a rule with a wildcard.
+- A client over TLS may use exact keys only, unless `access.wildcards` is set. A few wildcards can
+  take all of Zenoh's processor time.
 - The daemon checks each message again: the exact key, the kind PUT and the source.
 
 Zenoh does not tell the daemon with which certificate a sample came. Therefore each certificate that
@@ -53,7 +54,7 @@ SPOKEN = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
-"""Zenoh's names of the messages that a daemon sends, besides its data."""
+"""Zenoh's names of the messages that a daemon sends, apart from data (`put`)."""
 
 EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
@@ -62,16 +63,17 @@ DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_RO
 
 
 def _grants(role: Role) -> tuple[str, ...]:
-    """Return the names of a role's rules: for its own keys, and for those of lower roles.
+    """Return the names of the rules of a role: for its own keys and for those of lower roles.
 
-    A router has the role maintainer. Only this role may forward the tokens of other daemons.
+    Only the maintainer may forward the liveliness tokens of other daemons. A router has this role.
     """
     own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
     return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))
 
 
 USES = ("subscribes", "queries", "publishes")
-"""The name of a rule for a role's keys is the role and one of these words."""
+"""The last words of the rules for a role's keys. Such a rule is named, for example, "viewer
+queries"."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
 """The names of the rules of each role. `_rules` defines the rules."""
@@ -96,8 +98,8 @@ LOCAL = (
 """The names of the rules of a client on the robot's own machine.
 
 Such a client has the permissions of a maintainer. It may also subscribe with any wildcard and
-follow the commands. It may put on wrong keys, so that the daemon can count such a sample and refuse
-it with a reason. It may not publish on the keys on which the robot publishes.
+receive the commands of other clients. It may put on wrong keys, so that the daemon can count such a
+sample and refuse it with a reason. It may not publish on the keys on which the robot publishes.
 """
 
 Flow = Literal["ingress", "egress"]
@@ -125,12 +127,12 @@ class _Keys:
         self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU, DESCRIPTION})
         topics, outgoing = offered(config), published(config)
         self._incoming = [topic for topic in topics if topic not in outgoing]
-        """Rows of the topic table on which clients put, and the queries and services.
+        """Rows of the topic table that the daemon does not publish: inputs, queries and services.
 
-        The gyro's row is not among them if the daemon publishes the simulator's gyro.
+        If the daemon publishes the simulator's gyro, the gyro's row is not among them.
         """
         self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
-        """Rows of the topic table to which clients subscribe, and which they query."""
+        """Rows of the topic table that clients may subscribe to or query."""
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.claims = claims(config.ros)
@@ -161,26 +163,28 @@ class _Keys:
         """Key expressions on which the daemon publishes, or which it answers."""
 
     def of(self, role: Role, use: Use) -> list[str]:
-        """Return the exact native and ROS keys that `role` may use, but no lower role.
+        """Return the exact native and ROS keys that `role` may use and that no lower role may use.
 
-        Command keys that end with a certificate's name are not included; see `commands_by`.
+        `use` is the kind of use. Command keys that end with a certificate's name are not included;
+        see `commands_by`.
         """
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
         return keys + [e.key for e in self._ros if use in _uses(e) and self._least(e) == role]
 
     def commands_by(self, certificate: str) -> list[str]:
-        """Return a certificate's command keys of the configured sources; "*" for any certificate.
+        """Return the command keys that the holder of one certificate may use, of all sources.
 
-        A router forwards the commands of any certificate.
+        `certificate` is the common name of the certificate. "*" gives the keys of all certificates:
+        a router needs them, because it forwards the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def _least(self, endpoint: Endpoint) -> Role | None:
-        """Return the least role for a ROS endpoint: that of the native key for which it stands.
+        """Return the lowest role that may use a ROS endpoint: the same as for its native key.
 
-        Returns None for the commands of a source that is not configured, which no role may send. A
-        ROS key has no place for a certificate's name, so each role that may command may use it.
+        Return None if the endpoint commands a source that is not configured: no role may do that. A
+        ROS key cannot contain a certificate's name, so every role that may command may use it.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):
@@ -208,16 +212,18 @@ def access_control(config: Config) -> dict[str, object]:
 def gateway_access(config: Config) -> dict[str, object]:
     """Return the value of Zenoh's `access_control` for the session of the TLS gateway.
 
-    The only link of that session without a certificate leads to the daemon. Each certificate that
-    may command is a subject of its own, and also belongs to the subject of its role.
+    That session has only one link without a certificate, which leads to the daemon. Each
+    certificate that may command is a subject of its own, and also belongs to the subject of its
+    role.
     """
     return _access(config, ("pass",), gateway=True)
 
 
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
-    """Return the value of `access_control`; `local` names the rules of links without certificate.
+    """Return the value of `access_control`.
 
-    `gateway` is true for the TLS gateway and false for the daemon.
+    `local` has the names of the rules for links without a certificate. `gateway` is true for the
+    TLS gateway and false for the daemon.
     """
     keys = _Keys(config)
     rules = _rules(keys)
@@ -271,12 +277,12 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
     forged = [key for key in keys.answered if key != keys.imu]
     following = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
     rules = [
-        # The daemon's declarations and answers, its data, and the commands that others follow:
+        # The daemon sends declarations and answers, data, and commands to subscribers of commands:
         _rule("speak", "egress", SPOKEN, [*keys.answered, *keys.subscribed, *tokens]),
         _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
         _rule("overhear", "egress", ["put"], keys.subscribed),
     ]
-    # The exact keys of each role:
+    # Each role may use exact keys:
     for role in ROLES:
         rules += [
             _rule(f"{role} subscribes", "ingress", following, keys.of(role, "subscribe")),
@@ -284,22 +290,24 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
             _rule(f"{role} publishes", "ingress", ["put"], keys.of(role, "publish")),
         ]
     rules += [
-        # The tokens of other daemons, which a router forwards:
+        # A router forwards the tokens of other daemons:
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
-        # Commands of a client without a certificate, and those that a router forwards:
+        # A client without a certificate commands, and a router forwards commands:
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("hand_on", "ingress", ["put"], keys.commands_by("*")),
-        # Wildcards: all robots and the tokens of ROS, the samples for late subscribers, all keys of
-        # the robot, and the tokens of late subscribers:
+        # These rules allow wildcards. `roam`: subscribe to all robots and to the tokens of ROS.
+        # `recall`: query the samples for late subscribers, and the queries of viewers. `browse`:
+        # query all keys of the robot. `attend`: declare the tokens of late subscribers.
         _rule("roam", "ingress", following, [f"{ROOT}/**", *tokens]),
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.viewer_queries]),
         _rule("browse", "ingress", ["query"], [keys.all]),
         _rule("attend", "ingress", ["liveliness_token"], keys.kept),
-        # A client on the robot's own machine: see `LOCAL`.
+        # A client on the robot's own machine has these rules too (`LOCAL`).
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*forged, *tokens], "deny"),
-        # All messages between the TLS gateway and the daemon. In Zenoh, ** includes no @.
+        # The TLS gateway and the daemon exchange all messages. In Zenoh, `**` does not match a part
+        # of a key that begins with @, so the tokens are listed.
         _rule("pass", "both", EVERYTHING, ["**", *tokens]),
     ]
     return {rule["id"]: rule for rule in rules}

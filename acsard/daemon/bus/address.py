@@ -15,12 +15,12 @@ from acsard.host.errors import UsageError
 
 
 class Address(NamedTuple):
-    """The endpoint, id and certificate directory of a robot."""
+    """The endpoint and the id of a robot, and the TLS directory of the client."""
 
     endpoint: str
     robot_id: str
     tls: str
-    """Directory with the client's certificate; "" without a certificate."""
+    """Directory with the client's certificate; "" if the link needs no certificate."""
 
 
 def address_of(
@@ -29,10 +29,11 @@ def address_of(
     robot_id: str | None = None,
     tls: str | None = None,
 ) -> Address:
-    """Return the address of a robot from its configuration and from options of a tool.
+    """Return the address of a robot from its configuration and from the options of a tool.
 
-    An option that is not None replaces the value of the configuration. Raises `UsageError` for an
-    id that no robot can have.
+    The options are `connect` (the endpoint), `robot_id` and `tls` (the certificate directory). An
+    option that is not None replaces the value of the configuration. Raises `UsageError` for an id
+    that no robot can have.
     """
     robot_id = config.robot.id if robot_id is None else robot_id
     require_id(robot_id)
@@ -48,13 +49,14 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    An argument that is not None wins. The other values come from the file that $ACSARD_CONFIG
-    names, or from the defaults. $ACSARD_TLS replaces the certificate directory of the file. Raises
-    `UsageError` for an id that no robot can have, and for a file that cannot be used.
+    An argument that is not None takes precedence. The other values come from the file that
+    $ACSARD_CONFIG names, or from the defaults. $ACSARD_TLS replaces the certificate directory of
+    the file. Raises `UsageError` for an id that no robot can have, and for a file that cannot be
+    used.
     """
     complete = endpoint is not None and robot_id is not None
     if complete and (tls is not None or not _is_tls(endpoint or "")):
-        # The file could not change the result, so it need not exist.
+        # The arguments decide everything, so do not read the file. It need not exist.
         config = Config()
     else:
         config = _config_of_environment()

@@ -35,7 +35,8 @@ OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
 TWIN_TIMEOUT_S = 0.5
-"""Time to listen for another daemon with this robot's id or ROS names, before using them, s."""
+"""Time in which the start of the daemon checks whether another daemon has this robot's id or ROS
+names, s."""
 
 
 class ZenohBus:
@@ -88,7 +89,7 @@ class ZenohBus:
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
-        """End the query that the ticket names. It gets no more replies."""
+        """End the query of this ticket. It gets no more replies."""
         self._replies.retire(ticket)
 
     # Opening the session.
@@ -123,7 +124,7 @@ class ZenohBus:
     def _conflict(self, tokens: set[str]) -> str:
         """Return an error message if another daemon has this robot's id or ROS names, else "".
 
-        `tokens` are the liveliness tokens that other sessions hold, out of those of this robot.
+        `tokens` has those of this robot's liveliness tokens that other sessions hold.
         """
         if self._alive in tokens:
             return (
@@ -162,10 +163,10 @@ class ZenohBus:
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
-        """Publish the topic as JSON too, for clients without msgpack.
+        """Declare the topic's JSON key, for clients without msgpack.
 
-        The publisher is never latched, because a latched publisher encodes every message even
-        without subscribers. A query returns the present value instead.
+        Its publisher is never latched, because a latched publisher encodes every message even
+        without subscribers. A query on the key returns the present value instead.
         """
         below = json_key(topic.key)
         key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
@@ -209,15 +210,18 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return which of these tokens other sessions hold; take up to `TWIN_TIMEOUT_S`."""
+    """Return those of the liveliness tokens `alive` and `claims` that other sessions hold.
+
+    Blocks for up to `TWIN_TIMEOUT_S`.
+    """
     liveliness = session.liveliness()
     subscribers = {
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)
     }
     deadline_ns = clock.now().mono_ns + int(TWIN_TIMEOUT_S * NS_PER_S)
     held: set[str] = set()
-    # A daemon with this robot's id also has its ROS names. The message about the id is better, so
-    # wait for the id.
+    # A daemon with this robot's id also has its ROS names. The message about the id is clearer, so
+    # go on until the token of the id arrives.
     while alive not in held and clock.now().mono_ns < deadline_ns:
         time.sleep(0.01)
         held |= {token for token, other in subscribers.items() if other.try_recv() is not None}

@@ -1,12 +1,12 @@
-"""Watches the certificates of the bus on the disk: whether they were replaced, and when they end.
+"""Watches the certificate files of the bus: whether they are replaced, and when they expire.
 
-Zenoh reads the files of a listening endpoint when it opens it, and the files of a connection when
-it connects. A process that listens must therefore know when other files are there: `renewed`. Three
-files cannot be replaced at the same moment, so new files count once they belong together and no
-longer change.
+Zenoh reads the files of a listening endpoint only when it opens the endpoint, and the files of a
+connection only when it connects. A process that listens must therefore know when its files have
+been replaced, which `renewed` reports. Three files cannot be replaced at the same moment. So new
+files are reported only when they belong together and no longer change.
 
-The ends are those of the robot's own certificate, its authority's and the router's. A thread reads
-them again and again, because a disk or a router may not answer.
+The watched expiry times are those of the robot's own certificate, of its authority's and of the
+routers'. A thread reads them again and again, because a disk or a router may not answer.
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
 
 FILES_LOOK_NS = 2 * NS_PER_S
-"""Time between two looks at the files, ns. Copying three files takes less."""
+"""Time between two checks for replaced files, ns. Copying three files takes less."""
 
 Signature = tuple[tuple[int, int, int], ...]
-"""Inode, size in bytes and time of change in ns of each file; () if one of them is missing."""
+"""Inode, size in bytes and modification time in ns of each file; () if a file is missing."""
 
 
 class CertificateFiles:
     """The authority, the certificate and the key of a process that listens."""
 
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
-        """Begin with the present files, which the process reads after this."""
+        """Record the present files. Call this before the process itself reads the files."""
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
         self._due_ns = clock.mono_ns() + FILES_LOOK_NS
 
     def renewed(self) -> bool:
-        """Return True once after each change to other files that can be used together.
+        """Return whether the files were replaced by others that can be used together.
 
-        It looks at the files at most every `FILES_LOOK_NS`, and returns False in between.
+        It returns True once for each replacement. It checks the files at most every
+        `FILES_LOOK_NS`, and returns False in between.
         """
         now_ns = clock.mono_ns()
         if now_ns < self._due_ns:
@@ -68,38 +69,45 @@ class CertificateFiles:
 
 
 ENDS_LOOK_S = 60.0
-"""Pause between two looks at the files."""
+"""Pause between two readings of the expiry times, s."""
 
 ROUTER_LOOKS = 60
-"""Number of looks at the files for each look at the routers, which costs them a connection.
+"""Number of readings of the robot's files for each reading of the routers' certificates.
 
-A router that did not answer is looked at each time.
+Reading a router's certificate costs the router a connection. If a router did not answer, the
+routers are tried again at the next reading of the files.
 """
 
 
 def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
-    """Return the ends of the certificates of the routers that answer, as `expiry` takes them.
+    """Return when the certificates of the routers that answer expire, ns since 1970.
 
-    `directory` has the certificate with which this machine connects to the routers.
+    The keys of the result are names for messages, like "the router tls/HOST:PORT". `routers` has
+    the endpoints. `directory` has the certificate with which this machine connects to the routers.
     """
     found = {f"the router {one}": peer_ends_ns(one, directory) for one in routers}
     return {whose: ends_ns for whose, ends_ns in found.items() if ends_ns is not None}
 
 
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
-    """Keep the ends in `known` true, until cancelled. An end that cannot be read stays."""
+    """Update the expiry times in `known` again and again, until cancelled.
+
+    `known` maps the name of each certificate to its expiry time, ns since 1970. The value of a
+    certificate that cannot be read stays unchanged.
+    """
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS)]
     answered, look = 0, 0
     while True:
         found: dict[str, int] = {}
         try:
-            # Without a time limit: each look at a disk that hangs would leave one more thread.
+            # Wait without a time limit. With one, each attempt to read a disk that hangs would
+            # leave one more blocked thread.
             if answered < len(routers) or look % ROUTER_LOOKS == 0:
                 found |= await in_thread(lambda: ends_of(routers, bus.tls), None)
                 answered = len(found)
             found |= await in_thread(lambda: ends(bus.tls), None)
         except NoThreadError:
-            pass  # the next look tries again
+            pass  # the next round tries again
         if bus.outside:
             # The TLS gateway reports the certificate that it uses.
             found.pop("", None)

@@ -23,10 +23,11 @@ from acsard.daemon.bus.tls import common_name
 from acsard.host import clock
 
 WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
-"""Time to wait for the first answer, and after the first for more answers, s."""
+"""Time to wait for the first answer, and then for further answers, s."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""Function that queries a key, and calls its second argument with each sample that answers."""
+"""Function that queries a key (first argument), and passes each sample that answers to a callback
+(second argument)."""
 
 
 class Identity(Struct, frozen=True):
@@ -44,7 +45,11 @@ class Identity(Struct, frozen=True):
     """The endpoint to which the client is connected."""
 
     def lacks(self, key: str) -> str:
-        """Return why this client may not use a robot's key; "" if it may, or nothing is known."""
+        """Return why this client may not use a robot's key, in words.
+
+        Return "" if the client may use the key. Also return "" if no key answered and the client
+        has no certificate, because then nothing is known about its role.
+        """
         least = least_role(key)
         if not self.role:
             return self.silence
@@ -54,11 +59,11 @@ class Identity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """The likeliest reasons why no key answered.
+        """The likeliest reasons why no key answered, in words.
 
-        It is "" if the client has a role, or has no certificate. A client cannot distinguish three
-        cases: the robot is absent, it hangs, or it does not list the client's certificate.
-        Therefore the message names all three.
+        This is "" if the client has a role, or has no certificate. A client cannot distinguish
+        three cases: the robot is absent, the robot hangs, or the robot does not list the client's
+        certificate. Therefore the text names all three.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
@@ -90,14 +95,14 @@ class Identity(Struct, frozen=True):
 
 
 def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:
-    """Query the robot for this client's role, and return its identity.
+    """Query the robot for this client's role, and return the client's identity.
 
     Blocks for up to `WHOAMI_S`.
 
     Args:
         ask: queries a key of the robot.
         tls: directory of the client's certificate; "" without a certificate.
-        sender: see `Identity.sender`.
+        sender: the name that the daemon gives to this client's commands.
         robot: the robot's id.
         endpoint: the endpoint to which the client is connected.
     """

@@ -1,11 +1,11 @@
 """Buffers the samples and queries from the bus for the next control step, and sends the replies.
 
 Zenoh's threads fill the buffers, and every buffer is bounded. A callback in this module only copies
-its input. It never calls back into Zenoh: even a refusal goes through `Replies`.
+its input. It never calls back into Zenoh: even a refusal is queued for `Replies`.
 
-A thread of its own sends the replies, because a client that hangs would block the control loop.
-Each query gets a number, its ticket, when it arrives, and a reply names that ticket. When a ticket
-is retired, Zenoh's query is dropped, and the client stops waiting.
+`Replies` sends the replies in a separate thread, because a client that hangs would block the
+control loop. Each query gets a number, its ticket, when it arrives, and a reply names that ticket.
+When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Replies:
     def issue(self, query: zenoh.Query, key: str) -> int | None:
         """Return a ticket for this query, or None if there are too many unfinished queries.
 
-        The replies go to the key `key`. If it is "", each reply goes to its own key below the
-        prefix of the robot.
+        The replies to the query go to the key `key`. If `key` is "", each reply goes to the key
+        that it names below the prefix of the robot.
         """
         if len(self._queries) > TICKETS:
             return None
@@ -68,7 +68,7 @@ class Replies:
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Start the thread. Earlier replies wait for it in the queue."""
+        """Start the thread that sends the replies. Replies that are queued already wait for it."""
         threading.Thread(target=self._run, args=(session,), name="replies", daemon=True).start()
 
     def stop(self) -> None:
@@ -107,15 +107,14 @@ class Replies:
 
 
 ARRIVALS = 16
-"""Size of the buffer of each command key. The newest samples stay.
+"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one.
 
 A sender at the limit of 1000 Hz puts 10 samples into one step at 100 Hz.
 """
 
 SAMPLES = 64
-"""Size of the buffer for gyro samples. A gyro at 400 Hz fills it while the control loop stands
-still for 150 ms.
-"""
+"""Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
+samples for 160 ms."""
 
 OTHERS = ""
 """Name of the buffer for the keys of all unlisted sources.
@@ -137,7 +136,7 @@ queries are refused with `BUSY`.
 """
 
 ATTACHMENT_BYTES = 256
-"""Number of bytes of an attachment that are used.
+"""Largest number of bytes of an attachment that are used.
 
 An attachment of rmw_zenoh has 33 bytes, and one of acsard has up to 140. A longer attachment is cut
 off, so that no sender can be decoded from it.
@@ -179,10 +178,11 @@ class Inbox:
         self._slow: deque[Query] = deque()
         """ROS parameter queries, and changes of settings.
 
-        One of these takes as long as all other queries of a step.
+        One of these takes as much time as all other queries of a step.
         """
         self._lost = dict.fromkeys(self._arrivals, 0)
-        """Number of samples that newer ones had displaced in each buffer at the last `take`."""
+        """For each buffer, the number of samples that newer ones had displaced before the last
+        `take`."""
         self._any = False
         """True if an item has arrived. It is set after the item is queued, so that `take` misses no
         item.
@@ -226,9 +226,10 @@ class Inbox:
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample on a ROS key like a sample on the native key that the ROS key stands for.
+        """Queue a sample on a ROS key.
 
-        A ROS sample has no encoding, so `endpoint` supplies the encoding.
+        It is treated like a sample on the native key for which the ROS key stands. A ROS sample has
+        no encoding, so `endpoint` supplies the encoding.
         """
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
@@ -285,13 +286,14 @@ class Inbox:
         """Queue a query that matches `topic`, a row of the native topic table."""
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
-            # A wildcard must not call a service. It also matches the key of the JSON topic without
-            # `json/`, which answers it. Returning drops the query, which ends it.
+            # A query with a wildcard must not call a service. A JSON key does not answer it either,
+            # because the wildcard also matches the topic's key without `json/`, which answers.
+            # Returning without a ticket drops the query.
             return
         self._queried(query, topic, asked, "", "native")
 
     def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:
-        """Queue a call of a ROS service."""
+        """Queue a query on a ROS key, such as a call of a ROS service."""
         if str(query.key_expr) == endpoint.key:
             native = endpoint.native
             self._queried(query, native, native, endpoint.key, endpoint.transport)
@@ -336,7 +338,10 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Copy at most `most` + 1 bytes of a payload. The extra byte shows that it is too long."""
+    """Return a copy of at most `most` + 1 bytes of a payload.
+
+    The extra byte shows that a payload is too long. Without a payload the copy is empty.
+    """
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

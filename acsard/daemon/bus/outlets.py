@@ -1,11 +1,11 @@
-"""Publishes each topic on every key of the topic that has a subscriber.
+"""Publishes each topic on those of its keys that have a subscriber.
 
 A topic has native keys and perhaps ROS keys; this module calls each of them an outlet. A message is
 encoded once per encoding, and only if an outlet with that encoding has a subscriber.
 
-The control loop only puts messages into slots, which keep the newest messages of each topic. A
-thread encodes and sends these messages, so a bus that blocks costs messages and never a control
-period.
+The control loop only puts messages into slots. A slot keeps the newest messages of one topic. A
+thread encodes and sends these messages. So if the bus blocks, messages are lost, but no control
+period is.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ OPTIONS: dict[str, Any] = {
 }
 
 HELD = 16
-"""Size of the slot of a topic. The newest messages stay.
+"""Size of the slot of a topic, in messages. A newer message displaces the oldest one.
 
-At 100 Hz this is odometry of 0.16 s, longer than the machine or a joining client usually blocks the
-thread.
+At 100 Hz a slot holds 0.16 s of odometry. The machine or a joining client usually blocks the thread
+for less.
 """
 
 STUCK_NS = NS_PER_S // 4
-"""If a round of puts takes longer than this, the bus is blocked.
+"""Longest time of a round of puts, ns. If a round takes longer, the bus counts as blocked.
 
 A round usually takes 0.1 ms, and a little longer on a busy machine.
 """
@@ -48,7 +48,10 @@ HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
-    """Wrap a callback so that it runs in Zenoh's receiving thread, not in a thread of its own."""
+    """Return a Zenoh handler that runs a callback in Zenoh's receiving thread.
+
+    By default the callback would run in a thread of its own.
+    """
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
@@ -81,15 +84,15 @@ class Outlets:
         """Zenoh's listeners, which end when nothing refers to them."""
         self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
-        """The topics that have a subscriber, as native keys."""
+        """The native keys of the topics that have a subscriber."""
         self._slots: dict[str, Mailbox[Message]] = {}
         self._bell = Bell()
-        """Wakes the thread. All slots share one bell, because a step fills several slots."""
+        """Signal that wakes the thread. All slots share it, because a step fills several slots."""
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0
-        """Number of messages that newer ones have displaced since the last `losses`."""
+        """Number of messages that newer ones have displaced since the last call of `losses`."""
         self._began_ns: int | None = None
-        """Monotonic time at which the present round of puts began; None between rounds."""
+        """Monotonic time at which the present round of puts began, ns; None between rounds."""
         self._error: BaseException | None = None
         self._thread = Thread(target=self._run, name="outlets", daemon=True)
 
@@ -126,9 +129,9 @@ class Outlets:
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return the number of messages dropped since the last call, and whether the bus blocks.
+        """Return the number of messages that were dropped, and whether the bus has begun to block.
 
-        The second value is true only once for each time that the bus blocks.
+        Both values are for the time since the last call. `now_ns` is the monotonic time.
         """
         dropped, self._dropped = self._dropped, 0
         began_ns, was_stuck = self._began_ns, self._stuck
@@ -136,7 +139,7 @@ class Outlets:
         return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
-        """Start the thread. Earlier messages wait for it in the slots."""
+        """Start the thread that sends the messages. Earlier messages wait for it in the slots."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
@@ -187,11 +190,12 @@ class Outlets:
             session: the daemon's Zenoh session.
             topic: native key of the topic.
             key: key to publish on.
-            form: form of the payload.
-            encoding: name of the encoding for Zenoh.
+            form: format of the payload.
+            encoding: Zenoh's name of the encoding.
             latched: keep the last sample for late subscribers.
-            gid: identity of a ROS publisher. With it, the samples carry an attachment of rmw_zenoh.
-            signed: attachment of the samples without a `gid`; may be empty.
+            gid: identity of a ROS publisher, or b"". With it, the samples carry an attachment of
+                rmw_zenoh.
+            signed: attachment of the samples without a `gid`, or b"" for none.
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(
@@ -217,6 +221,6 @@ class Outlets:
             self._count(outlet, status.matching)
 
         self._kept.append(publisher.declare_matching_listener(direct(matching)))
-        # Otherwise the listener above reports the next subscriber.
+        # The listener reports only later changes, so ask for a subscriber that is there already.
         if publisher.matching_status.matching:
             self._count(outlet, True)

@@ -48,10 +48,10 @@ def named(text: str) -> tuple[str, ...]:
 
 
 def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Return the ids out of `ids` whose daemon is running, sorted.
+    """Return those of `ids` whose daemon is running, sorted.
 
-    "*" in `ids` stands for all robots. If it is there and no robot is visible, the function raises
-    `NoAnswerError` with a message for the user of this `endpoint`.
+    "*" in `ids` stands for all robots. Raises `NoAnswerError` if `ids` has "*" and no robot is
+    visible. The message of the error names `endpoint`, the endpoint of the client.
     """
     found = set()
     for robot_id in ids:
@@ -64,9 +64,10 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:
-    """Return whether this robot is present, or else the other robots.
+    """Return whether the client is connected, whether this robot is present, and which others are.
 
-    Returns None if the session is closing.
+    The other robots are looked up only if this robot is absent. Returns None if the session is
+    closing.
     """
     try:
         if not session.info.links():
@@ -110,7 +111,8 @@ def nobody(endpoint: str) -> str:
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
     """Subscribe to the key `name` of all these robots; "*" in `ids` stands for all robots.
 
-    `robot_of` returns the robot of a sample.
+    `robot_of` returns the robot of a sample from the sample's key. Raises `UsageError` if `name` is
+    not a key.
     """
     topic = by_key(name)
     latched = topic is not None and topic.latched
@@ -128,18 +130,18 @@ def robot_of(key: str) -> str:
 
 
 MAX_NAMED = 5
-"""Largest number of other robots that the message names if the requested robot is absent."""
+"""Largest number of other robots that a message of `explain_silence` names."""
 
 
 class Presence(Struct, frozen=True):
-    """The robots that a client sees on the bus."""
+    """The result of `presence`: the robots that a client sees on the bus."""
 
     linked: bool
     """True if the client is connected to its endpoint."""
     here: bool
     """True if the requested robot is present."""
     others: tuple[str, ...] = ()
-    """The ids of the other robots. Over TLS they are not visible."""
+    """The ids of the other robots if the requested robot is absent; over TLS always ()."""
 
 
 def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) -> str:
@@ -181,7 +183,7 @@ def _silent(key: str) -> str:
     if row.simulated:
         return f"only the simulator publishes {key}"
     if row.urdf:
-        return f"{key} is published only with a file in [ros] urdf of the robot's acsard.toml"
+        return f"{key} is published only if urdf in [ros] of the robot's acsard.toml names a file"
     return _unpublished(key, row)
 
 

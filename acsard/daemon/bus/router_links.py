@@ -16,14 +16,15 @@ POLL_S = 0.5
 """Time between two polls, s. One poll takes Zenoh 0.1 ms."""
 
 STOP_S = 0.05
-"""Time to wait for the thread at the end, s."""
+"""Longest time that `stop` waits for the thread, s."""
 
 
 class RouterLinks:
-    """Reports whether the endpoints of `bus.connect` are connected.
+    """The watch of the connections to the endpoints of `bus.connect`.
 
-    Zenoh reconnects by itself and does not report it, so nobody would notice that a router is gone.
-    A thread of its own polls Zenoh, because the call may block.
+    Zenoh reconnects by itself, but does not report that a connection is lost or made. Without this
+    watch, the operator would not notice that a router is gone. A thread of its own polls Zenoh,
+    because the call may block.
     """
 
     def __init__(self, bus: BusConfig, inbox: Inbox) -> None:
@@ -81,7 +82,7 @@ class RouterLinks:
 
 
 def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
-    """Return the endpoints that no link leads to.
+    """Return the endpoints to which no link leads.
 
     `mode` is `bus.mode`, and `ends` has the address of the far end of each link. In mode "client"
     there is only one link, and if it exists, no endpoint is unreached. A program that connected to
@@ -94,9 +95,9 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 
 
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Return whether one of the far ends belongs to the endpoint.
+    """Return whether one of the far ends `ends` belongs to the endpoint.
 
-    The far ends are addresses. The endpoint may have a host name.
+    The far ends are addresses like "tcp/192.168.0.2:7447". The endpoint may have a host name.
     """
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, address = bare.partition("/")
@@ -106,7 +107,7 @@ def _leads_there(endpoint: str, ends: set[str]) -> bool:
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
     except (OSError, ValueError):
-        # The name does not resolve any more, but a link may still be connected.
+        # The name does not resolve any more, but its link may still exist. Compare the port alone.
         return bool(port) and any(
             end.startswith(f"{protocol}/") and end.endswith(f":{port}") for end in ends
         )

@@ -40,12 +40,12 @@ class Arrivals(Mailbox[zenoh.Sample]):
 
 
 class Subscription:
-    """The samples of a key in the order of their arrival."""
+    """The samples of one or more keys, in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
         """Read from `queue`, such as an `Arrivals`.
 
-        If `key` is given, the subscription skips samples that were put on another key or on a
+        If `key` is not "", the subscription skips samples that were put on another key or on a
         wildcard.
         """
         self._queue, self._key = queue, key
@@ -64,11 +64,15 @@ class Subscription:
         self._queue.wakes(wake)
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Append a sample that was fetched by a query, as if it had been published."""
+        """Append a sample that a query has returned, as if it had been published now."""
         self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """Yield samples until the session closes, or none arrives for `timeout` s if given."""
+        """Yield samples until the session closes or no sample arrives for `timeout` s.
+
+        If `timeout` is None, wait for samples without a limit. Undeclare the subscribers at the
+        end.
+        """
         quiet_since_ns = clock.mono_ns()
         try:
             while True:
@@ -89,7 +93,7 @@ class Subscription:
             self.undeclare()
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
-        """Yield samples until the session closes."""
+        """Yield samples until the session closes. Undeclare the subscribers at the end."""
         arrived, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:
@@ -122,19 +126,20 @@ class Subscription:
 
 
 def on(key: str, sample: zenoh.Sample) -> bool:
-    """Return whether a sample was put on exactly this key, and not on a wildcard."""
+    """Return whether a sample was put on exactly the key `key`, and not on a wildcard."""
     return str(sample.key_expr) == key
 
 
 def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
-    """Return the encoding and the payload of a sample or a reply, for a `Decoder`."""
+    """Return the encoding and the payload of a sample, as `Decoder.decode` expects them."""
     return str(sample.encoding), sample.payload.to_bytes()
 
 
 def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
     """Subscribe to the keys, and return the queue of their samples.
 
-    If `latched` is true, the last published sample of each key comes first.
+    If `latched` is true, the queue first gets the sample that was last published on each key before
+    the subscription.
     """
     arrivals = Arrivals()
     handler = zenoh.handlers.Callback(arrivals.put, arrivals.close)

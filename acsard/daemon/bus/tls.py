@@ -1,8 +1,8 @@
 """Checks and reads the certificate files, and explains why a TLS endpoint cannot be reached.
 
-Zenoh has one error for all causes. `trouble` therefore repeats the connection step by step with
-Python's own TLS, and has a message for each cause. Only the ends of certificates need a library of
-the optional extra `tls`.
+Zenoh reports the same error for every cause. `trouble` therefore repeats the connection step by
+step with Python's own TLS, and has a message for each cause. Only the expiry times of certificates
+need a library of the optional extra `tls`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def unusable(authority: Path, certificate: Path, key: Path) -> str:
         # With an empty one it fails, which is right, because Zenoh accepts no encrypted key.
         context.load_cert_chain(certificate, key, password="")
     except (OSError, ValueError) as error:
-        # This includes SSLError, which is an OSError.
+        # SSLError is an OSError.
         return str(error)
     return ""
 
@@ -86,7 +86,7 @@ def common_name(directory: str) -> str:
 
 
 def shown_at(endpoint: str, directory: str) -> str:
-    """Return the common name with which a client connects to this endpoint.
+    """Return the common name that this client's certificate shows at an endpoint.
 
     `directory` is the client's TLS directory. Returns "" if the client needs no certificate there,
     or has no readable one.
@@ -103,7 +103,7 @@ def names_in(directory: str) -> list[str]:
 def _plain(name: str) -> str:
     """Return an IPv6 address in its short form, and any other name unchanged.
 
-    The standard library writes every zero of an IPv6 address in a certificate.
+    In a decoded certificate, the standard library writes every zero of an IPv6 address.
     """
     try:
         return str(ipaddress.ip_address(name))
@@ -119,7 +119,7 @@ def _decoded(directory: str) -> dict[str, Any]:
     """
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_context.verify_mode = ssl.CERT_REQUIRED
-    # The name of an expired certificate is needed to say how to replace it.
+    # Accept an expired certificate, because its name is needed to say how to replace it.
     server_context.verify_flags |= NO_CHECK_TIME
     to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
     try:
@@ -131,7 +131,7 @@ def _decoded(directory: str) -> dict[str, Any]:
             with suppress(ssl.SSLWantReadError):
                 end.do_handshake()
     except (OSError, ValueError):
-        # This includes SSLError, which is an OSError.
+        # SSLError is an OSError.
         return {}
     return dict(server.getpeercert() or {})
 
@@ -140,14 +140,15 @@ NO_CHECK_TIME = 0x200000
 """OpenSSL's flag X509_V_FLAG_NO_CHECK_TIME, which Python's `ssl` does not name."""
 
 AUTHORITY = "the authority"
-"""Name of the authority's certificate in `ends`. The name of the directory's own is ""."""
+"""Key of the authority's certificate in the result of `ends`. The key of the directory's own
+certificate is the empty string."""
 
 
 def ends(directory: str) -> dict[str, int]:
-    """Return when the certificates in `directory` expire, ns since 1970, by their names.
+    """Return when the certificates in `directory` expire, ns since 1970.
 
-    These are the directory's own and that of its authority. Returns {} if a file or the optional
-    library is missing.
+    The key "" has the directory's own certificate, and the key `AUTHORITY` that of its authority.
+    Returns {} if a file or the optional library is missing.
     """
     try:
         from cryptography import x509
@@ -167,9 +168,9 @@ def ends(directory: str) -> dict[str, int]:
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
 
-    `directory` has the certificate of this machine. Nothing is verified, so that the end of an
-    expired certificate is known too. Returns None if the program cannot be reached or the optional
-    library is missing. It takes `PATIENCE_S` twice at most.
+    `directory` has the certificate of this machine. Nothing is verified, so that the function also
+    works for an expired certificate. Returns None if the program cannot be reached or the optional
+    library is missing. Blocks for up to twice `PATIENCE_S`.
     """
     try:
         from cryptography import x509
@@ -187,7 +188,10 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
-    """Return the context of a client with the certificate in `directory` that verifies nothing."""
+    """Return the TLS context of a client that verifies nothing.
+
+    The client has the certificate in `directory`.
+    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     _load(context, directory)
@@ -199,7 +203,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _ends_ns(certificate: Any) -> int:
-    """Return the end of a certificate of the library cryptography, ns since 1970."""
+    """Return when a certificate of the library `cryptography` expires, ns since 1970."""
     return int(certificate.not_valid_after_utc.timestamp()) * NS_PER_S
 
 
@@ -217,16 +221,17 @@ def _place(endpoint: str) -> tuple[str, str]:
 
 
 PATIENCE_S = 2.0
-"""Time for the server to accept the connection, and again to answer in TLS, s."""
+"""Time limit for the server to accept the connection, and again for its answer in TLS, s."""
 
 REFUSAL_S = 0.5
-"""If the server is silent for this time, it has accepted the client's certificate, s.
+"""Time to wait after the TLS handshake for a rejection of the client's certificate, s.
 
-A server that rejects the certificate says so at once. A server that accepts it waits for data.
+A server that rejects the certificate says so at once. A server that accepts it sends nothing and
+waits for data.
 """
 
 AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
-"""Errors of an address that no machine answers, so that nothing is known about a port."""
+"""Error numbers that mean that no machine answers at the address. The port is then unknown."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 """OpenSSL's verify codes (X509_V_ERR_...). Other codes mean a certificate of another authority."""
@@ -235,8 +240,8 @@ EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 def trouble(endpoint: str, directory: str) -> str:
     """Return why this machine cannot connect to a TLS endpoint, and how to fix it.
 
-    `directory` has the client's certificate. Returns "" if this function finds no fault. It takes a
-    few seconds at most.
+    `directory` has the client's certificate. Returns "" if this function finds no fault. Blocks for
+    a few seconds at most.
     """
     host, port = _place(endpoint)
     try:
@@ -287,7 +292,7 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
 
 
 def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: str) -> str:
-    """Return the message if this machine rejects the server's certificate."""
+    """Return the message for a server whose certificate this machine rejects."""
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     match error.verify_code:
         case code if code == EXPIRED:
@@ -315,9 +320,9 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
-    """Return the message if the server rejects the client's certificate.
+    """Return the message for a server that rejects the client's certificate.
 
-    `reason` is OpenSSL's name of the server's TLS alert.
+    `reason` is OpenSSL's name of the TLS alert that the server sent.
     """
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:

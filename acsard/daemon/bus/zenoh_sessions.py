@@ -1,7 +1,7 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-This module has the settings of these sessions, and the reason for each setting. It uses keys only
-for the rate limits.
+This module has the settings of these sessions, and the reason for each setting. Of the robot's
+keys, it names only those with a rate limit.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.host.terminal_modes import coloured
 
 COMMAND_RATE_HZ = 1000.0
-"""Largest number of commands on a key that a session accepts, per second.
+"""Largest number of commands per second that a session accepts on each key.
 
-It lets a zero pass 1 ms after a command, and is too low to cost a control period. The TLS gateway
-has the same limit for stops. A stop beyond the limit comes within a millisecond after another one,
-so dropping it is safe.
+The rate is high enough that a zero command passes 1 ms after another command. It is too low for a
+flood to cost a control period. The TLS gateway has the same limit for stops. Dropping a stop beyond
+the limit is safe, because another stop came less than a millisecond before.
 """
 
 MAX_SESSIONS = 256
 """Largest number of connections of the daemon's session, and of the TLS gateway's session."""
 
 MESSAGE_BYTES = 65536
-"""Largest message that a link accepts, bytes. The limit for commands is far lower."""
+"""Largest size of a message that a link accepts, bytes. The limit for commands is far lower."""
 
 
 def daemon_session(config: Config) -> zenoh.Session:
-    """Open the daemon's session: a peer or client without multicast discovery.
+    """Open the daemon's session: a Zenoh peer or client without multicast discovery.
 
-    A client over TLS connects to the TLS gateway, not to this session. In client mode this call
+    Clients over TLS connect to the TLS gateway, not to this session. In client mode this call
     blocks until the router answers, so call it in a thread.
 
     Raises:
@@ -72,8 +72,8 @@ def gateway_session(config: Config) -> zenoh.Session:
     """
     bus = config.bus
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
-    # The limit counts puts only. Otherwise a flood of DELETE messages, which are not stops, would
-    # use up the limit of the stops. The daemon's own session does not limit stops.
+    # Limit only puts. Otherwise a flood of DELETE messages, which are not stops, would use up the
+    # limit of the stops. The daemon's own session does not limit stops.
     stops = _rate_limit("stops", ["put"], [full_key(config.robot.id, "stop")])
     settings |= _limits(config, gateway_access(config), stops)
     settings |= {
@@ -90,7 +90,7 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
     """Return why Zenoh cannot listen with these certificate files, or "" if it can.
 
     OpenSSL accepts more than Zenoh: certificates without extensions (X.509 version 1), and keys of
-    the curves P-521 and Ed448. The answer takes half a second.
+    the curves P-521 and Ed448. This call takes half a second.
     """
     files = {
         "root_ca_certificate": str(authority),
@@ -110,9 +110,9 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint with which a program on this machine reaches a listen endpoint.
+    """Return the endpoint with which a program on this machine reaches a listening endpoint.
 
-    A listen endpoint on all addresses becomes one on loopback.
+    For an endpoint that listens on all addresses, this is the loopback address.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
@@ -127,7 +127,7 @@ PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
 def _listening() -> dict[str, object]:
-    """Return the limits for clients that connect and send nothing, or too much."""
+    """Return the settings that limit clients which connect and send nothing, or too much."""
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
@@ -147,7 +147,7 @@ def _limits(
 ) -> dict[str, object]:
     """Return the access rules and the rate limits as Zenoh settings.
 
-    The rate limits are those of the commands, and `more`.
+    The rate limits are those of the commands, and those in `more`.
     """
     return {"access_control": access, "downsampling": [_command_limits(config), *more]}
 
@@ -167,7 +167,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     """Open a session in Zenoh's client mode to the daemon or router at `endpoint`.
 
     In peer mode the session would reach no program behind a router. `tls` is the directory with the
-    certificates, for an endpoint like "tls/robot.local:7449".
+    client's certificate. Only an endpoint like "tls/robot.local:7449" needs it.
 
     Raises:
         UsageError: `endpoint` is not an endpoint.
@@ -246,7 +246,7 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(config: Config) -> dict[str, object]:
-    """Return the rate limits of commands, speed limits and the gyro, native and of ROS.
+    """Return the rate limits of commands, speed limits and gyro samples, on native and ROS keys.
 
     Each configured source has a limit of its own, so that no source uses up another's limit. All
     other sources share one limit. All certificates of a source share the limit of the source. Zenoh

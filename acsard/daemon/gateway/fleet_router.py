@@ -30,7 +30,7 @@ EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
 IS_FOR = "// It is for {}. For yours:\n"
-"""Line at the head of the template, with the ids of the robots."""
+"""Line at the head of the template. It has the ids of the robots in place of {}."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
@@ -92,28 +92,31 @@ ROUTER_EVENTS: Events = {
     "open": "router_open",
     "full": "router_full",
     "stuck": "router_stuck",
-    # "alone" is absent because the router does not wait for a daemon.
+    # "alone" is absent because the router needs no daemon.
 }
 
 CERTIFICATE_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
-"""Keys of Zenoh's `transport/link/tls` with the files of a listening endpoint."""
+"""Keys of Zenoh's `transport/link/tls` that name the files of a listening endpoint."""
 
 AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
-"""Protocol and address of an endpoint, without its settings."""
+"""Matches the protocol and the address of an endpoint, without its settings."""
 
 _VALUE_ERROR = re.compile(
     r'msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+) \}\)'
 )
-"""Zenoh's error about a wrong key or value in a configuration."""
+"""Matches Zenoh's error about a wrong key or value in a configuration."""
 
 _SYNTAX_ERROR = re.compile(
     r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)?$", re.M | re.S
 )
-"""Zenoh's error about text that is not JSON5."""
+"""Matches Zenoh's error about text that is not JSON5."""
 
 
 def reason(error: zenoh.ZError) -> str:
-    """Return the readable part of Zenoh's error about a configuration, with its position."""
+    """Return the readable part of Zenoh's error about a configuration.
+
+    It begins with the line and the column if Zenoh names them.
+    """
     text = str(error)
     if match := _VALUE_ERROR.search(text):
         message = re.sub(r"\\(.)", r"\1", match[1])
@@ -124,7 +127,7 @@ def reason(error: zenoh.ZError) -> str:
 
 
 class Router(Listener):
-    """The router that zenohd would run with a configuration file, but without plugins."""
+    """The router of a fleet: zenohd with the same configuration file, but without plugins."""
 
     events = ROUTER_EVENTS
 
@@ -132,7 +135,7 @@ class Router(Listener):
         """Read the file; raise `RouterFileError` if Zenoh does not accept it."""
         self._file = file
         try:
-            # Zenoh would not say why it could not open the file.
+            # Read the file here, because Zenoh would not say why it cannot open it.
             file.read_bytes()
         except OSError as error:
             raise RouterFileError(f"cannot read {file}: {error.strerror}; correct it") from None
@@ -178,7 +181,7 @@ class Router(Listener):
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether Zenoh accepts the configuration with other addresses of this machine.
+        """Return whether Zenoh accepts the configuration with free addresses on loopback.
 
         If it does, only the configured addresses are at fault, and they may become free later.
         Zenoh's messages do not distinguish this case from a mistake in the file.
@@ -195,7 +198,10 @@ class Router(Listener):
         return True
 
     def _certificate_files(self) -> CertificateFiles | None:
-        """Return the files for which this router listens, or None if it names none."""
+        """Return the certificate files of the listening endpoints.
+
+        Returns None if the configuration does not name all three files.
+        """
         tls = json.loads(self._config.get_json("transport/link/tls")) or {}
         named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]
         return CertificateFiles(*named) if len(named) == len(CERTIFICATE_FILES) else None

@@ -1,9 +1,9 @@
-"""Runs a Zenoh session that is open to strangers, in a process of its own that may be restarted.
+"""Runs a Zenoh session that is open to the network, in a process of its own that can be restarted.
 
-A stranger can make Zenoh compare key expressions for ever, keep all connections, or take memory.
-All of that happens in this process, and not in the daemon. During such an attack a call to Zenoh
-may never return. Therefore one thread observes the session, and the main thread checks whether that
-thread still does so.
+A malicious client can make Zenoh compare key expressions for ever, keep all connections, or take
+memory. All of that happens in this process, and not in the daemon. During such an attack a call to
+Zenoh may never return. Therefore one thread observes the session. The main thread checks whether
+that thread still makes observations.
 """
 
 from __future__ import annotations
@@ -37,22 +37,27 @@ An observation takes a millisecond.
 """
 
 FIRST_NS = 5 * NS_PER_S
-"""Longest time after the start until the daemon connects, ns. Other clients connect then too."""
+"""Time after the start within which the daemon must connect, ns.
+
+It is longer than `ALONE_NS`, because the other clients connect at the same time.
+"""
 
 ALONE_NS = NS_PER_S
-"""Longest later time without a connection of the daemon, ns."""
+"""Longest time without a connection to the daemon, once there was one, ns."""
 
 REPORTS = Rate(1 / 60)
-"""Rate of the events that all connections are taken: one a minute."""
+"""Largest rate of events which report that all connections are taken: one a minute."""
 
 MAX_UNANSWERED = 4
-"""Number of consecutive unanswered queries that show a dead connection. Each is a second old.
+"""Number of consecutive unanswered queries that show a dead connection to the daemon.
 
-The connection to the daemon is then still open, but data does not reach the daemon.
+A query counts as unanswered after a second. The connection is then still open, but data does not
+reach the daemon.
 """
 
 NAMES = 5
-"""Largest number of clients that an event names: those with the most connections."""
+"""Largest number of clients that the text of an event names. These are the clients with the most
+connections."""
 
 Incident = Literal["open", "full", "stuck", "alone"]
 
@@ -68,10 +73,10 @@ GATEWAY_EVENTS: Events = {
 
 
 class Observation(Struct, frozen=True):
-    """State of the Zenoh session at a time."""
+    """The state of the Zenoh session at a time."""
 
     at_ns: int
-    """Monotonic time, ns."""
+    """Monotonic time of the observation, ns."""
     holders: tuple[str, ...] = ()
     """Common name in the certificate of each connection from the network.
 
@@ -80,14 +85,14 @@ class Observation(Struct, frozen=True):
     linked: bool = False
     """True if the daemon is connected. A router, which needs no daemon, always has True."""
     unanswered: int = 0
-    """Number of consecutive queries to the daemon that have not ended."""
+    """Number of consecutive queries that the daemon has not answered in time."""
 
 
 class SessionHealth:
-    """Judges one observation of the session after the other."""
+    """The health of the session, derived from one observation after the other."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
-        """Begin at the monotonic time `opened_ns`, at which the session was opened.
+        """Start at the monotonic time `opened_ns`, at which the session was opened.
 
         `most` is the largest number of connections from the network. `events` names the log events.
         """
@@ -99,7 +104,10 @@ class SessionHealth:
         """Number of observations in which all connections were taken."""
 
     def full_event(self, observed: Observation) -> Event | None:
-        """Return an event if all connections are taken and the last event is a minute old."""
+        """Return an event if all connections are taken and the last such event is a minute old.
+
+        Otherwise return None.
+        """
         if len(observed.holders) < self._most:
             return None
         self.full += 1
@@ -115,7 +123,7 @@ class SessionHealth:
         """Return an event that says why the process must restart, or None if it need not.
 
         `observed` is the newest observation, perhaps the same as in the last call. `passed_ns` is
-        the time since the last call.
+        the time since the last call, ns.
         """
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
         stuck = self._silence.too_long(new, passed_ns)
@@ -137,23 +145,26 @@ class SessionHealth:
 
 
 def connection_counts(holders: Sequence[str]) -> str:
-    """Describe how many connections each client has; `holders` has a name for each connection."""
+    """Return a text with the number of connections of each client with many connections.
+
+    `holders` has the name of the client for each connection.
+    """
     most = Counter(holders).most_common(NAMES)
     return ", ".join(f"{count} by {name or 'an unnamed client'}" for name, count in most)
 
 
 PERIOD_S = 0.25
-"""Time between two observations of the session, and between two checks."""
+"""Time between two observations of the session, and between two checks of the main thread, s."""
 
 MEMORY_BYTES = 192 << 20
-"""Memory limit of the process, which takes 35 MB, or 72 MB with all connections in use.
+"""Limit of the data memory of the process, bytes.
 
-An attack takes 600 MB a second, faster than any check could react. The kernel then refuses the
-memory, which ends the process.
+The process uses 35 MB, or 72 MB with all connections in use. An attack can take 600 MB a second, so
+a check could not react in time. The kernel refuses memory above the limit, which ends the process.
 """
 
 NICE = 5
-"""Niceness, so that the daemon and the programs of people run before this process."""
+"""Nice value of this process. The daemon and the programs of people have priority over it."""
 
 
 class Listener:
@@ -166,7 +177,7 @@ class Listener:
     events: Events
     """Names of the log events."""
     files: CertificateFiles | None
-    """The certificate files of the session, or None if it has none."""
+    """The certificate files of the session, or None if it has none to watch."""
 
     def ready(self) -> bool:
         """Return whether clients may be admitted now."""
@@ -181,7 +192,7 @@ class Listener:
         raise NotImplementedError
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Publish the state for the daemon, if there is one. This call may never return."""
+        """Publish the state for the daemon, if there is a daemon. This call may never return."""
 
 
 class ListenerProcess:
@@ -190,9 +201,9 @@ class ListenerProcess:
     def __init__(self, listener: Listener, log: Log, manager: Systemd, parent: int | None) -> None:
         """Prepare the process.
 
-        `parent` is a file descriptor that the parent process holds, or None. The process ends when
-        the parent closes it. If it is a socket, the process writes a sign of life to it in every
-        period.
+        `parent` is a file descriptor that the parent process holds too, or None. The process ends
+        when the parent closes its end. If the descriptor is a socket, the process writes a sign of
+        life to it in every period.
         """
         self._listener, self._log, self._manager = listener, log, manager
         self._parent = None if parent is None else Parent(parent)
@@ -236,9 +247,10 @@ class ListenerProcess:
         return Exit.OK
 
     def _renewed(self) -> bool:
-        """Return whether the session must be opened again, because it has a new certificate.
+        """Return whether the session must be opened again, because there is a new certificate.
 
-        Zenoh cannot use it in an open session. If it cannot be used at all, the log says why.
+        Zenoh cannot use a new certificate in an open session. If the new certificate cannot be used
+        at all, this method logs the reason and returns False.
         """
         files = self._listener.files
         if files is None or not files.renewed():
@@ -275,7 +287,7 @@ class ListenerProcess:
         return health
 
     def _observe(self, session: zenoh.Session, health: SessionHealth) -> None:
-        """Observe the session and report its state, in every period of the process."""
+        """Observe the session and report its state, once in each period of `PERIOD_S`."""
         try:
             pause = threading.Event()
             while True:
@@ -296,5 +308,5 @@ def _confine() -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with contextlib.suppress(OSError):
         os.nice(NICE)
-    # A lack of memory may end the process, and a backtrace would only fill the log.
+    # If a lack of memory ends the process, a backtrace would only fill the log.
     os.environ["RUST_BACKTRACE"] = "0"

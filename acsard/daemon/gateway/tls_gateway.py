@@ -33,13 +33,14 @@ from acsard.host import clock
 CONNECT_S = 1.0
 
 PROBE_NS = NS_PER_S
-"""Time between two queries to the daemon, ns. A query that has not ended by then is unanswered."""
+"""Time between two queries to the daemon, ns. A query that has not ended when the next one is due
+counts as unanswered."""
 
 QUERY_TIMEOUT_S = 60.0
 """Time after which Zenoh itself ends a query, s. Such an end is not an answer.
 
-The time is much longer than `PROBE_NS`, so that the query counts as unanswered before, even if the
-gateway has to wait for a core.
+The time is much longer than `PROBE_NS`. So the query counts as unanswered long before its end, even
+if the gateway has to wait for a processor.
 """
 
 
@@ -47,11 +48,14 @@ class Gateway(Listener):
     """The TLS gateway: opens once the daemon runs, and reports its connections to the daemon."""
 
     most = MAX_SESSIONS - 1
-    """Largest number of connections from the network. The daemon takes one more connection."""
+    """Largest number of connections from the network. One more connection is for the daemon."""
     events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
-        """Raise `CertificateError` or `NotPermittedError` if `bus.tls` cannot be used."""
+        """Check the certificate files.
+
+        Raises `CertificateError` or `NotPermittedError` if those in `bus.tls` cannot be used.
+        """
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
         self.files = CertificateFiles(*files_in(config.bus.tls))
@@ -61,7 +65,7 @@ class Gateway(Listener):
         self._probe = DaemonProbe(full_key(config.robot.id, "info"))
 
     def ready(self) -> bool:
-        """Return whether the daemon accepts connections; before it no client is admitted."""
+        """Return whether the daemon accepts connections. Until it does, no client is admitted."""
         host, _, port = reachable(self._config.bus.plain[0]).partition("/")[2].rpartition(":")
         try:
             with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
@@ -85,7 +89,7 @@ class Gateway(Listener):
         return Observation(clock.mono_ns(), holders, bool(local), unanswered)
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Publish the number of connections. The daemon shows it in `state`."""
+        """Publish the number of connections and related values, which `state` shows."""
         if self._publisher is None:
             self._ends_ns = min(ends(self._config.bus.tls).values(), default=0)
             key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
@@ -96,11 +100,11 @@ class Gateway(Listener):
 
 
 class DaemonProbe:
-    """Queries the daemon again and again, because an open connection may carry no data.
+    """A probe that queries the daemon repeatedly, because an open connection may carry no data.
 
-    On a machine with forty times the work that it can do, two gateways ended within half a minute.
-    The connection of the third gateway then stayed open for minutes, while the daemon's Zenoh did
-    not read from it.
+    This was observed on a machine with forty times as much work as it could do. There two gateways
+    ended within half a minute. The connection of the third gateway then stayed open for minutes,
+    while the daemon's Zenoh did not read from it.
     """
 
     def __init__(self, key: str) -> None:
@@ -113,7 +117,10 @@ class DaemonProbe:
         """
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Return how many queries in a row took over a second; send one a second."""
+        """Return the number of consecutive queries that did not end within `PROBE_NS`.
+
+        This method also sends the next query if it is due. `now_ns` is the monotonic time.
+        """
         if now_ns - self._asked_ns < PROBE_NS:
             return self._unanswered
         if self._asked_ns:

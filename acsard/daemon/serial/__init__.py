@@ -1,2 +1,1 @@
-"""Shell package that owns the serial port: raw and locked, without a queue, with a STOP at the
-end."""
+"""The serial port: opened raw and locked, written without a queue, closed after a STOP."""

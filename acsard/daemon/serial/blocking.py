@@ -1,4 +1,4 @@
-"""The serial port of `acsard mcu check`: locked and blocking, with a bound on every wait."""
+"""The serial port of `acsard mcu check`: locked and blocking, with a time limit on every wait."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
 SEND_S = 0.5
-"""Seconds after which a driver that takes no byte has hung. A line takes 50 ms on the slowest
-wire."""
+"""Time after which a driver that accepts no byte counts as hung, s. A line takes 50 ms on the
+slowest wire."""
 
 DRAIN_S = 0.5
-"""Seconds that the last stop lines may take to leave."""
+"""Longest time to wait at the close until the driver has sent the last stop lines, s."""
 
 CLOSE_S = 1.0
-"""Seconds to wait for a close. Some drivers drain for 30 s."""
+"""Longest time to wait for a close, s. Some drivers drain for 30 s."""
 
 
 class BlockingPort:
@@ -37,7 +37,7 @@ class BlockingPort:
         self._waited_ns = 0
 
     def open(self, baud_rate: int) -> None:
-        """Open and lock the port, or change the baud rate of the open port."""
+        """Open and lock the port. If it is open already, change its baud rate."""
         if self._device is None:
             try:
                 self._device = open_raw(self._path, baud_rate)
@@ -56,7 +56,7 @@ class BlockingPort:
             raise WireLostError(f"{self._path}: {error}") from error
 
     def close(self) -> None:
-        """Drain the last bytes, unlock and close. No driver can block this for long."""
+        """Send the last bytes, unlock and close. No driver can block this for long."""
         device, self._device = self._device, None
         if device is None:
             return
@@ -70,9 +70,9 @@ class BlockingPort:
         return clock.mono_ns()
 
     def late_ns(self) -> int:
-        """Return how long the program at the other end of a pty waited for a processor, ns.
+        """Return how long the program at the other end of a pty has waited for a processor, ns.
 
-        The time counts from the last call. It is 0 for a real device.
+        This is the time since the last call. It is 0 for a real device.
         """
         if self._program is None:
             return 0
@@ -80,7 +80,10 @@ class BlockingPort:
         return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
-        """Write `data`; raise `WireLostError` if the driver stops taking bytes."""
+        """Write all of `data`.
+
+        Raises `WireLostError` if the port is lost or accepts no more bytes.
+        """
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
         while data:
@@ -95,7 +98,11 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Return the data received until `until_ns`, each piece with the time of its read."""
+        """Return the data that is received until monotonic `until_ns`.
+
+        Each piece comes with the monotonic time of its read, ns. Raises `WireLostError` if the port
+        is lost.
+        """
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []
         while True:

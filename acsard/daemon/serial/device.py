@@ -1,7 +1,7 @@
-"""System calls on the serial device: open it raw and locked, drain it, close it, explain refusals.
+"""System calls on the serial device: open it raw and locked, drain it, close it, explain errors.
 
-This module knows what an error means to the operator. `port.py` decides for the daemon, and
-`blocking.py` for the tools, when to open, reopen and send.
+This module knows what an error means to the operator. `port.py` decides for the daemon when to
+open, reopen and send. `blocking.py` does so for the tools.
 """
 
 from __future__ import annotations
@@ -26,14 +26,17 @@ _left_open: list[int] = []
 """Descriptors that could not be closed because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
-"""Seconds between two looks at the unsent bytes: a tenth of a line's time."""
+"""Time between two checks for unsent bytes, s: a tenth of the time that a line takes."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
-    """A port whose `read` makes one system call. The caller knows that data is waiting."""
+    """A port whose `read` makes one system call and never waits."""
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to `size` waiting bytes; raise `SerialException` for a lost port."""
+        """Return up to `size` bytes that have been received, b"" if there are none.
+
+        Raises `SerialException` for a lost port.
+        """
         if self.fd is None:
             raise serial.PortNotOpenError
         try:
@@ -48,8 +51,12 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
-    """Open the port: locked for this process alone, raw and flushed; raise OSError."""
-    with suppress(IndexError):  # two threads may empty the list at the same time
+    """Open the port at `path`, locked for this process alone, raw and with empty buffers.
+
+    Raises `OSError` if the port cannot be opened.
+    """
+    # Close the devices that `close` could not. Two threads may empty the list at the same time.
+    with suppress(IndexError):
         while True:
             _end(_left_open.pop())
     # An inter-byte timeout makes pyserial set VMIN = 1, so a read without data fails with EAGAIN
@@ -65,8 +72,8 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
         if device.is_open:
             unlock(device.fileno())
         device.close()
-        # If the device vanishes or is not a tty the cause is a `termios.error`, which is not an
-        # OSError. pyserial passes it on unchanged or only as text.
+        # If the device vanishes or is not a tty, the cause is a `termios.error`, which is not an
+        # OSError. pyserial passes that error on unchanged, or only its text.
         hidden = error.__context__
         known = hidden if isinstance(hidden, termios.error) else error
         raise OSError(*known.args) from error
@@ -101,15 +108,19 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield the pauses to make, s, until all bytes have left or the deadline has passed."""
+    """Yield each pause to make, s, until the driver has sent all bytes or the deadline has passed.
+
+    `deadline_ns` is a monotonic time.
+    """
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
 
 
 def unlock(fd: int) -> None:
-    """Let others open the device.
+    """Let other processes open the device again.
 
-    A pty outlives this process with its exclusive mark, and nobody else could open it.
+    A pty outlives this process and keeps its exclusive mark. Without this call no other process
+    could open the pty.
     """
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
@@ -118,16 +129,18 @@ def unlock(fd: int) -> None:
 
 
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
-    """Discard stuck bytes, unlock and close in a thread, because a driver may drain for 30 s.
+    """Discard unsent bytes, and unlock and close the device in a thread.
 
-    The descriptor of `device` then refers to /dev/null, which its owner may drain and close without
-    delay. Wait up to `wait_s` for the thread. If no thread can be started, the next `open_raw`
-    closes the device.
+    The thread is needed because a driver may drain for 30 s. Wait for it at most `wait_s`. The
+    descriptor of `device` refers to /dev/null from now on, so its owner can drain and close it
+    without delay. If no thread can be started, the next `open_raw` closes the device.
+
+    `lost` is true if the device has failed. The buffers are then discarded in any case.
     """
     fd = device.fileno()
     if lost or unsent(fd):
-        # Flush only if bytes are stuck: on a pty a flush discards a STOP that the other end has not
-        # read yet.
+        # Flush only if the driver has unsent bytes. On a pty, a flush discards a STOP that the
+        # other end has not read yet.
         try:
             device.reset_output_buffer()
         except (OSError, termios.error):
@@ -181,9 +194,9 @@ _JOIN = (
 
 
 def require(path: str) -> None:
-    """Raise the error of `refusal` unless the path is a character device.
+    """Raise the error of `refusal` unless `path` is a character device.
 
-    Tools call this. The daemon does not, because it waits for a device that is not there.
+    The tools call this. The daemon does not, because it waits for a device that is absent.
     """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):

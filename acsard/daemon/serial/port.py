@@ -1,8 +1,8 @@
-"""The daemon's serial port: opens it, reads it, reopens it, never queues a line, ends with STOP.
+"""The daemon's serial port: opens, reads and reopens the device, and sends STOP before it closes.
 
-pyserial-asyncio reads. The daemon writes lines to the descriptor directly, because that transport
-queues the bytes that the kernel does not take, and the daemon must not hold a line back (invariant
-3). Opening runs in a thread with a time limit, because drivers may block.
+pyserial-asyncio reads. Its transport would queue the bytes that the kernel does not take, but the
+daemon must not keep a line to send it later (invariant 3). Therefore the daemon writes lines to the
+descriptor directly. Opening runs in a thread with a time limit, because drivers may block.
 """
 
 from __future__ import annotations
@@ -26,29 +26,31 @@ from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 
 OPEN_TIMEOUT_S = 5.0
-"""Seconds after which an open has hung. Until it ends, only a different device may be opened."""
+"""Time after which a call that opens a device counts as hung, s. Until that call ends, only a
+different device may be opened."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
-"""Seconds between attempts to reopen. The last one repeats. They are short because udev sets groups
-late."""
+"""Pauses between the attempts to reopen the port, s. The last pause repeats. The first ones are
+short, because udev sets the group of a device a moment after it appears."""
 
 PERMISSION_PATIENCE_S = 2.0
-"""Seconds that a start waits for udev to grant access before it gives up."""
+"""Time that the start waits for udev to grant access before it fails, s."""
 
 HUNG = "the driver did not answer"
 
 FAREWELL_S = 0.15
-"""Seconds for the last STOP: twice a line's time on the slowest wire, and a margin."""
+"""Time limit of the last STOP, s. It is twice the time of a line on the slowest wire, and a margin.
+"""
 
 
 AT_ONCE = 4096
-"""Bytes per read: as many as a driver buffers."""
+"""Largest number of bytes per read, as many as a driver buffers."""
 
 
 class SerialPort:
-    """The port to the board, as a context manager.
+    """The port to the board, as an asynchronous context manager.
 
-    Entering opens the port, `keep_open` reopens it for ever, and leaving sends STOP.
+    Entering opens the port, `keep_open` reopens it for ever, and leaving sends STOP and closes it.
     """
 
     def __init__(
@@ -81,14 +83,15 @@ class SerialPort:
 
     @property
     def sent_ns(self) -> int:
-        """Monotonic time at which the kernel took the last line."""
+        """Monotonic time at which the kernel took the last line, ns."""
         return self._output.sent_ns
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        A step that comes late passes its time as `late`: then waiting bytes are read too. Otherwise
-        the step may run before the reader and take its delay for silence of the board.
+        `late` is the time of a step that comes late, else None. For a late step, the bytes that
+        wait in the kernel are read too. Otherwise the step could run before the reader, and its own
+        delay would look like silence of the board.
 
         After a suspend of the computer the port is reopened even if the device did not notice.
         Everything before the suspend then belongs to another session, and every commander must
@@ -108,10 +111,14 @@ class SerialPort:
         return got
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Send the line now or report that it did not go. The line is never kept for later."""
+        """Write a line that was made at `now`, and return "sent".
+
+        If the line was not written, return "superseded", or "down" for a closed port. The line is
+        dropped.
+        """
         if not self.is_open:
             return "down"
-        # Ask before the time is read, because asking the driver takes time.
+        # Ask the driver for the unsent bytes before reading the clock, because asking takes time.
         waiting = unsent(self._fd)
         data = self._output.prepare(line, now.mono_ns, clock.mono_ns(), waiting)
         if data is None:
@@ -195,7 +202,7 @@ class SerialPort:
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
 
     def _complain(self, refused: MendableError) -> None:
-        """Log once why the port cannot be opened, not at every attempt."""
+        """Log why the port cannot be opened, unless the last attempt had the same reason."""
         text = f"{refused}; retrying"
         if text != self.trouble:
             self.trouble = text
@@ -208,7 +215,10 @@ class SerialPort:
         self._wake()
 
     def _leave(self, error: BaseException | None) -> None:
-        """Close the port. Bytes that the kernel still holds must not go out later."""
+        """Close the port. Bytes that the kernel still holds must not be sent later.
+
+        `error` is the reason why the port is lost, None if the daemon closes it.
+        """
         if not self.is_open:
             return
         self.is_open = False
@@ -228,7 +238,10 @@ class SerialPort:
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP as the last line, whatever ended the block. It takes at most `FAREWELL_S`."""
+        """Send STOP as the last line and close, whatever ended the block.
+
+        This takes at most `FAREWELL_S`.
+        """
         deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
             if clock.now().mono_ns > deadline_ns:
@@ -240,7 +253,7 @@ class SerialPort:
 
 
 class _Reader(asyncio.Protocol):
-    """The protocol that passes bytes and losses from the transport to its port."""
+    """The protocol that passes received bytes and losses from the transport to its `SerialPort`."""
 
     def __init__(self, port: SerialPort) -> None:
         self._port = port

@@ -1,9 +1,9 @@
 """The simulated board in real time behind a pty, so that the real serial code runs.
 
-A pty carries any baud rate. Here a host that sets another rate than the board's gets garbage, and
-so does the board, as on a real wire. `PtyEnd` is the board's end of any serial line that is a pty.
-Beside the daemon, `Simulated` also publishes the board's true state on the bus; the control loop
-reads the device like any other and knows nothing about the rest.
+A pty itself carries data at any baud rate. This module garbles the data in both directions if the
+host sets another baud rate than the board's, as a real wire would. `PtyEnd` is the board's end of
+any serial line that is a pty. `Simulated` is the board beside a daemon. It also publishes the
+board's true state on the bus. The control loop reads its device like that of a real board.
 """
 
 from __future__ import annotations
@@ -31,36 +31,40 @@ from acsard.host.timerfd import TimerFd
 
 
 class PtyEnd:
-    """The pty's end of the board.
+    """The board's end of a pty.
 
-    It never blocks, and `fileno` is readable when the host has written.
+    Its methods never block. The descriptor `fileno` becomes readable when the host has written.
     """
 
     def __init__(self) -> None:
         self._master, self.slave = pty.openpty()
-        # Keep the slave open, or the master would see a hang-up whenever no host is connected.
+        # Keep the slave open. Otherwise the master sees a hang-up whenever no host is connected.
         tty.setraw(self.slave)
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self.slave)
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on."""
+        """Return the descriptor on which the event loop waits."""
         return self._master
 
     def read(self) -> bytes:
-        """Return the bytes that the host has written, b"" if none."""
+        """Return the bytes that the host has written, b"" if there are none."""
         try:
             data = os.read(self._master, 4096)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EIO):
                 return b""
             raise
-        # A killed host leaves its exclusive mark on the pty. A real port would not keep it.
+        # A killed host leaves its exclusive mark on the pty. Remove it, because a real port would
+        # not keep it.
         unlock(self.slave)
         return data
 
     def write(self, data: bytes) -> bool:
-        """Write to the host; return False if nobody reads. A real wire would lose the bytes too."""
+        """Write to the host; return False if the buffer is full because no host reads.
+
+        The data is then lost, as on a real wire.
+        """
         try:
             os.write(self._master, data)
         except BlockingIOError:
@@ -109,13 +113,13 @@ class SimPty:
             self._arm()
 
     def _set_speed(self) -> None:
-        """Set the board's baud rate, for a host that sets none."""
+        """Set the pty to the board's baud rate, for a host that does not set a rate."""
         attributes = termios.tcgetattr(self._end.slave)
         attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the host's baud rate, or the board's if the host's is not one of a board."""
+        """Return the host's baud rate. If no board has that rate, return the board's own."""
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
@@ -135,7 +139,7 @@ POSE = "sim/pose"
 
 
 class Simulated(SimPty):
-    """The simulator, which also publishes the board's true state on the bus that `tell` sets."""
+    """The simulator of a daemon. It also publishes the board's true state on the bus."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))
@@ -146,7 +150,7 @@ class Simulated(SimPty):
         self._last: tuple[Sight, int] | None = None
 
     def tell(self, bus: Bus) -> None:
-        """Publish on this bus from now on."""
+        """Publish the true state of the board on this bus from now on."""
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
@@ -161,7 +165,7 @@ class Simulated(SimPty):
             return
         if POSE in bus.wanted:
             bus.publish(POSE, true_pose(sight, wall_ns))
-        # The daemon receives its own sample from the bus, like one of a gyro on a real robot.
+        # The daemon receives this sample from the bus, like a sample of a gyro on a real robot.
         if self._gyro:
             measured_ns = wall_ns - self._delay_ns
             bus.publish(IMU, turn_rate(sight, self._frame, self._noise, measured_ns))

@@ -108,7 +108,8 @@ def test_an_input_that_stays_pressed_or_comes_with_another_one_is_named() -> Non
     safety, presses = SafetyConfig(bumpers=TWO), {"front bumper": 1, "rear bumper": 2}
     found, _ = checked("bumper_pressed=2:0:0", presses=presses, safety=safety)
     assert found.text == (
-        "front bumper: the rear bumper was reported with it; rear bumper: no release was reported"
+        "front bumper: the board also reported the rear bumper; "
+        "rear bumper: no release was reported"
     )
     assert found.figure == "0 of 2 right"
 

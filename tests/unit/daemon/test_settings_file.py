@@ -102,8 +102,11 @@ def test_a_daemon_without_a_file_is_compared_with_its_start(started: Started) ->
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (b"[limits\n", "the file cannot be used at the next start: not TOML"),
-        (b"[limits]\nlinear_sped = 1\n", "the file cannot be used at the next start: limits."),
+        (b"[limits\n", "the daemon could not start with the file as it is now: not TOML"),
+        (
+            b"[limits]\nlinear_sped = 1\n",
+            "the daemon could not start with the file as it is now: limits.",
+        ),
         (None, "the file cannot be read: No such file or directory"),
     ],
 )

@@ -177,7 +177,7 @@ class Hasty(Player):
 
 
 def test_a_first_turn_that_was_ended_half_way_is_found_out() -> None:
-    with pytest.raises(GuideError, match="one full circle"):
+    with pytest.raises(GuideError, match="exactly one turn"):
         play("tape", Hasty(Robot(chi=1.7)))
 
 

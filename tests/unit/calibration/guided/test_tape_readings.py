@@ -172,7 +172,7 @@ def test_one_turn_tells_the_track_whatever_is_configured(chi: float, multiplier:
 
 def test_a_turn_that_was_not_a_full_circle_is_reported() -> None:
     half = once(2.4)
-    with pytest.raises(GuideError, match="one full circle"):
+    with pytest.raises(GuideError, match="exactly one turn"):
         track_ratio(Reading(half.rides, "turned", math.pi, 0.01), DriveConfig())
 
 

@@ -216,7 +216,8 @@ def test_motion_away_from_a_bumper_needs_its_place() -> None:
     away = Config(safety=SafetyConfig(bumper="away"))
     assert contradictions(away) == [
         'safety.bumper = "away" needs the place of each bumper, but safety.bumpers = []; write '
-        'safety.bumpers = ["front", "rear"] in the order of the board, or safety.bumper = "stop"'
+        'safety.bumpers = ["front", "rear"] in the order in which the board reports them, or '
+        'safety.bumper = "stop"'
     ]
     placed = Config(safety=SafetyConfig(bumpers=("rear",), bumper="away"))
     assert contradictions(placed) == []

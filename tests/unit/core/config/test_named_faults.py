@@ -51,7 +51,10 @@ REFUSED = [
     ("stalls=0.2:0.2", "fewer seconds for each"),
     ("estop_pressed=-1:2", "give the seconds from the start until it begins"),
     ("estop_silent=1:-2", "give the seconds from the start until it begins"),
-    ("bumper_pressed=5:1:2", "the bumpers are 1 to 4, in the order of the board"),
+    (
+        "bumper_pressed=5:1:2",
+        "the bumpers have the numbers 1 to 4, in the order in which the board",
+    ),
     ("bumper_pressed=1:-1:2", "give the seconds from the start until it begins"),
     ("driver_fault=1:-2", "give the seconds from the start until it begins"),
     ("stalls=5:0", "both at least 0.001"),
@@ -103,7 +106,8 @@ def test_every_mistake_is_reported() -> None:
 
 def test_what_needs_a_timer_is_told_where_it_goes() -> None:
     assert problems('["reset=5"]') == [
-        'sim.faults[0] = "reset=5": needs `acsard sim --fault reset=5`; remove it here'
+        'sim.faults[0] = "reset=5": works only as `acsard sim --fault reset=5`; '
+        "remove it from sim.faults"
     ]
 
 
