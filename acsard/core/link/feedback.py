@@ -174,6 +174,8 @@ class Timeline:
         self._forgotten = True
         self._last_placed = Placed("reads", 0)
         """The time of the last good line."""
+        self._spoilt = False
+        """Whether a bad or ignored line came since the last good line."""
         self._later = 0.0
         """Mean time by which `PromptedTimes` places a reply later than `FreeRunningTimes`, ns."""
         self.leaps = 0
@@ -226,6 +228,7 @@ class Timeline:
         If the board answers lines, the bad line is still the reply to one of them.
         """
         self._rest -= 1
+        self._spoilt = True
         if not self._style.speaks:
             self._prompts.skip()
 
@@ -258,6 +261,7 @@ class Timeline:
         since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
         placed = self._placed(asked_ns, came_ns)
         dt, bridged = self._since_last(placed)
+        self._spoilt = False
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
         # A board that answers lines sends nothing by itself, so no line is missing after a silence
@@ -319,7 +323,9 @@ class Timeline:
         if by_clock is not None:
             return dt, placed.bridged
         period = self._usual_ns / NS_PER_S
-        missing = dt > 1.5 * period and self._style.speaks is not False
+        # A prompted board sends no line that is not asked for, but the replies that were ignored
+        # have reported a part of this time.
+        missing = dt > 1.5 * period and (self._style.speaks is not False or self._spoilt)
         return dt, dt - period if missing else 0.0
 
     def _compare(self, answered: Placed, slot: Placed) -> None:

@@ -243,6 +243,24 @@ def test_a_line_that_is_none_was_one_when_it_was_made() -> None:
     assert (found.dt, found.bridged) == (0.02, 0.01)
 
 
+@pytest.mark.parametrize("ignored", [0, 3])
+def test_a_first_reply_by_the_clock_of_the_commands_fills_what_ignored_replies_reported(
+    ignored: int,
+) -> None:
+    bench = Bench(counts=0)
+    bench.timeline._style.speaks = False
+    bench.line()
+    for _ in range(ignored):
+        bench.now_ns += 50 * MS
+        bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
+        bench.timeline.spoilt()
+    bench.now_ns += (4 - ignored) * 50 * MS
+    bench.timeline.left(bench.now_ns)
+    found = bench.line()
+    assert found.dt == pytest.approx(0.21, abs=0.002)
+    assert found.bridged == pytest.approx(0.2 if ignored else 0.0, abs=0.002)
+
+
 def test_without_a_period_lines_of_a_read_share_the_time_since_the_last() -> None:
     bench = Bench(counts=0)
     bench.line()
