@@ -37,6 +37,10 @@ SILENT_NS = NS_PER_S // 5
 LATEST_NS = NS_PER_S // 4
 """Delay of a sample above which its sender's clock is assumed to have been set, ns."""
 
+SET_BACK_NS = NS_PER_S // 50
+"""Step back from one stamp to the next above which the sender's clock was set, ns. Samples come in
+order, but a driver may swap two of them or measure their times with some jitter."""
+
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Least and greatest delay of the gyro against the wheels, ns."""
 
@@ -218,8 +222,7 @@ class Gyro:
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
         late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
-        # Samples come in order, so a stamp before the last one means that the clock was set back.
-        if late > LATEST_NS or sample.stamp_ns < last.stamp_ns:
+        if late > LATEST_NS or last.stamp_ns - sample.stamp_ns > SET_BACK_NS:
             self._promptest = MinimumDelay()
             return sample.at_ns
         return sample.at_ns - max(0, int(late))

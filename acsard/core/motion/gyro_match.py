@@ -5,18 +5,20 @@ ratio of the configured effective track to the true one, and T the delay of the 
 
     g(t) = a w(t - T), which is about a w(t) - a T dw/dt for a small T
 
-A fit finds the coefficients a and -a T from means over a tenth of a second. It forgets old data
-only while the robot turns. For a it makes the error independent of w, as least squares do. For T it
-makes the error independent of the change z of the gyro's rate, not of dw/dt: z is an instrumental
-variable (Young, Recursive estimation and time-series analysis, 2011). The change of the wheels'
-rate has the same error as the rate itself, so coarse encoder counts on a straight drive would look
-like a delay of half a block.
+A least-squares fit finds the coefficients a and -a T from means over a tenth of a second. It
+forgets old data only while the robot turns.
+
+The change of the wheels' rate has the same error as the rate itself. On a straight drive with
+coarse encoder counts that would look like a delay of half a block, so a change counts as 0 unless
+the gyro's rate changes too, within the longest delay.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+
+from msgspec import Struct
 
 BLOCK_S = 0.1
 """Duration of a block, over which mean rates are compared, s. A single line has too few encoder
@@ -51,8 +53,12 @@ assumption `ROUGH` in stretches."""
 DELAY_S = 0.2
 """Standard deviation of the delay before any data, s."""
 
-NO_DELAY = 0.0, 0.0, 0.0, 1.0 / DELAY_S**2, 1.0 / DELAY_S**2
-"""Initial values of the five sums that contain the delay: of w dw, z w, z g, z dw and z z."""
+NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
+"""Initial values of the three least-squares sums that contain the delay."""
+
+BEFORE, BEHIND = 2, 3
+"""Blocks before and behind a block in which the gyro's rate may show the change of the wheels' rate
+in this block. The gyro is 0.1 s early to 0.3 s late (`gyro.DELAYS_NS`)."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 """Standard deviation of a block's mean rate: a constant in rad/s, and a share of the rate."""
@@ -76,13 +82,25 @@ CERTAIN = 3.0
 """Number of standard deviations from which the difference is a contradiction."""
 
 
+class Block(Struct, frozen=True, gc=False):
+    """The turns of wheels and gyro in a block, rad, and the change of the wheels' rate, rad/s2."""
+
+    wheels: float
+    gyro: float
+    change: float
+    time: float
+    """Duration of the block, s."""
+    slips: bool
+    """Whether the wheels slip. Then nothing is learned from the block."""
+
+
 class Match:
     """Compares the robot's turn according to wheels and gyro, feedback line by feedback line."""
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
         """Least-squares sums. Their initial values mean that the ratio is roughly 1."""
-        self._wd, self._zw, self._zg, self._zd, self._zz = NO_DELAY
+        self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
         """Turn of the gyro that the fit did not predict, and whole turn of the wheels, both in the
         present stretch, rad."""
@@ -96,9 +114,7 @@ class Match:
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
         """The turn rate according to the wheels now, and at the start of the block, rad/s."""
-        self._blocks: deque[tuple[float, float, float]] = deque(maxlen=3)
-        """Mean rates of wheels and gyro, rad/s, and change of the wheels' rate, rad/s2, of the last
-        blocks without slip."""
+        self._blocks: deque[Block] = deque(maxlen=BEFORE + 1 + BEHIND)
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
 
@@ -113,10 +129,11 @@ class Match:
         If it is a number, the caller must assume the new delay from then on.
         """
         ratio, slope = self.ratio, self._slope
-        spread = self._known**2 / (self._zz - self._zw * self._zw / self._ww)
-        if ratio < ROUGH / 2 or spread * (CERTAIN_S * ratio) ** 2 < 1.0 or self._known < 0.0:
+        spread = self._dd - self._wd * self._wd / self._ww
+        if ratio < ROUGH / 2 or spread * (CERTAIN_S * ratio) ** 2 < 1.0:
             return None
-        self._wd, self._zw, self._zg, self._zd, self._zz = NO_DELAY
+        self._blocks.clear()
+        self._wd, self._dg, self._dd = NO_DELAY
         self._lag = CERTAIN_S
         self._solve()
         return -slope / ratio
@@ -138,13 +155,9 @@ class Match:
         self._gyro += gyro
         self._time += dt
         if self._time >= BLOCK_S * 0.95:
-            if slips:
-                self._blocks.clear()
-            else:
-                change = (smooth - self._began) / self._time
-                block = self._wheels / self._time, self._gyro / self._time, change
-                self._blocks.append(block)
-            if len(self._blocks) == 3:
+            change = (smooth - self._began) / self._time
+            self._blocks.append(Block(self._wheels, self._gyro, change, self._time, slips))
+            if len(self._blocks) == self._blocks.maxlen:
                 self._learn()
             self._wheels = self._gyro = self._time = 0.0
             self._began = smooth
@@ -175,16 +188,17 @@ class Match:
             sums[2] -= old[2]
 
     def _learn(self) -> None:
-        """Learn from the second of three blocks: z is the change from the first to the third."""
-        (_, before, _), (wheels, gyro, change), (_, after, _) = self._blocks
-        if abs(wheels) < LEAST_RATE and abs(change) < LEAST_CHANGE:
+        """Learn from a block when the blocks behind it are known."""
+        block = self._blocks[BEFORE]
+        wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
+        rates = [one.gyro / one.time for one in self._blocks]
+        if max(rates) - min(rates) < LEAST_CHANGE * BLOCK_S:
+            change = 0.0
+        if block.slips or (abs(wheels) < LEAST_RATE and abs(change) < LEAST_CHANGE):
             return
-        z = (after - before) / (2.0 * BLOCK_S)
-        if z * change < 0.0:
-            z = 0.0
         weight = 1.0 / (BLOCK_NOISE + BLOCK_SHARE * abs(wheels)) ** 2
-        self._way += wheels * BLOCK_S
-        self._off += (gyro - self.ratio * wheels - self._slope * change) * BLOCK_S
+        self._way += block.wheels
+        self._off += (gyro - self.ratio * wheels - self._slope * change) * block.time
         if abs(self._way) >= STRETCH:
             self._offs = KEPT * self._offs + self._off * self._off
             self._ways = KEPT * self._ways + self._way * self._way
@@ -192,23 +206,17 @@ class Match:
         self._ww = MEMORY * self._ww + weight * wheels * wheels
         self._wg = MEMORY * self._wg + weight * wheels * gyro
         self._wd = MEMORY * self._wd + weight * wheels * change
-        self._zw = MEMORY * self._zw + weight * z * wheels
-        self._zg = MEMORY * self._zg + weight * z * gyro
-        self._zd = MEMORY * self._zd + weight * z * change
-        self._zz = MEMORY * self._zz + weight * z * z
+        self._dd = MEMORY * self._dd + weight * change * change
+        self._dg = MEMORY * self._dg + weight * change * gyro
         if abs(wheels) >= LEAST_RATE:
             self.blocks = MEMORY * self.blocks + 1.0
         self._solve()
 
     def _solve(self) -> None:
-        """Solve the two equations for the coefficients of w and dw/dt."""
-        along = self._zw / self._ww
-        self._known = self._zd - along * self._wd
-        """What the data say about the delay, as the inverse of a variance, 1/s2. If they say less
-        than half of what was assumed without data, the delay does not change the ratio."""
-        known = self._known * DELAY_S**2 > 0.5
-        self._slope = (self._zg - along * self._wg) / self._known if known else 0.0
-        self.ratio = (self._wg - self._slope * self._wd) / self._ww
+        """Solve the least-squares equations for the coefficients of w and dw/dt."""
+        det = self._ww * self._dd - self._wd * self._wd
+        self.ratio = (self._wg * self._dd - self._dg * self._wd) / det
         """The ratio a: the turn of the gyro divided by the turn of the wheels."""
+        self._slope = (self._dg * self._ww - self._wg * self._wd) / det
         self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
         """Standard deviation of the ratio."""

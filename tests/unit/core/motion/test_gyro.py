@@ -237,6 +237,19 @@ def test_a_clock_that_is_set_makes_no_wrong_turn(set_ms: int) -> None:
     assert worst < 0.07
 
 
+def test_stamps_that_jitter_backwards_are_no_clock_that_was_set() -> None:
+    worst = {}
+    for back_ms in (0, 12):
+        bench, worst[back_ms] = Bench(stamped=True), 0.0
+        bench.run(REST_FIRST)
+        for n in range(500):
+            bench.late_ns = n // 10 % 2 * 80 * MS
+            bench.clock_ns = 10**18 - n % 2 * back_ms * MS
+            bench.run(DT, 2.0 * math.sin(n / 15))
+            worst[back_ms] = max(worst[back_ms], abs(bench.told - bench.true))
+    assert worst[12] < 1.2 * worst[0]
+
+
 # silence, slip, contradictions
 
 

@@ -81,6 +81,17 @@ def test_the_encoder_counts_of_a_straight_drive_are_no_delay() -> None:
     assert found is None or abs(found) < 0.005
 
 
+@pytest.mark.parametrize("delay", [-0.04, 0.12])
+def test_the_encoder_counts_of_a_straight_drive_leave_the_ratio(delay: float) -> None:
+    for seed in range(20):
+        match, dice, before = matched(6.0, 0.625, delay), random.Random(seed), 0
+        for _ in range(4000):
+            now = dice.choice((0, 1))
+            match.add((now - before) * 0.003, dice.gauss(0.0, 5e-5), DT, slips=False)
+            before = now
+        assert match.ratio == pytest.approx(0.625, abs=0.05)
+
+
 def test_changes_of_the_wheels_that_the_gyro_does_not_follow_leave_a_ratio() -> None:
     match, pattern = Match(), (0.0, 0.0, 0.1, 0.1, 0.0, 0.0, -0.1, -0.1)
     for n in range(4000):
@@ -129,6 +140,7 @@ def test_driving_with_a_gyro_that_is_late_contradicts_nothing() -> None:
 
 def test_what_slips_is_not_learned() -> None:
     match = matched(20.0)
+    slipping(match, 1.0, 1.0, 0.0)  # the blocks before the slip are still learned
     before = match.ratio
     slipping(match, 20.0, 1.0, 0.0)
     assert match.ratio == before
