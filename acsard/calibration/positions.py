@@ -136,7 +136,7 @@ def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
 
 
 def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return the indices of the positions before which the source jumped."""
+    """Return the index of the first position after each jump of the source of positions."""
     steps = np.abs(np.diff(run.place))
     if len(steps) < LEAST_POINTS:
         return np.zeros(0, dtype=np.int64)

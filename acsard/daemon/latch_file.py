@@ -231,9 +231,9 @@ class LatchFile:
     # The control loop calls the methods below.
 
     def keep(self, latches: Latches) -> None:
-        """Store these latches, which are in force from now on, without waiting for the disk.
+        """Hand the latches that are now in force to the writer's thread, without waiting for it.
 
-        The thread writes only the newest latches.
+        If several sets of latches wait, the thread writes only the newest.
         """
         self._handed = latches
         self._box.put(latches)

@@ -82,9 +82,9 @@ class Cause(Struct, frozen=True):
 
 
 def suspended(late: Lateness) -> str:
-    """Return the clause for a suspend of the computer, or "".
+    """Return the part of the message that says that the computer was suspended, "" if it was not.
 
-    CLOCK_BOOTTIME runs on during a suspend, and CLOCK_MONOTONIC does not.
+    Two clocks show it: CLOCK_BOOTTIME runs on during a suspend, and CLOCK_MONOTONIC does not.
     """
     asleep_ns = late.after.asleep_ns - late.before.asleep_ns
     return (

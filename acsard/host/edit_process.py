@@ -1,8 +1,8 @@
 """Computes the changed text of an `acsard.toml` in a process of its own, for the daemon.
 
-The library tomlkit needs a tenth of a second for a file like the reference. In a thread of the
-daemon it would hold the interpreter again and again, for half a millisecond each time. In a
-measurement of that, the control loop was up to 12 ms late and missed 3 of 559 periods.
+The library tomlkit needs a tenth of a second for a file as long as the reference configuration. In
+a thread of the daemon it would hold the interpreter again and again, for half a millisecond each
+time. When this was measured, the control loop was up to 12 ms late and missed 3 of 559 periods.
 """
 
 from __future__ import annotations

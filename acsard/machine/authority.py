@@ -85,9 +85,10 @@ class Authority:
         return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
 
     def permits(self, address: str) -> bool:
-        """Return whether a certificate for this host name or IP address would be valid.
+        """Return whether a certificate of this authority for a host name or address would be valid.
 
-        An authority that another program made may sign for any name.
+        An authority that acsard made is limited to some names. One that another program made may
+        have no limits.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)

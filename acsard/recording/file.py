@@ -284,7 +284,7 @@ class Writing:
         self._end_builder.event(event)
 
     def flush(self) -> None:
-        """Write all added messages in a form that can be read, and sync the file to the disk."""
+        """Write all added messages so that they can be read from now on, and sync the file."""
         if self._chunk is not None and self._chunk.has_unwritten:
             self._put(self._chunk.take())
         self._sync()

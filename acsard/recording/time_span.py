@@ -168,7 +168,7 @@ def _last_occurrence(when: TimeOfDay, before_s: float) -> float:
 
 
 def clock(seconds: float, day: bool = False) -> str:
-    """Return a time in s since 1970 as local time: with its date if `day`, else with its ms."""
+    """Format `seconds` since 1970 as local time, with the date if `day`, else with ms."""
     local = time.localtime(seconds)
     if day:
         return time.strftime("%Y-%m-%d %H:%M:%S", local)

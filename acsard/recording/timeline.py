@@ -266,7 +266,7 @@ class WaitingSenders:
         yield TimelineEntry(now.wall_ns / 1e9, "waits", text, by=_named(*key))
 
     def _has_room(self, now: Instant) -> bool:
-        """Return whether one more sender can be watched, after forgetting the silent ones."""
+        """Forget the senders that are silent, and return whether one more can be watched."""
         if len(self._waiting) >= MAX_WAITING:
             oldest_ns = now.mono_ns - SILENT_NS
             kept = {key: one for key, one in self._waiting.items() if one.last_ns >= oldest_ns}

@@ -195,7 +195,7 @@ class Admission:
             return problem(error.status, WORDS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Delay a request without a valid token by `HOLD_S` if its network sends too many."""
+        """Delay a request by `HOLD_S` if it has no valid token and its network sends many such."""
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
 

@@ -116,7 +116,7 @@ class _Source:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """Return the live senders, armed ones first, and otherwise the earlier ones first."""
+        """Return the live senders: armed ones before others, then those that came earlier."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live

@@ -71,7 +71,8 @@ class EventThrottle:
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line of this name may be written now. If so, count it as written.
 
-        `news` is true if the waiting events include news. Only then may several lines come at once.
+        `news` says whether a waiting event is marked as news. If none is, only one line may be
+        written at a time.
         """
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
