@@ -419,8 +419,8 @@ class _Log:
             t, speeds = speeds_of(t, angles)
         elif not np.any(np.abs(speeds) > 0.0):
             raise LogError(
-                f"{topic} has no position and no velocity that changes: its publisher leaves both "
-                "empty, or the wheels stood still. Record the wheels while the robot drives"
+                f"{topic} has neither positions nor velocities that change: its publisher leaves "
+                "both empty, or the wheels stood still. Record the wheels while the robot drives"
             )
         return {"t": t} | dict(zip(topic.wheels, speeds.T, strict=True))
 

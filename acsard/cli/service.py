@@ -71,7 +71,8 @@ def main_uninstall(args: argparse.Namespace) -> int:
         stateful=[unit for unit, (where, _) in service.STATES.items() if where.exists()],
     )
     _do(steps, args.dry_run)
-    print(f"\nThe program itself stays in {sys.prefix}; delete that directory to remove it")
+    if sys.prefix != sys.base_prefix:  # a venv: never advise to delete a Python of the system
+        print(f"\nThe program itself stays in {sys.prefix}; delete that directory to remove it")
     return 0
 
 

@@ -101,7 +101,7 @@ class Drives:
         """Register a viewer's channel. If it cannot drive, the reason is reported on publishing."""
         found, problem = "", ""
         if topic != self.topic:
-            problem = f"no program listens on {topic}: drive on {self.topic}"
+            problem = f"no program listens on {topic}: send commands to {self.topic} instead"
         else:
             try:
                 found = encoding_of(encoding, schema_name)

@@ -42,7 +42,7 @@ CUTS = {
     "bug": "cut: an internal error ended the daemon",
     "crash": "cut: the daemon or the computer ended without notice",
     "disk": "cut: the disk accepted no more data",
-    "late": "cut: the daemon was asked to end, and the disk was too slow for the rest",
+    "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut, or still being recorded, when it was recovered",
 }
 """Maps each cause for which a recording has no ordinary end to its description.

@@ -169,8 +169,8 @@ class Calls:
             rate = STOPS_ELSEWHERE
             raise RefusedError(
                 "too_fast",
-                f"not sent: more than {rate.most:g} stops at once, or {rate.hz:g} a second, to "
-                "robots that have not answered yet; ask again",
+                f"the stop was not sent: at most {rate.most:g} at once, and {rate.hz:g} a second, "
+                "may go to robots that have not answered yet; send it again",
             )
 
     async def _ask(self, call: Callable[[], T]) -> T:

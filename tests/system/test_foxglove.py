@@ -471,7 +471,7 @@ def test_input_that_is_not_a_command_is_reported(viewer: Viewer) -> None:
     viewer.status("refused: needs both `linear` and `angular`")
     send, _ = viewer.publish_on("/initialpose", "json", "geometry_msgs/Twist")
     send(speed(1.0))
-    viewer.status("no program listens on /initialpose: drive on /cmd_vel")
+    viewer.status("no program listens on /initialpose: send commands to /cmd_vel instead")
 
 
 @SLOW

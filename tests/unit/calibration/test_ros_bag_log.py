@@ -308,7 +308,7 @@ def test_an_axis_without_an_imu_is_told() -> None:
 def test_wheels_that_never_move_are_told() -> None:
     still = usual(plan=[(10, 0, 0)])
     still = Drive(**{**vars(still), "left": still.left * 0, "right": still.right * 0})
-    with pytest.raises(LogError, match="no position and no velocity that changes"):
+    with pytest.raises(LogError, match="neither positions nor velocities that change"):
         of(joint_states(still), imu(still))
 
 
