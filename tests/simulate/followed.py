@@ -148,8 +148,12 @@ class Followed:
         if learned_ns != witness.ages.learned_ns:
             least = age
         if age < least - FALL_NS:
-            # A backlog pours in, or the clock was set.
+            # A backlog pours in, or the clock was set. The daemon takes the clock for new, and may
+            # no longer count the commands before.
             self._fell_ns[sample.clock] = wish.arrived_ns
+            for commands in (self._waiting, self._sure):
+                for who in [who for who, one in commands.items() if one.clock == sample.clock]:
+                    del commands[who]
         # The daemon may know a clock that it has never followed, also behind a silence.
         least = min(least, age)
         self._least[sample.clock] = witness.ages.learned_ns, least

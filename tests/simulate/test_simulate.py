@@ -1001,6 +1001,23 @@ def test_a_gap_while_moving_that_leaves_the_covariance_as_it_was_is_a_finding(
         see(1.0, 0.01, 0.3, 0.01 + grown)
 
 
+@pytest.mark.parametrize("gap_s", [0.2, 2.0])
+def test_a_robot_that_stood_before_a_gap_may_have_been_pushed_in_it(gap_s: float) -> None:
+    witness = PoseWitness(PLAIN["config"])
+
+    def see(at_s: float, true_x: float) -> None:
+        at_ns = int(at_s * NS)
+        estimate = at_ns, 0.0, 0.0, 0.0, (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), ()
+        witness.see(at_ns, [estimate], (at_ns, true_x, 0.0, 0.0, 0.0), 0, set())
+
+    for n in range(30):
+        see(1.0 + n * 0.01, 0.0)
+    outcome = nullcontext() if gap_s > 1.0 else pytest.raises(BrokenError, match="its covariance")
+    with outcome:
+        for n in range(30):
+            see(1.3 + gap_s + n * 0.01, 2.0)
+
+
 def test_a_pose_in_state_that_moves_while_the_board_is_silent_is_a_finding() -> None:
     state = {"x": 1.0, "y": 2.0, "yaw": 0.5}
     judge_pose(2 * NS, state, (1.0, 2.0, 0.5), NS, NS // 10)
@@ -1130,6 +1147,27 @@ def test_a_robot_that_is_released_forgets_the_command_that_it_followed_in_that_s
             if released and not number:
                 witness.arming(at_ns + 1)
             followed.step(at_ns + 2, at_ns + 2, at_ns, "driving", "up")
+
+
+def test_a_clock_whose_delay_falls_has_no_certain_command_any_more() -> None:
+    witness = witnessed()
+    followed, sender = Followed(witness), SIGNED | {"way": "client", "delay": 1.0}
+
+    def arrives(at_ns: int, delay_ns: int) -> None:
+        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, at_ns, "")
+        found = sample(sender, one, PLAIN["config"], 0)
+        wish = witness.command(sender, one, found, at_ns)
+        followed.command(sender, one, found, at_ns, wish)
+
+    for at_ns in range(NS, 8 * NS, NS // 20):
+        arrives(at_ns, NS)
+        followed.step(at_ns + 1, at_ns + 1, None, "driving", "up")
+    assert followed._sure
+    arrives(8 * NS, NS)
+    assert followed._waiting
+    arrives(8 * NS + 1, NS // 2)
+    assert not followed._sure
+    assert not followed._waiting
 
 
 def test_a_delay_that_falls_below_all_accepted_ones_looks_like_a_clock_that_was_set() -> None:
