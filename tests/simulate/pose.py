@@ -62,6 +62,8 @@ class PoseWitness:
         self._known_ns = 0
         """From when on the lines show the motion again."""
         rate = config.get("control", {}).get("rate")
+        self._seldom = rate == 10.0
+        """Whether lines come so seldom that two of them say little of a longer gap between."""
         rates = config.get("odometry", {})
         sure = rates.get("yaw_variance_per_metre", 1.0) < 1e-4
         sure |= rates.get("yaw_variance_per_radian", 1.0) < 1e-2
@@ -69,7 +71,7 @@ class PoseWitness:
         rounded = isinstance(rate, float) and rate > 100.0 and coarse
         # Nobody knows the heading as well as these rates say at ten lines a second, or from lines
         # so frequent that their speeds are a count or none.
-        self._drifts = sure and (rate == 10.0 or rounded)
+        self._drifts = sure and (self._seldom or rounded)
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._placed = False
@@ -175,8 +177,9 @@ class PoseWitness:
                 )
         if lies or self._drifts:
             return
-        if last is not None and at_ns - last[0] >= GAP_NS:
-            # A robot that stood before the gap may have been pushed in it.
+        # A robot that stood before a gap may have been pushed in it.
+        stood = self._before is not None and self._before[3] < MOVES
+        if last is not None and at_ns - last[0] >= GAP_NS and (self._seldom or stood):
             self.doubt(mute=True)
         true = self._true_at(at_ns)
         if true is None:
