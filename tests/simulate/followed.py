@@ -80,6 +80,9 @@ class Followed:
         last forgot all delays. A lower delay that did not last for a proof is not believed."""
         self._below_ns: dict[str, int] = {}
         """When a command of each clock last took clearly less time than the delay in `_learned`."""
+        self._late_ns: dict[str, int] = {}
+        """When a command of each adjusted clock last came later than its timeout allows. The daemon
+        may have learned that delay, and a shorter one then looks like a clock that was set."""
         self._newest: dict[str, int] = {}
         """The highest number that arrived, by clock."""
         self._waiting: dict[Who, Command] = {}
@@ -166,13 +169,17 @@ class Followed:
         ):
             run = self._runs[sample.clock] = Run(at_ns, age)
         run.low, run.high, run.last_ns = min(run.low, age), max(run.high, age), at_ns
-        proof_ns = 3 * NS + 2 * min(witness.timeout[found.who[0]], 2 * NS)
+        timeout_ns = witness.timeout[found.who[0]]
+        proof_ns = 3 * NS + 2 * min(timeout_ns, 2 * NS)
+        if sender["way"] in FOREIGN and age - least > timeout_ns - FALL_NS:
+            self._late_ns[sample.clock] = at_ns
         if age < self._lowest_learned(sample.clock, age) - FALL_NS:
             self._below_ns[sample.clock] = at_ns
         proven = run.followed or (not sender.get("jitter") and at_ns - run.begun_ns > proof_ns)
         if proven:
             self._learn(sample.clock, age)
         proven &= at_ns - self._fell_ns.get(sample.clock, -NS) >= NS
+        proven &= at_ns - self._late_ns.get(sample.clock, -proof_ns) >= proof_ns
         return proven and age <= least + EVEN_NS and message.number > newest
 
     def _lowest_learned(self, clock: str, default: int) -> int:

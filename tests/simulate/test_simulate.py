@@ -1170,6 +1170,26 @@ def test_a_clock_whose_delay_falls_has_no_certain_command_any_more() -> None:
     assert not followed._waiting
 
 
+@pytest.mark.parametrize(("way", "certain"), [("signed", False), ("client", True)])
+def test_an_adjusted_clock_with_a_late_command_has_no_certain_command_for_a_while(
+    way: str, certain: bool
+) -> None:
+    witness = witnessed()
+    followed, sender = Followed(witness), SIGNED | {"way": way}
+    certain_ns = []
+    for at_ns in range(NS, 9 * NS, NS // 20):
+        late = at_ns == 4 * NS
+        sent_ns = at_ns - (2 * NS if late else NS // 100)
+        one = Message(sent_ns, at_ns, 0.3, 0.0, sent_ns, at_ns, "")
+        found = sample(sender, one, PLAIN["config"], 0)
+        wish = witness.command(sender, one, found, at_ns)
+        followed.command(sender, one, found, at_ns, wish)
+        certain_ns += [at_ns] if followed._waiting else []
+        followed.step(at_ns + 1, at_ns + 1, None if late else at_ns, "driving", "up")
+    assert certain_ns[0] < 4 * NS < 8 * NS < certain_ns[-1]
+    assert any(5 * NS < at_ns < 6 * NS for at_ns in certain_ns) is certain
+
+
 def test_a_delay_that_falls_below_all_accepted_ones_looks_like_a_clock_that_was_set() -> None:
     sent = [
         (3.9, "a", 0.3, 0.0),
