@@ -135,6 +135,8 @@ class Followed:
     def _certain(self, found: Command, sample: Sample, wish: Wish) -> bool:
         """Return whether the daemon certainly accepts this command."""
         witness, sender, message = self._witness, found.sender, found.message
+        newest = self._newest.get(sample.clock, 0)
+        self._newest[sample.clock] = max(newest, message.number)
         if found.who[0] in witness.churned or message.junk:
             return False
         if not sample.clock:
@@ -144,8 +146,6 @@ class Followed:
             return wish.certain and (armed or not sample.shared)
         if sample.clock in witness.shared_clocks or not stable(sender):
             return False
-        newest = self._newest.get(sample.clock, 0)
-        self._newest[sample.clock] = max(newest, message.number)
         age, at_ns = wish.arrived_ns - message.sent_ns, wish.arrived_ns
         learned_ns, least = self._least.get(sample.clock, (0, age))
         if learned_ns != witness.ages.learned_ns:

@@ -1190,6 +1190,22 @@ def test_an_adjusted_clock_with_a_late_command_has_no_certain_command_for_a_whil
     assert any(5 * NS < at_ns < 6 * NS for at_ns in certain_ns) is certain
 
 
+@pytest.mark.parametrize("number", [200, 202])
+def test_a_command_older_than_one_without_motion_is_not_certain(number: int) -> None:
+    followed, sender = Followed(witnessed()), SIGNED | {"way": "client"}
+    for at_ns, sequence, junk in (
+        *((n * NS // 20, n, "") for n in range(20, 200)),
+        (10 * NS, 201, "cancels"),
+        (10 * NS + 1, number, ""),
+    ):
+        one = Message(at_ns, at_ns, 0.3, 0.0, at_ns, sequence, junk)
+        found = sample(sender, one, PLAIN["config"], 0)
+        wish = followed._witness.command(sender, one, found, at_ns)
+        followed.step(at_ns, at_ns, None, "driving", "up")
+        followed.command(sender, one, found, at_ns, wish)
+    assert bool(followed._waiting) is (number > 201)
+
+
 def test_a_delay_that_falls_below_all_accepted_ones_looks_like_a_clock_that_was_set() -> None:
     sent = [
         (3.9, "a", 0.3, 0.0),

@@ -216,7 +216,9 @@ class _Side:
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
             against = self.witnesses[self.out].speed * self.expected.commanded < 0.0
-            if fault == "stuck" or (fault == "reversed" and against):
+            if fault == "stuck" and not same[self.out]:
+                self._out_s = 0.0  # it has another speed, so it was not stuck
+            elif fault == "stuck" or (fault == "reversed" and against):
                 self._out_s += dt
         # A finding that a wheel is reversed may be wrong on a slow robot, so the test goes on after
         # it.

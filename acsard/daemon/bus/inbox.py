@@ -53,7 +53,7 @@ class Replies:
         The replies to the query go to the key `key`. If `key` is "", each reply goes to the key
         that it names below the prefix of the robot.
         """
-        if len(self._queries) > TICKETS:
+        if len(self._queries) >= TICKETS:
             return None
         ticket = next(self._tickets)
         self._queries[ticket] = (query, key)

@@ -122,6 +122,23 @@ def test_it_counts_again_when_it_has_agreed_for_half_a_second() -> None:
     assert bench.events == ["left out", "again"]
 
 
+@pytest.mark.parametrize(("says", "fault"), [((10.0, 10.0), True), ((7.0, 8.0), False)])
+def test_a_wheel_left_out_as_stuck_is_a_fault_only_while_it_repeats_that_speed(
+    says: tuple[float, float], fault: bool
+) -> None:
+    bench, five = driven(), WheelSpeeds(5.0, 5.0, 5.0, 5.0)
+    bench.run(only(0, 10.0, others=5.0), five, seconds=0.1)
+    assert "says one and the same speed" in bench.faults.status.text
+    told = ""
+    for line in range(500):
+        seen = only(0, says[line % 2], others=5.0)
+        turned = tuple(speed * PERIOD for speed in seen.as_tuple())
+        told = told or bench.faults.watch(five, seen, PERIOD)
+        bench.faults.look(turned, seen, PERIOD)  # type: ignore[arg-type]
+    assert ("stuck" in told) is fault
+    assert bench.faults.status.left_out == ("front_right",)
+
+
 def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
     robot, plain = odometry(3200), Plain()
     for told in [TEN] * 200 + [only(0, 0.0)] * 50:
