@@ -20,6 +20,10 @@ LIARS = {
 MOTORS = {"reversed_motor", "dead_motor", "swapped_motors"}
 """Faults behind which a wheel still turns against its command until its motor has followed."""
 
+QUEUED_NS = 2 * NS
+"""Time after a wrong baud rate for which lines may come late: they waited while the board sent
+slowly."""
+
 GAP_NS = 3 * NS // 10
 """A gap of the estimates of this length and more is judged by itself."""
 
@@ -103,6 +107,8 @@ class PoseWitness:
         """Note that a fault of the board ended."""
         if fault in MOTORS:
             self.unknown_until(at_ns + self._follows_ns)
+        if fault == "wrong_baud":
+            self.unknown_until(at_ns + QUEUED_NS)
 
     def unknown_until(self, at_ns: int) -> None:
         """Note that until then nobody can know the motion from the lines."""

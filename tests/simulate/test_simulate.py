@@ -1018,6 +1018,19 @@ def test_a_robot_that_stood_before_a_gap_may_have_been_pushed_in_it(gap_s: float
             see(1.3 + gap_s + n * 0.01, 2.0)
 
 
+@pytest.mark.parametrize(("since_s", "finding"), [(0.5, False), (2.5, True)])
+def test_lines_that_waited_at_a_wrong_baud_rate_tell_an_older_motion(
+    since_s: float, finding: bool
+) -> None:
+    witness = PoseWitness(PLAIN["config"])
+    witness.mended("wrong_baud", 0)
+    with pytest.raises(BrokenError, match="its covariance") if finding else nullcontext():
+        for n in range(300):
+            at_ns = int(since_s * NS) + n * NS // 250
+            estimate = at_ns, 0.0, 0.0, 0.0, (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), ()
+            witness.see(at_ns, [estimate], (at_ns, n * 0.002, 0.0, 0.0, 0.0), 0, set())
+
+
 def test_a_pose_in_state_that_moves_while_the_board_is_silent_is_a_finding() -> None:
     state = {"x": 1.0, "y": 2.0, "yaw": 0.5}
     judge_pose(2 * NS, state, (1.0, 2.0, 0.5), NS, NS // 10)
