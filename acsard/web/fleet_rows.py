@@ -122,6 +122,8 @@ def _row(one: fleet.Row) -> Row:
     if one.here is False:
         was = f"its daemon has ended; it was {state.mode}"
         return Row(one.robot_id, "gone", was, None, "", age, version)
+    if one.silent:
+        return Row(one.robot_id, None, f"it was {state.mode}", None, "", age, version)
     return Row(
         one.robot_id, state.mode, state.reason, state.linear, state.link, age, version,
         [str(one) for one in warnings(state)], [state.x, state.y, state.yaw],

@@ -241,8 +241,8 @@ class Row(Struct, frozen=True):
 
     robot: str
     mode: str | None
-    """Mode as in `state`; "gone" after the daemon announced its end, None before the first
-    state."""
+    """Mode as in `state`; "gone" after the daemon announced its end, None while the robot is
+    silent."""
     reason: str
     speed: float | None
     """Measured forward speed, m/s."""
@@ -254,7 +254,7 @@ class Row(Struct, frozen=True):
     warnings: Sequence[str] = ()
     """Warnings of the robot, in words. A robot with warnings may still be ready."""
     place: Sequence[float] | None = None
-    """x and y in m, and yaw in rad, in the odom frame; None before the first state."""
+    """x and y in m, and yaw in rad, in the odom frame; None while no state arrives."""
     battery: str = ""
     """State of charge, else the voltage, in words; "" if neither is reported."""
 

@@ -63,6 +63,8 @@ class Outgoing:
         """Subscribed keys by (robot, key)."""
         # If more messages than this wait, the oldest are dropped.
         self._out: deque[bytes] = deque(maxlen=200)
+        self._pong: bytes | None = None
+        """Data of the newest ping that has no answer yet, or None."""
         self._news = asyncio.Event()
         self._reports = Buckets(REPORTS)
         self._closing = False
@@ -129,16 +131,23 @@ class Outgoing:
         if self._transport is not None:
             self._transport.abort()
 
-    async def pong(self, data: bytes) -> None:
-        """Answer a ping."""
-        with suppress(ConnectionError):
-            await self._socket.pong(data)
+    def pong(self, data: bytes) -> None:
+        """Answer a ping with this data, and no earlier ping that still waits for its answer.
 
-    async def _send(self, text: bytes) -> None:
+        The protocol allows that, and the pings of a client that does not read cannot fill the
+        memory.
+        """
+        self._pong = data
+        self._news.set()
+
+    async def _send(self, data: bytes, kind: aiohttp.WSMsgType = aiohttp.WSMsgType.TEXT) -> None:
         if not self._closing:  # no data may follow a close frame
-            await self._socket.send_frame(text, aiohttp.WSMsgType.TEXT)
+            await self._socket.send_frame(data, kind)
 
     async def _send_what_waits(self) -> None:
+        if self._pong is not None:
+            data, self._pong = self._pong, None
+            await self._send(data, aiohttp.WSMsgType.PONG)
         while self._out:
             await self._send(self._out.popleft())
 
@@ -232,26 +241,23 @@ class Keys:
         # Remove the key now, because the client may subscribe again in the next message.
         one = self._out.following.pop(name, None)
         if one is not None:
-            self._give_back(one)
-            if one.stream is not None:
-                self._start(self._robots.streams.leave(*name))
+            self._leave(one)
 
-    async def leave_all(self) -> None:
+    def leave_all(self) -> None:
         """End all subscriptions."""
         followed, self._out.following = self._out.following, {}
         for one in followed.values():
-            self._give_back(one)
-        for one in followed.values():
-            if one.stream is not None:
-                await self._robots.streams.leave(one.robot, one.name)
+            self._leave(one)
 
     @property
     def _shares(self) -> Shares:
         return self._robots.streams.shares
 
-    def _give_back(self, one: Following) -> None:
+    def _leave(self, one: Following) -> None:
         if one.robot != self._robots.id:
             self._shares.leave(self._holder, (one.robot, one.name))
+        if one.stream is not None:
+            self._robots.streams.leave(one.robot, one.name)
 
     async def _join(self, one: Following) -> None:
         stream = None
@@ -260,7 +266,7 @@ class Keys:
         if stream is None:
             return
         if not self._is_followed(one):  # the viewer unsubscribed meanwhile
-            await self._robots.streams.leave(one.robot, one.name)
+            self._robots.streams.leave(one.robot, one.name)
             return
         one.stream = stream
         self._out.wake()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -89,6 +90,7 @@ class Streams:
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
+        self._ending: set[asyncio.Task[None]] = set()
         self.shares = Shares(STREAMS, STREAMS_OF_ONE)
         """The holders of streams of other robots. The caller acquires a share before `follow`, and
         releases it when it ends the subscription."""
@@ -108,7 +110,7 @@ class Streams:
                 if stream.declared is None:
                     stream.declared = await self._declare(client, robot, key, stream)
         except BaseException:
-            await self.leave(robot, key)
+            self.leave(robot, key)
             raise
         return stream
 
@@ -116,8 +118,11 @@ class Streams:
         """Return the stream of a robot's key if it has a user, otherwise None."""
         return self._streams.get((robot, key))
 
-    async def leave(self, robot: str, key: str) -> None:
-        """Remove a user from a stream; without users, the subscription ends."""
+    def leave(self, robot: str, key: str) -> None:
+        """Remove a user from a stream; without users, the subscription ends in the background.
+
+        The call does not wait, so a user that ends at the same moment leaves nothing behind.
+        """
         stream = self._streams.get((robot, key))
         if stream is None:
             return
@@ -126,10 +131,9 @@ class Streams:
             return
         del self._streams[robot, key]
         if stream.declared is not None:
-            try:
-                await in_thread(stream.declared.undeclare, DECLARE_S)
-            except (TimeoutError, zenoh.ZError):
-                pass  # the bus is stuck or closed, so no samples arrive
+            task = asyncio.create_task(_ended(stream.declared))
+            self._ending.add(task)
+            task.add_done_callback(self._ending.discard)
 
     async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
         client = own.like(robot)
@@ -154,6 +158,11 @@ class Streams:
             return heard
 
         return await in_thread(declare, DECLARE_S, late)
+
+
+async def _ended(subscriber: Any) -> None:
+    with suppress(TimeoutError, zenoh.ZError):  # the bus is stuck or closed, so no samples arrive
+        await in_thread(subscriber.undeclare, DECLARE_S)
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:

@@ -177,7 +177,7 @@ class Viewer:
             pump.cancel()
             for task in list(self._tasks):
                 task.cancel()
-            await self._keys.leave_all()
+            self._keys.leave_all()
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
@@ -227,7 +227,7 @@ class Viewer:
                 self._counts.refuse("too_fast", self.who.origin)
                 self._out.cut()
         elif message.type == aiohttp.WSMsgType.PING:
-            self._start(self._out.pong(message.data))
+            self._out.pong(message.data)
 
     def _obey(self, frame: Frame) -> None:
         self._guide.heard(self)

@@ -392,13 +392,15 @@ def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
         assert browser.js("document.getElementById('stick').matches('.held')") is False
 
 
-@pytest.mark.parametrize("other", ["MetaLeft", "menu"])
+@pytest.mark.parametrize("other", ["MetaLeft", "menu", "drag"])
 def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, other: str) -> None:
     browser, bus = page.browser, page.bus
     browser.key("Down", "KeyW", "w")
     until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "forwards")
     if other == "menu":
         browser.js("window.dispatchEvent(new MouseEvent('contextmenu'))")
+    elif other == "drag":
+        browser.js("document.querySelector('.help').dispatchEvent(new DragEvent('dragstart'))")
     else:
         browser.ask(
             "Input.dispatchKeyEvent", type="rawKeyDown", code=other, key="Meta", modifiers=4
@@ -406,6 +408,24 @@ def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, othe
     bus.at_rest()
     assert browser.js("document.getElementById('stick').matches('.held')") is False
     browser.key("Up", "KeyW", "w")
+
+
+def test_a_key_that_was_pressed_while_nothing_drives_takes_no_part_in_the_next_drive(
+    page: Phone,
+) -> None:
+    """Its release may never be reported, for example while Meta is down."""
+    browser, bus = page.browser, page.bus
+    bus.ask("srv/stop")
+    page.shows("mode", "STOPPED")
+    browser.key("Down", "KeyW", "w")
+    bus.ask("srv/clear")
+    page.shows("mode", "READY")
+    browser.key("Down", "KeyA", "a")
+    until(lambda: (bus.state()["angular"] or 0.0) > 0.15, 10.0, "it turns")
+    assert abs(bus.state()["linear"]) < 0.02
+    browser.key("Up", "KeyA", "a")
+    bus.at_rest()
+    assert browser.js("document.getElementById('stick').matches('.held')") is False
 
 
 @alone

@@ -170,6 +170,42 @@ async def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
             assert list(viewer._out.following) == [("acsar", "state")]
 
 
+async def test_who_unsubscribes_and_leaves_at_once_leaves_no_subscription_behind(
+    inside: Inside, tmp_path: Path
+) -> None:
+    with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
+        inside.robots.client = Client(session, "acsar", "teleop")
+        async with inside.hands() as ours:
+            await ours.say(subscribe="odom", rate=50)
+            await ours.find(lambda said: "key" in said)
+            assert inside.robots.streams.followed("acsar", "odom") is not None
+            # The server reads both messages at once.
+            await ours.say(unsubscribe="odom")
+            await ours.socket.close()
+            await eventually(lambda: not inside.page._viewers)
+            assert inside.robots.streams.followed("acsar", "odom") is None
+
+
+async def test_who_pings_and_does_not_read_gets_one_answer_to_all_pings(inside: Inside) -> None:
+    async with inside.hands() as ours:
+        await ours.find(lambda said: "hello" in said)
+        wire = cast(Any, ours.socket)._response.connection.transport
+        wire.pause_reading()
+        (viewer,) = inside.page._viewers
+        viewer._out.say({"more than a kernel holds": "x" * 3_000_000})
+        await eventually(lambda: viewer._out._unread() > UNREAD_BYTES)
+        for n in range(300):
+            await ours.socket.ping(b"%0125d" % n)
+        await ours.drive(0.0)
+        await eventually(lambda: inside.counts.all().get("commands_dropped"))
+        ours.socket._autoping = False  # the client would answer and hide what the test waits for
+        wire.resume_reading()
+        async with asyncio.timeout(PATIENCE_S):
+            while (message := await ours.socket.receive()).type != aiohttp.WSMsgType.PONG:
+                pass
+        assert message.data == b"%0125d" % 299
+
+
 async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
     inside: Inside, tmp_path: Path
 ) -> None:

@@ -140,6 +140,8 @@ export class Drive {
     document.addEventListener("freeze", () => this.release());
     document.addEventListener("visibilitychange", () => document.hidden && this.release("released: the page was hidden"));
     addEventListener("contextmenu", () => this.#by === "keys" && this.release("released: a menu is open"), true);
+    // While something is dragged, no browser reports the release of a key.
+    addEventListener("dragstart", () => this.#by === "keys" && this.release("released: something is dragged"), true);
     addEventListener("gamepaddisconnected", () => this.#by === "pad" && this.release("released: the gamepad is disconnected"));
     setInterval(() => this.#pad(), 50);
   }
@@ -182,13 +184,14 @@ export class Drive {
     if (!down && !this.#pressed.delete(event.code)) return;
     if (down && (!this.shown || busy(event))) return;
     event.preventDefault();
-    if (event.repeat) return;
+    if (event.repeat || (this.#by && this.#by !== "keys")) return;
     if (down) this.#pressed.add(event.code);
-    if (this.#by && this.#by !== "keys") return;
     const sum = [...this.#pressed].reduce(([x, y], code) => [x + KEYS[code][0], y + KEYS[code][1]], [0, 0]);
     if (!this.#pressed.size) return this.release();
     this.#show(...sum.map(Math.sign));
     if (down) this.#press("keys");
+    // A key that does not drive is forgotten: its release may never be reported, and it would drive with the next key.
+    if (!this.#commander.held) this.release();
   }
 
   #pad() {

@@ -279,4 +279,4 @@ async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refu
                 await asyncio.sleep(0.01)
         await refused()
         assert await stop("r3") != "too_fast"
-        await known.streams.leave("r3", "state")
+        known.streams.leave("r3", "state")

@@ -71,6 +71,24 @@ async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
             await asyncio.sleep(0.01)
 
 
+async def test_a_robot_that_is_present_and_silent_is_not_shown_in_its_last_mode(
+    session: zenoh.Session,
+) -> None:
+    fleet = Fleet(robots(Client(session, "acsar", "teleop")))
+    token = session.liveliness().declare_token("acsard/r2/alive")
+    fleet.join(1)
+    await row(fleet, lambda one: one.robot == "r2")
+    key, named = "acsard/r2/state", encoding_name("msgpack", "RobotState")
+    session.put(key, encode(STATE, "msgpack"), encoding=named)
+    await row(fleet, lambda one: one.mode == STATE.mode)
+    silent = await row(fleet, lambda one: one.mode is None)
+    assert (silent.speed, silent.link, silent.place) == (None, "", None)
+    assert silent.reason == f"it was {STATE.mode}"
+    assert silent.age is not None
+    token.undeclare()
+    fleet.leave(1)
+
+
 async def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when_its_token_is(
     session: zenoh.Session,
 ) -> None:
