@@ -226,6 +226,8 @@ class _Input:
         """`X` for each pressed one in the last line, empty before the first line."""
         self.reported_ns: int | None = None
         """Arrival of the last line that may count, by the robot's clock."""
+        self.counted_ns = 0
+        """Arrival of the last line that certainly counts."""
         self.pressed_ns: int | None = None
         """True time since when one certainly counts as pressed."""
         self.sure = True
@@ -347,6 +349,8 @@ class Inputs:
         for known in (self.estop, self.bumpers):
             if known.reported_ns is not None and decided_ns - known.reported_ns > SILENT_NS:
                 self._silence(known, decided_ns, offset, calm_ns)
+            elif not known.sure and decided_ns - known.counted_ns > SILENT_NS:
+                self._doubt()  # the last line may not have ended the silence
         if self._fresh:
             # A line that a command made early leaves in the place of the next period's line. A
             # robot that has got a zero already may then get the next one a period later.
@@ -382,6 +386,7 @@ class Inputs:
             known.pressed_ns = None
             self._doubt()
             return
+        known.counted_ns = at_ns
         if (was_silent == "surely" and known is self.bumpers) or not before:
             # A pressed emergency stop that was silent still is the same press.
             before = b"." * len(marks)

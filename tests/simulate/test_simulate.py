@@ -252,6 +252,18 @@ def test_an_input_that_is_silent_for_half_a_second_counts_as_pressed(
         bench.step(at, b"", mode)
 
 
+@pytest.mark.parametrize(("at", "finding"), [(1.48, True), (1.53, False)])
+def test_a_status_line_without_a_check_may_not_end_a_silence(at: float, finding: bool) -> None:
+    bench = Bench()
+    bench.inputs._checked = True
+    bench.step(1.0, OK, "driving", MOVES)
+    bench.step(1.4, b"!status estop=ok\r\n", "driving", MOVES)
+    bench.witness.perhaps_latched.clear()
+    expected = pytest.raises(BrokenError, match="without a cause") if finding else nullcontext()
+    with expected:
+        bench.step(at, b"", "stopped")
+
+
 def test_a_pressed_emergency_stop_that_was_silent_is_no_new_press() -> None:
     bench = Bench()
     bench.step(1.0, OK, "driving", MOVES)
