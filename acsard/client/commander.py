@@ -57,8 +57,12 @@ GATHER_NS = NS_PER_S // 25
 """Time within which all commands of a delayed burst arrive, ns.
 
 A panel that sends at 20 Hz sends at most one command in this time. Only the first command after a
-silence waits this long.
+silence waits this long, and the first one after a burst of more than `CROWD` commands.
 """
+
+CROWD = 5
+"""Largest number of commands that a panel sends in `GATHER_NS`, at 125 Hz. If more arrive, the rest
+of the burst may follow."""
 
 STALE_NS = NS_PER_S // 10
 """Age above which a speed is not sent, ns: it no longer shows the operator's intention."""
@@ -108,7 +112,10 @@ class Commander:
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands that arrived shortly after the last silence; 0 once one is sent."""
+        """Number of commands that have arrived since the first one that waits for a burst; 0 once
+        one is sent."""
+        self._crowded = False
+        """Whether the last burst had more than `CROWD` commands."""
         self._moved_ns: int | None = None
         """Monotonic time at which a nonzero command was last sent, ns; None after a zero."""
         self._asked_ns: int | None = None
@@ -123,7 +130,9 @@ class Commander:
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > SILENCE_NS
         if begins:
-            self._lead, self._burst = self._leads, 0
+            self._lead = self._leads
+        if begins or (self._crowded and now_ns >= self._hold_until_ns):
+            self._burst, self._crowded = 0, False
             self._hold_until_ns = now_ns + self._gather_ns
         if now_ns < self._hold_until_ns:
             self._burst += 1
@@ -149,6 +158,7 @@ class Commander:
             return None
         wish, self._wish = self._wish, None
         burst, self._burst = self._burst, 0
+        self._crowded = burst > CROWD
         moves = wish.twist != REST
         if moves and (burst > 1 or now_ns - self._came_ns > STALE_NS):
             self.stale += 1

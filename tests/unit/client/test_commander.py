@@ -80,6 +80,25 @@ def test_a_burst_that_was_held_back_moves_nothing(panel: Panel) -> None:
     assert panel.commander.replaced == 19
 
 
+@pytest.mark.parametrize("sizes", [(200,), (10, 20, 40, 30)])
+def test_a_burst_that_outlasts_the_wait_for_it_moves_nothing(
+    panel: Panel, sizes: tuple[int, ...]
+) -> None:
+    panel.press(AHEAD, times=3)
+    panel.wait(2 * NS_PER_S)
+    for size in sizes:
+        panel.press(AHEAD, times=size, every_ns=MS)
+        panel.wait(150 * MS)
+    assert panel.gone == [REST, *[AHEAD] * 3, REST]
+    panel.press(LEFT, times=2)
+    assert panel.gone[-2:] == [LEFT, LEFT]
+
+
+def test_a_panel_that_sends_often_drives_after_the_first_wait(panel: Panel) -> None:
+    panel.press(AHEAD, times=100, every_ns=10 * MS)
+    assert len(panel.gone) > 90
+
+
 def test_after_a_burst_the_present_wish_is_sent(panel: Panel) -> None:
     panel.press(AHEAD, times=4, every_ns=0)
     panel.wait(100 * MS)
