@@ -110,6 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
+    code = int(Exit.OK)
     try:
         try:
             whole = parser(words[:1])
@@ -117,10 +118,10 @@ def main(argv: list[str] | None = None) -> int:
             if unknown:
                 text = f"unrecognized arguments: {' '.join(unknown)}"
                 whole.error(f"{text}; `acsard {args.verb} --help` lists the options")
-            return int(args.main(args))
+            code = int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)
-            return int(error.code if isinstance(error, MendableError) else Exit.FAILURE)
+            code = int(error.code if isinstance(error, MendableError) else Exit.FAILURE)
         finally:
             sys.stdout.flush()
     except OSError as error:
@@ -129,9 +130,10 @@ def main(argv: list[str] | None = None) -> int:
         # The program that reads this output (head, less) has ended, or the disk is full. A message
         # could not be printed either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
+        return code if isinstance(error, BrokenPipeError) else code or int(Exit.FAILURE)
     except KeyboardInterrupt:
         return 130
+    return code
 
 
 _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")

@@ -117,10 +117,14 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
         behind = "".join(f"\nnote: {note}" for note in notes)
         raise MendableError(f"{source}: {error}{behind}") from None
+    written, trouble = "", None
     if args.write:
-        change(Path(where), keys(found))
-    told = report(source, found, config.drive, where if args.write else "")
-    written = args.write
+        try:
+            change(Path(where), keys(found))
+            written = where
+        except MendableError as error:  # print the result of the long drive before the error
+            trouble = error
+    told = report(source, found, config.drive, written)
     if lines is None:
         if args.json:
             print(msgspec.json.encode(told).decode())
@@ -128,8 +132,11 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             show(*parts(told, found, where), most=SENTENCES)
     else:
         lines.result(plain(*parts(told, found, where), width=SENTENCES))
-        trouble = _differing(config, mine, where)
-        written = written or lines.offer(args.config, keys(found), trouble)
+        differing = _differing(config, mine, where)
+        if not args.write and lines.offer(args.config, keys(found), differing):
+            written = where
+    if trouble is not None:
+        raise trouble
     if written and not args.log:
         print("restart the daemon: it reads these values only when it starts", file=sys.stderr)
     return int(Exit.OK)

@@ -1,6 +1,7 @@
 """Query a key and print the answer as JSON, indented on a terminal and as one line into a pipe. The
 key is info, config, interfaces, topics, schema/Twist, or any published key, which answers with its
-last value.
+last value. If --id names several robots, each line has the answer of one robot. The exit code is 69
+if one does not answer.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from acsard.cli.replies import json_line, of_robot
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError
-from acsard.daemon.bus.robot_discovery import present
+from acsard.daemon.bus.robot_discovery import ALL, present
 from acsard.host.errors import Exit
 
 
@@ -31,7 +32,8 @@ def main(args: argparse.Namespace) -> int:
             _show(json_line(*robot.reply(args.key)))
             return 0
         silent = 0
-        for one in present(robot.session, many, robot.where.endpoint):
+        wanted = present(robot.session, many, robot.where.endpoint) if ALL in many else many
+        for one in wanted:
             try:
                 line = json_line(*robot.like(one).reply(args.key))
             except AcsardError as error:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import signal
 import sys
 from contextlib import ExitStack
@@ -80,6 +81,12 @@ def _make_link(link: Path, device: str) -> None:
         raise UsageError(words) from None
 
 
+def _remove_link(link: Path, device: str) -> None:
+    """Remove the symbolic link, unless another program has replaced it meanwhile."""
+    if link.is_symlink() and os.readlink(link) == device:
+        link.unlink()
+
+
 def _reset_again(mcu: FakeMcu, period_s: float) -> None:
 
     def reset() -> None:
@@ -104,7 +111,7 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
         if args.link:
             link = Path(args.link)
             _make_link(link, device)
-            stack.callback(link.unlink, missing_ok=True)
+            stack.callback(_remove_link, link, device)
         print(f"acsard run --port {args.link or device}", flush=True)
         faults = ", ".join((*config.sim.faults, *(fault.name for fault in args.fault))) or "none"
         print(f"simulated MCU on {device}, faults: {faults}; Ctrl-C ends it", file=sys.stderr)

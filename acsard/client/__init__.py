@@ -9,8 +9,9 @@
 `connect` is for scripts and `connect_async` for asyncio programs. Both offer the same methods and
 typed messages (`acsard.core.messages.schema`). The client signs, numbers and stamps its commands,
 and sends zeros before each drive. So a program needs no code of its own for the daemon's rules
-about stale commands and about zeros before motion. `drive` raises an error if the robot does not
-follow it. When `drive` returns, the robot is at rest.
+about stale commands and about zeros before motion. At the end of the block, also by an exception,
+the client sends a zero if its last command was not one. `drive` raises an error if the robot does
+not follow it. When `drive` returns, the robot is at rest.
 
 Arguments that you leave out come from the configuration file that the environment variable
 ACSARD_CONFIG names (`bus.listen`, `robot.id`, `bus.tls`), as on the command line. Without that

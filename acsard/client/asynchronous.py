@@ -34,10 +34,11 @@ async def connect_async(
     """
     where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
+    robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
     try:
-        yield AsyncClient(Client(session, where.robot_id, source, where.tls, where.endpoint))
+        yield AsyncClient(robot)
     finally:
-        await in_thread(lambda: close(session), 5.0)
+        await in_thread(robot.end, 5.0)
 
 
 class AsyncClient:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Generator, Iterator
+from contextlib import suppress
 from numbers import Real
 from typing import Protocol
 
@@ -37,6 +38,9 @@ STANDS = 0.01, 0.02
 SLOWER, SLOWS_S = 0.97, 1.0
 """A share and a time, s. The robot is still slowing down if its speed falls below this share of its
 lowest speed so far within this time."""
+
+
+CLOSED = "the connection was closed while the robot drove"
 
 
 class UnheardError(NotDrivenError):
@@ -77,16 +81,18 @@ def drive(
     try:
         # Send zeros before each drive, not only the first: since the last drive, the robot may have
         # been stopped and cleared, or restarted.
-        yield from _opening(robot, checks)
+        yield from _opening(checks)
         end, grace = time.monotonic() + seconds, min(GRACE_S, seconds / 2)
         while (left := end - time.monotonic()) > 0:
-            robot.send(linear, angular)
+            checks.send(linear, angular)
             yield min(SEND_PERIOD_S, left)
             checks.require(grace)
-        yield from _stopping(robot, checks)
+        yield from _stopping(checks)
     finally:
-        # Send a zero at the end, even if an exception interrupts the drive.
-        robot.send(0.0, 0.0)
+        # Send a zero at the end, even if an exception interrupts the drive. After the end of the
+        # connection this fails, and the exception says so.
+        with suppress(NoAnswerError):
+            checks.send(0.0, 0.0)
         checks.watch.end()
 
 
@@ -100,17 +106,17 @@ def _require(**numbers: object) -> None:
             raise UsageError(f"{name} = {value!r}: it must be a finite number")
 
 
-def _opening(robot: Driven, checks: _Drive) -> Iterator[float]:
+def _opening(checks: _Drive) -> Iterator[float]:
     begun = time.monotonic()
     while (passed := time.monotonic() - begun) < OPENING_S or checks.objection != "":
-        robot.send(0.0, 0.0)
+        checks.send(0.0, 0.0)
         yield OPENING_PERIOD_S
         checks.look()
         if passed >= OPENED_S or (passed >= SETTLED_S and checks.hopeless):
             checks.require(0.0)
 
 
-def _stopping(robot: Driven, checks: _Drive) -> Iterator[float]:
+def _stopping(checks: _Drive) -> Iterator[float]:
     """Send zeros until the robot stands, or until it no longer slows down.
 
     It does not slow down if something else moves it.
@@ -118,7 +124,7 @@ def _stopping(robot: Driven, checks: _Drive) -> Iterator[float]:
     begun = since = time.monotonic()
     watch, slowest = checks.watch, math.inf
     while since + SLOWS_S > (now := time.monotonic()) or watch.age(now) > QUIET_S:
-        robot.send(0.0, 0.0)
+        checks.send(0.0, 0.0)
         yield SEND_PERIOD_S
         checks.look()
         if checks.hopeless:
@@ -155,6 +161,13 @@ class _Drive:
         state = self.watch.state
         return state is not None and hopeless(state, self._robot.source)
 
+    def send(self, linear: float, angular: float) -> None:
+        """Send one command. Raises `NoAnswerError` if the connection was closed."""
+        try:
+            self._robot.send(linear, angular)
+        except zenoh.ZError:
+            raise NoAnswerError(CLOSED) from None
+
     def look(self) -> None:
         """Process the states that have arrived.
 
@@ -164,7 +177,7 @@ class _Drive:
         try:
             news = watch.look(now)
         except zenoh.ZError:
-            raise NoAnswerError("the connection was closed while the robot drove") from None
+            raise NoAnswerError(CLOSED) from None
         for state in news:
             self.objection = objection(state, self._robot.source, self._robot.sender)
             if not self.objection:

@@ -7,14 +7,14 @@ import platform
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
 from typing import Any
 
 import msgspec
 import zenoh
 
-from acsard.client.commander import SPACING_S, Sender, no_command
+from acsard.client.commander import LONGEST_S, SPACING_S, Sender, no_command
 from acsard.client.driving import UnheardError, drive
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
@@ -71,10 +71,11 @@ def connect(
     """
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
+    robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
     try:
-        yield Client(session, where.robot_id, source, where.tls, where.endpoint)
+        yield robot
     finally:
-        close(session)
+        robot.end()
 
 
 def close(session: zenoh.Session) -> None:
@@ -97,6 +98,9 @@ class _Puts:
     def __init__(self) -> None:
         # The lock is reentrant: a signal handler may also send while the same thread holds it.
         self._lock, self._next_s = threading.RLock(), 0.0
+        self.moving: dict[Client, float] = {}
+        """The clients of the connection whose last command was not zero, each with the time of that
+        command, s."""
 
     def wait(self) -> None:
         """Wait until the next command may be sent."""
@@ -185,6 +189,23 @@ class Client:
             self._opened = True
             self._put(0.0, 0.0, stamp_ns)
 
+    def end(self) -> None:
+        """Close the connection, as `connect` does at the end of its block.
+
+        A zero goes first to each robot that may still follow the last command of a client of this
+        connection: the program may have failed while it drove, and a source may have a timeout of
+        several seconds.
+        """
+        begun_s = time.monotonic()
+        try:
+            for client, sent_s in list(self._puts.moving.items()):
+                # After the longest timeout a zero would only stop the next sender that drives.
+                if begun_s - sent_s < LONGEST_S:
+                    with suppress(zenoh.ZError):  # the program has closed the session itself
+                        client.send(0.0)
+        finally:
+            close(self.session)
+
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for `seconds` (above 0), then slow down, and return when the robot stands.
 
@@ -238,9 +259,11 @@ class Client:
 
     def whoami(self) -> Identity:
         """Return this client's identity as the daemon sees it. The role is "" if it is unknown."""
-        return identity(
-            self.ask, self.where.tls, self.sender, self.where.robot_id, self.where.endpoint
-        )
+        where = self.where
+        try:
+            return identity(self.ask, where.tls, self.sender, where.robot_id, where.endpoint)
+        except zenoh.ZError:
+            raise self._refused("whoami") from None
 
     def pose(self) -> Pose:
         """Return the present pose of base_link in odom."""
@@ -268,7 +291,7 @@ class Client:
         try:
             return self.session.declare_subscriber(self.key(name), callback)
         except zenoh.ZError:
-            raise _no_key(name) from None
+            raise self._refused(name) from None
 
     def subscribe(self, name: str) -> Subscription:
         """Subscribe to a key; return its raw samples as a queue for a loop that must not block."""
@@ -292,7 +315,7 @@ class Client:
                 self.session, self.key(name), latched=topic is not None and topic.latched
             )
         except zenoh.ZError:
-            raise _no_key(name) from None
+            raise self._refused(name) from None
 
     def put(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
@@ -326,6 +349,10 @@ class Client:
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
         self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
+        if linear or angular:
+            self._puts.moving[self] = time.monotonic()
+        else:
+            self._puts.moving.pop(self, None)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         """Return the encoding and the payload of the first reply to a query.
@@ -360,8 +387,17 @@ class Client:
                 timeout=REPLY_TIMEOUT_S,
             )
         except zenoh.ZError:
-            raise _no_key(name) from None
+            raise self._refused(name) from None
         return next(iter(replies), None)
+
+    def _refused(self, name: str) -> MendableError:
+        """Return the error for a name with which the session refuses to work."""
+        if self.session.is_closed():
+            return NoAnswerError(
+                "the connection of this client is closed: use a client within the `with` block of "
+                "`connect`"
+            )
+        return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
         """Return an error that says that there is no reply, with the cause if it is known."""
@@ -405,10 +441,6 @@ class Client:
         # The role may explain why no command arrives, but it does not explain a fault or a stop.
         unexplained = str(error) == no_command(self.source)
         return NotDrivenError(f"{error}; {us.words()}" if unexplained else str(error))
-
-
-def _no_key(name: str) -> UsageError:
-    return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
 
 @lru_cache(maxsize=64)

@@ -48,8 +48,8 @@ def find(path: str | None) -> tuple[str, bytes]:
 def writable(path: str | None) -> Path:
     """Return the file that --write changes.
 
-    Raises `MendableError` if the file or the library tomlkit is missing, or if the file is the
-    reference file of a clone of acsard.
+    Raises `MendableError` if the file or the library tomlkit is missing, if the file is the
+    reference file of a clone of acsard, or if this user may not change it.
     """
     require_tomlkit()
     where, text = find(path)
@@ -65,6 +65,7 @@ def writable(path: str | None) -> Path:
             f"changed file hinders the next `git pull`: type `cp {where} robot.toml` and add "
             "--config robot.toml",
         )
+    require_changeable(Path(where), {})
     return Path(where)
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from msgspec import Struct
 
 import acsard
+from acsard.host.atomic_file import replace
 from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import called
 
@@ -136,10 +137,9 @@ class Write(Struct, frozen=True):
         path.parent.mkdir(parents=True, exist_ok=True)
         for place in made:
             place.chmod(0o755)
-        # Replace a symbolic link. Writing through it would change the file to which it points.
-        path.unlink(missing_ok=True)
-        path.write_bytes(self.file.content)
-        path.chmod(self.file.mode)
+        # This also replaces a symbolic link. Writing through it would change the file to which it
+        # points.
+        replace(path, self.file.content, mode=self.file.mode, owner=(os.geteuid(), os.getegid()))
 
 
 class Remove(Struct, frozen=True):
@@ -362,9 +362,16 @@ def uninstalling(
     directories of the service, and `stateful` are the units that have a state directory.
 
     A changed file stays unless `force` or `purge` is set. A changed file with `kept` stays unless
-    `purge` is set. So do `others`, and the state directories of the `stateful` units.
+    `purge` is set. So do `others`, and the state directories of the `stateful` units. To purge
+    these directories, the steps first install their units again if they are missing.
     """
-    there = [file for file in wanted if found[file.path] is not None]
+    wanted, stateful = list(wanted), list(stateful)
+    # systemd knows the real path of a state directory, but only while the unit is installed. An
+    # earlier uninstallation may have removed the unit and kept the directory.
+    again = [
+        file for file in wanted if purge and file.path.name in stateful and found[file.path] is None
+    ]
+    there = [file for file in wanted if found[file.path] is not None or file in again]
     why: dict[Path, str] = {}
     for file in there:
         if found[file.path] == file.content or purge:
@@ -385,12 +392,12 @@ def uninstalling(
         steps.append(Remove(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
         where, what = STATES[unit]
-        # systemd knows the real path of the state directory, but only while the unit is installed.
         clean = Run(("systemctl", "clean", "--what=state", unit))
         steps.insert(0, clean if purge else Keep(where, f"{what}; --purge removes it"))
     units = [name for name in reversed(ALL) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
-    return [*leaving, *steps, *GONE]
+    back: list[Step] = [*map(Write, again), RELOAD[0]] if again else []
+    return [*back, *leaving, *steps, *GONE]
 
 
 def state(unit: str) -> str:

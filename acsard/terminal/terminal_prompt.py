@@ -123,6 +123,8 @@ class TerminalPrompt(Screen):
         """Return one of the answers; q, or the end of the input, ends the subcommand."""
         self._clear()
         choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
+        # A line that was typed before the question appeared must not answer it.
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
         while True:
             self._print(f"\n{question}{choice} ")
             line = sys.stdin.readline()

@@ -21,6 +21,18 @@ It is longer than a keyboard's delay before the first repeat (0.25 to 0.5 s); ot
 would stutter.
 """
 
+BURST = 8
+"""Largest number of keys that count if they arrive together.
+
+A held key repeats about 30 times a second. More keys at once have waited, usually in an SSH
+connection that stalled, and the operator may have released the key long ago.
+"""
+
+BURST_S = 0.2
+"""Time for which keys that follow a burst belong to it, s."""
+
+STOP = " "
+
 _MOVES = {
     "i": (1, 0), "o": (1, -1), "u": (1, 1), "j": (0, 1), "l": (0, -1),
     ",": (-1, 0), ".": (-1, 1), "m": (-1, -1),
@@ -39,7 +51,19 @@ class Keyboard:
         self.linear, self.angular = linear, angular
         self._move = (0, 0)
         self._until = 0.0
+        self._old_until = 0.0
         self._zeros = ZEROS
+
+    def take(self, text: str, now: float) -> None:
+        """Process the text of one terminal read at `now` (monotonic clock, s).
+
+        A burst of keys only stops the robot: it does not show what the operator wants now.
+        """
+        keys = split(text)
+        if len(keys) > BURST:
+            self._old_until = now + BURST_S
+        for key in [STOP] if keys and now < self._old_until else keys:
+            self.press(key, now)
 
     def press(self, key: str, now: float) -> None:
         """Process a key, or an arrow's escape sequence, pressed at `now` (monotonic clock, s)."""
@@ -77,8 +101,7 @@ class Ride:
         """Process the typed keys, send the command that is due, and process received states."""
         now = time.monotonic()
         now_ns = round(now * NS_PER_S)
-        for key in split(typed):
-            self._keyboard.press(key, now)
+        self._keyboard.take(typed, now)
         wish = self._keyboard.wish(now)
         if wish is not None:
             self._commander.take(Wish(wish), now_ns)

@@ -44,7 +44,7 @@ They apply, in this order, after a change, while the robot moves, and at other t
 
 NO_END = 10**9
 
-LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 def once(feed: Feed) -> str:

@@ -16,6 +16,7 @@ import pytest
 
 from acsard.client import connect
 from acsard.daemon.bus.robot_discovery import Presence, presence
+from acsard.host.errors import Exit
 from tests.each import each
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -276,6 +277,21 @@ def test_printing_to_a_reader_that_has_left_ends_quietly(tmp_path: Path, words: 
     assert p.stderr == ""
 
 
+def test_a_failure_keeps_its_exit_code_when_the_reader_of_the_output_has_left(
+    shared: Daemon,
+) -> None:
+    env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = acsard("get", "info", "--id", "acsar,other", "--config", str(shared.config))
+    with (
+        os.fdopen(writer, "wb") as closed,
+        Program(words, shared.config.parent, env, stdout=closed) as get,
+    ):
+        assert get.ended(10.0) == Exit.UNREACHABLE
+    assert "Traceback" not in get.stderr
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_echo_ends_at_once_by_a_signal(shared: Daemon, bus: Bus, number: signal.Signals) -> None:
     words = acsard("echo", "odom", "--config", str(shared.config))
@@ -521,6 +537,21 @@ def test_a_faulty_simulator_misbehaves_and_says_so(tmp_path: Path) -> None:
     assert "faults: mute" in sim.stderr
 
 
+def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_path: Path) -> None:
+    link = tmp_path / "mcu"
+    with Program(acsard("sim", "--link", "mcu"), tmp_path) as first:
+        first.says("acsard run --port mcu")
+        before = os.readlink(link)
+        with Program(acsard("sim", "--link", "mcu"), tmp_path) as second:
+            second.says("acsard run --port mcu")
+            first.signal(signal.SIGINT)
+            assert first.ended(3.0) == 0
+            assert os.readlink(link) != before
+            second.signal(signal.SIGINT)
+            assert second.ended(3.0) == 0
+    assert not link.is_symlink()
+
+
 # get
 
 
@@ -536,6 +567,14 @@ def test_get_answers_on_every_kind_of_key(shared: Daemon, key: str) -> None:
     ended = tool(shared, "get", key)
     assert (ended.code, ended.err) == (0, "")
     assert isinstance(json.loads(ended.out), dict)
+
+
+def test_get_of_several_robots_names_the_one_that_does_not_answer(shared: Daemon) -> None:
+    ended = tool(shared, "get", "info", "--id", "acsar,other")
+    assert ended.code == Exit.UNREACHABLE
+    (line,) = ended.out.splitlines()
+    assert json.loads(line)["robot"] == "acsar"
+    assert ended.err.startswith("other: NO ANSWER: no answer on acsard/other/info")
 
 
 def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
@@ -739,7 +778,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
         assert after == fresh.settings
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
     shared: Daemon, bus: Bus, number: signal.Signals
 ) -> None:

@@ -231,6 +231,19 @@ def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare:
     assert not bare.path(f"{STATE}-web").exists()  # a new instance accepts no old invitation
 
 
+@pytest.mark.nightly
+def test_a_purge_after_an_uninstall_removes_what_the_uninstall_kept(bare: Container) -> None:
+    bare.write(CONFIGURATION, "")  # the simulator
+    assert bare.run(ACSARD, "service", "install").code == 0
+    kept = bare.run(ACSARD, "service", "uninstall").out
+    assert f"keep    {CONFIGURATION}" in kept
+    assert "keep    /var/lib/acsard  " in kept
+    done = bare.run(ACSARD, "service", "uninstall", "--purge")
+    assert done.code == 0, done.out + done.err
+    for place in (CONFIGURATION, STATE, f"{STATE}-web", f"/etc/systemd/system/{UNIT}"):
+        assert not bare.path(place).exists(), place
+
+
 def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:
     unit = f"/etc/systemd/system/{UNIT}"
     bare.write(unit, "[Service]\nExecStart=/bin/true\n")

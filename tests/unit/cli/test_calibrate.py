@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -74,6 +75,19 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
         called(tmp_path, GOOD, "--json", "--write", text=text)
     assert end.value.code == Exit.FAILURE
     assert (tmp_path / "acsard.toml").read_text() == text
+
+
+def test_a_result_that_cannot_be_written_is_printed_before_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(MendableError, match=r"was not changed.*write the lines by hand"):
+        called(tmp_path, GOOD, "--write")
+    assert "wheel_separation_multiplier = " in capsys.readouterr().out
+    assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
 def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 import pytest
@@ -263,6 +264,16 @@ def test_who_has_no_file_to_write_to_is_sent_to_the_robot(places: Places) -> Non
         writable(None)
     assert "on the robot" in str(raised.value)
     assert "acsard.toml there" in str(raised.value)
+
+
+def test_a_file_that_this_user_may_not_write_is_refused_before_the_work(
+    places: Places, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places.here.write_text("")
+    # Root may write everywhere.
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(MendableError, match="was not changed: no permission"):
+        writable(None)
 
 
 @pytest.mark.parametrize("named", [True, False])

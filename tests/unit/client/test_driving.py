@@ -306,6 +306,24 @@ def test_a_connection_that_is_closed_ends_it(monkeypatch: pytest.MonkeyPatch) ->
         next(steps)
 
 
+def test_a_drive_on_a_connection_that_is_closed_ends_with_an_error_that_the_docs_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(followed)
+    monkeypatch.setattr(driving, "time", SimpleNamespace(monotonic=lambda: world.now))
+    robot: Any = world
+    steps = drive(robot, 0.5, 0.0, 1.0)
+    next(steps)
+
+    def closed(*_: float) -> None:
+        raise zenoh.ZError("session closed")
+
+    monkeypatch.setattr(world, "send", closed)
+    with pytest.raises(NoAnswerError, match="closed"):
+        for _ in steps:
+            pass
+
+
 def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
     world: Any = World(followed)
     given: Any

@@ -6,15 +6,16 @@ import time
 from typing import Any
 
 import pytest
+import zenoh
 
 from acsard import client
 from acsard.client import Client, NoAnswerError
-from acsard.client.commander import SPACING_S
+from acsard.client.commander import LONGEST_S, SPACING_S
 from acsard.client.driving import UnheardError
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import Command
+from acsard.core.values import REST, Command
 from acsard.daemon.bus.identity import Identity
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
@@ -26,6 +27,16 @@ class Session:
     def __init__(self, zid: str) -> None:
         self._zid = zid
         self.heard: list[Command] = []
+        self.closed = False
+
+    def close(self) -> None:
+        self.closed = True
+
+    def is_closed(self) -> bool:
+        return self.closed
+
+    def declare_subscriber(self, *_: Any) -> None:
+        raise zenoh.ZError("session closed")
 
     def zid(self) -> str:
         return self._zid
@@ -34,6 +45,8 @@ class Session:
         return None
 
     def get(self, key: str, *_: Any, **__: Any) -> list[Any]:
+        if self.closed:
+            raise zenoh.ZError("session closed")
         return []  # no robot answers
 
     def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
@@ -91,6 +104,51 @@ def test_a_signal_s_handler_sends_while_the_same_thread_waits_for_its_turn(
     monkeypatch.setattr(time, "sleep", interrupted)
     client.send(0.5)
     assert len(session.heard) == 3
+
+
+def test_the_end_of_a_connection_sends_a_zero_to_each_robot_that_may_still_move(
+    session: Session,
+) -> None:
+    robot = client_of(session)
+    other = robot.like("acsar", "other")
+    resting = robot.like("acsar", "resting")
+    for sender in (robot, other, resting):
+        sender.send(0.0)
+        sender.send(0.3)
+    resting.send(0.0)
+    sent = len(session.heard)
+    robot.end()
+    zeros = session.heard[sent:]
+    assert [command.twist for command in zeros] == [REST, REST]
+    assert {command.sender for command in zeros} == {robot.sender, other.sender}
+    assert session.closed
+
+
+def test_after_the_longest_timeout_the_end_of_a_connection_stops_no_other_sender(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = client_of(session)
+    robot.send(0.0)
+    robot.send(0.3)
+    sent, now = len(session.heard), time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + LONGEST_S)
+    robot.end()
+    assert len(session.heard) == sent
+
+
+def test_on_a_closed_connection_each_method_says_so(session: Session) -> None:
+    robot = client_of(session)
+    session.close()
+    for method in (
+        robot.pose,
+        robot.whoami,
+        lambda: robot.call("stop"),
+        lambda: robot.drive(0.1, seconds=1.0),
+        lambda: next(robot.messages("odom")),
+        lambda: robot.listen("odom", print),
+    ):
+        with pytest.raises(NoAnswerError, match="connection of this client is closed"):
+            method()
 
 
 def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:

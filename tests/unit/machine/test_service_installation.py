@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import pytest
@@ -195,6 +196,14 @@ def test_a_purge_keeps_nothing() -> None:
     }
 
 
+def test_a_purge_installs_a_unit_for_systemd_to_find_the_state_that_an_uninstall_kept() -> None:
+    steps = uninstalling(ALL, dict.fromkeys(there()), force=True, purge=True, stateful=[UNIT])
+    clean = Run(("systemctl", "clean", "--what=state", UNIT))
+    before, after = steps[: steps.index(clean)], steps[steps.index(clean) :]
+    assert before[:2] == [Write(UNIT_FILE), Run(("systemctl", "daemon-reload"))]
+    assert Remove(UNIT_FILE.path) in after
+
+
 @pytest.mark.parametrize("purge", [False, True])
 def test_recordings_and_invitations_stay_unless_purged(purge: bool) -> None:
     steps = uninstalling(ALL, there(), force=False, purge=purge, stateful=STATES)
@@ -249,6 +258,18 @@ def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:
     Remove(file.path).do()
     assert file.condition() == "missing"
     assert [path.name for path in tmp_path.iterdir()] == ["elsewhere"]
+
+
+def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path) -> None:
+    # A part of the configuration would be kept as the user's own. An empty one is the simulator.
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            Write(File(tmp_path / "acsard.toml", bytes(20_000), kept=True)).do()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_directory_with_something_else_in_it_stays(tmp_path: Path) -> None:

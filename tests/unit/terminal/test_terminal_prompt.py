@@ -8,6 +8,7 @@ import re
 import sys
 import termios
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -75,6 +76,13 @@ def test_q_leaves_wherever_it_is_asked(
         types("q\n")
         with pytest.raises(KeyboardInterrupt):
             asked(person)
+
+
+def test_a_line_that_was_typed_before_the_question_does_not_answer_it(types: Types) -> None:
+    types("fl\n")
+    time.sleep(0.4)
+    types("rr\n")
+    assert TerminalPrompt().ask("Which wheel did motor b turn?", ("fl", "rr")) == "rr"
 
 
 def test_nothing_but_enter_starts_a_leg(types: Types) -> None:

@@ -214,6 +214,25 @@ def test_the_last_commands_are_zeros_and_then_nothing_is_sent(
     assert robot.sent[sent:] == [0.0] * ZEROS
 
 
+@each("key", ["i", UP])
+def test_keys_that_a_stalled_connection_held_back_do_not_drive(
+    key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step("i", times=5)
+    waited = 151 * key
+    reads = [waited[at : at + 64] for at in range(0, len(waited), 64)]  # as a terminal gives them
+    sent = len(robot.sent)
+    for read in reads:
+        drive.ride.step(read)
+        drive.now += 0.005
+    drive.step(times=20)
+    assert set(robot.sent[sent:]) == {0.0}
+    drive.step(key, times=3)
+    assert robot.sent[-1] == 0.5
+
+
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot()
     drive = Drive(robot, monkeypatch)
