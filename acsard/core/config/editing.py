@@ -55,9 +55,30 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
             if part not in table:
                 table[part] = tomlkit.table()
             table = table[part]
-        table[name] = value
+        if not (name in table and _adjusted(table[name], value)):
+            table[name] = value
     changed = tomlkit.dumps(document)
     return changed.replace("\n", "\r\n") if crlf else changed
+
+
+def _adjusted(array: object, value: object) -> bool:
+    """Change a list in place and return True, so that the comments in it stay.
+
+    The list then lacks the items that are not in the new value, and has its new ones at the end.
+    Return False if that is not the new value.
+    """
+    from tomlkit.items import Array
+
+    if not (isinstance(array, Array) and isinstance(value, list | tuple)):
+        return False
+    for n in reversed(range(len(array))):
+        if array[n] not in value:
+            del array[n]
+    kept = len(array)
+    if list(array) != list(value[:kept]):
+        return False
+    array.extend(value[kept:])
+    return True
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:

@@ -56,6 +56,28 @@ def test_what_would_not_check_is_not_written(text: str, keys: dict[str, object])
         edited(text, keys)
 
 
+@each(
+    ("names", "kept"),
+    [
+        (["anna", "eve", "carl"], ["anna", "hall 3", "bob"]),
+        (["eve", "carl"], ["bob"]),
+        (["eve", "anna"], []),
+        ([], []),
+    ],
+)
+def test_a_changed_list_keeps_the_comments_of_its_items(names: list[str], kept: list[str]) -> None:
+    text = """[access]
+operators = [
+    "anna",   # hall 3, until May
+    # "bob" left the company
+    "eve",
+]
+"""
+    after = edited(text, {"access.operators": names})
+    assert parse(after.encode()).access.operators == tuple(names)
+    assert all(words in after for words in kept)
+
+
 @each("text", ["", "[bus]\n", "bus.tls = ''\n", '[bus]\nlisten = [\n  "tcp/[::1]:1",  # here\n]\n'])
 def test_a_list_is_set_as_any_other_value(text: str) -> None:
     endpoints = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
