@@ -339,6 +339,7 @@ def test_a_calibration_describes_drives_that_were_not_seen(name: str, way: str) 
         assert not row.refused
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "way"), [("differential", "both"), ("skid, grows with the rate", "gyro")]
 )

@@ -169,6 +169,7 @@ def slow_drives(seed: int, **other: float) -> list[Drive]:
     return [drive(robot, slow_squares(turn=turn)) for turn in (0.3, -0.3) * 2]
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("seed", [1, 3, 6])
 def test_slow_squares_of_a_sound_robot_make_it_no_worse(seed: int) -> None:
     """The errors of the wheels hide the small turns of a short block, so its track is too wide."""
@@ -183,6 +184,7 @@ def test_slow_squares_of_a_sound_robot_make_it_no_worse(seed: int) -> None:
     assert after <= before
 
 
+@pytest.mark.slow
 def test_slow_squares_of_a_robot_that_is_off_make_it_better() -> None:
     fixed = {"chi": 1.1, "left": 0.98, "right": 1.02, "wheel_noise": 0.02}
     values = calibrated(log_of_runs(slow_drives(0, **fixed), gyro=False)).multipliers.values
@@ -285,6 +287,7 @@ def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
     assert found.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("places", [False, True])
 def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
     """A scale error of 1 % is normal for a gyro. Only positions reveal it."""
@@ -297,6 +300,7 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
         assert found.values[0] == pytest.approx(1.6, rel=0.006)
 
 
+@pytest.mark.slow
 def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))

@@ -253,6 +253,7 @@ def converted(name: str, where: Path, *words: str) -> str:
     return (where / "drive.csv").read_text()
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("sqlite", [False, True])
 def test_the_page_s_converter_makes_a_log_of_a_bag(
     sqlite: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]

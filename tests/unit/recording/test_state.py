@@ -175,6 +175,7 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
     assert [*tmp_path.iterdir()] == [recording.path]
 
 
+@pytest.mark.slow
 def test_forged_states_behind_gaps_take_time_in_proportion_to_the_file(
     taped: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
