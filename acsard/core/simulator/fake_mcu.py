@@ -38,6 +38,10 @@ SHORTEST_WINDOW_NS = 4 * MS
 A reply within this time repeats the last speeds.
 """
 
+OUTPUT_BYTES = 255
+"""Size of the board's output buffer. The board drops a line that does not fit, as the firmware in
+`deploy/firmware` does."""
+
 STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
@@ -272,7 +276,11 @@ class FakeMcu(Faults):
         self._send(now_ns, data[: len(data) // 2] if self.cut_replies else data)
 
     def _send(self, now_ns: int, data: bytes) -> None:
-        self._out_free_ns = max(self._out_free_ns, now_ns) + wire_ns(len(data), self.baud_rate)
+        begin_ns = max(self._out_free_ns, now_ns)
+        end_ns = begin_ns + wire_ns(len(data), self.baud_rate)
+        if begin_ns > now_ns and end_ns - now_ns > wire_ns(OUTPUT_BYTES, self.baud_rate):
+            return
+        self._out_free_ns = end_ns
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:

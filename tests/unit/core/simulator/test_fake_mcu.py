@@ -485,6 +485,17 @@ def test_a_slow_mcu_acts_and_answers_later_by_its_delay() -> None:
     assert mcu.vehicle.set_points == SPEEDS
 
 
+def test_replies_longer_than_the_commands_are_missing_once_the_output_buffer_is_full() -> None:
+    mcu, count = FakeMcu(TRUE), 1000
+    with mcu.spaces():
+        mcu.receive(0, LINE * count)
+        came = replies(mcu, 10_000 * MS)
+    assert count * 0.85 < len(came) < count * 0.95
+    wire_ns = count * LINE_NS
+    assert all(due < wire_ns + 30 * MS for due, _ in came)
+    assert {len(line) for _, line in came} == {len(LINE) + 3}
+
+
 def test_spaces_follow_every_comma_and_take_their_time() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.spaces():
