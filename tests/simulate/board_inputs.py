@@ -470,6 +470,8 @@ class Inputs:
                 text = f"{seen.mode}, and the board has not reported {name}"
                 raise BrokenError("a robot waits for its inputs", true_ns, text)
         self._empty(true_ns, seen)
+        if self._doubtful:  # a clear that is answered only now may be older than the doubt
+            witness.perhaps_latched.add("clear")
         causes = witness.stops or witness.perhaps_latched or witness.pending
         if seen.mode == "stopped" and self._mode not in (*STOPPED, "") and not causes:
             raise BrokenError("no stop without a cause", true_ns, seen.reason)

@@ -264,6 +264,20 @@ def test_a_status_line_without_a_check_may_not_end_a_silence(at: float, finding:
         bench.step(at, b"", "stopped")
 
 
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_late_answer_to_a_clear_does_not_end_the_doubt_about_a_silence(silent: bool) -> None:
+    bench = Bench()
+    bench.step(1.0, OK, "driving", MOVES)
+    at_ns = 153 * NS // 100
+    bench.inputs.fed(at_ns, b"" if silent else OK)
+    bench.inputs.take(at_ns, 0, -NS)
+    bench.witness.cleared(12 * NS // 10, 11 * NS // 10, CLEARED, "ann")
+    seen = Seen(at_ns, at_ns, "stopped", "a reason", None, "up", [], ())
+    expected = nullcontext() if silent else pytest.raises(BrokenError, match="without a cause")
+    with expected:
+        bench.inputs.step(at_ns, seen, 0, True, dict)
+
+
 def test_a_pressed_emergency_stop_that_was_silent_is_no_new_press() -> None:
     bench = Bench()
     bench.step(1.0, OK, "driving", MOVES)
