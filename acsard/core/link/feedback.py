@@ -220,7 +220,7 @@ class Timeline:
             if spoke:
                 # No reply was assigned to a line while the board seemed to report by itself.
                 self._prompts.restart()
-        self._prompts.read(end_ns, lines)
+        self._prompts.read(end_ns, lines, following > 0)
 
     def spoilt(self) -> None:
         """Skip the next line of the read, because it is bad.

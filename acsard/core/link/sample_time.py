@@ -477,6 +477,9 @@ class PromptedTimes:
         answered, ns."""
         self._lost = False
         """Whether a line was given up because of the last reply that was read alone."""
+        self._given: list[int] = []
+        """Lines that the last read of a batched link gave up, in order. Their replies may have
+        waited in an adapter that stalled."""
         self._at, self._alone = 0, False
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         """For a batched link: least delay and usual time between two reads, both ns, and share of
@@ -510,8 +513,10 @@ class PromptedTimes:
         self._sent = at_ns
         self._left.append(at_ns)
 
-    def read(self, at_ns: int, lines: int) -> None:
+    def read(self, at_ns: int, lines: int, cut: bool = False) -> None:
         """Process a read of `lines` lines. The last was complete at the monotonic time `at_ns`.
+
+        `cut` says whether the read ends within a further line.
 
         The delay of a reply that is read alone shows which line it answers. The delay of a batch
         shows it only if it is longer than the adapter ever holds a reply back.
@@ -523,7 +528,7 @@ class PromptedTimes:
         self._thinking += SLOW * (varies - self._thinking)
         if self._batched:
             self._soon = 0.0
-            self._weigh(lines, since)
+            self._weigh(lines, since, cut)
         elif self._delay is not None:
             self._base, self._losses = self._delay, 0.0
 
@@ -580,7 +585,7 @@ class PromptedTimes:
         if left:
             self._delay = self._least = float(self._at - left[0])
 
-    def _weigh(self, lines: int, since: int) -> None:
+    def _weigh(self, lines: int, since: int, cut: bool) -> None:
         """Give up lines whose replies were lost: the last reply of a batch is too late for them.
 
         If many replies are lost, the first reply of the batch decides instead, because the board
@@ -589,24 +594,32 @@ class PromptedTimes:
         Args:
             lines: The number of replies in the batch.
             since: The time since the previous read, ns.
+            cut: Whether the read has a part of one more reply.
         """
-        left, at = self._left, self._at
+        left, at, began = self._left, self._at, lines + cut
         judged, soonest = lines - 1, float(self._soonest)
         if self.lossy:
             judged, soonest = 0, max(soonest, self._base - JITTER_NS)
         if since < 1.5 * self._batch:
             self._batch += FAST * (since - self._batch)
+        given, self._given, again = self._given, [], False
+        # The part of a reply comes sooner than the whole one.
+        earliest = self._soonest // 2 if cut else self._soonest
+        while given and (len(left) < began or at - left[began - 1] < earliest):
+            left.appendleft(given.pop())  # too soon: these replies answer lines that were given up
+            again = True
         if len(left) < lines or self._delay is None:
             return
         if at - left[lines - 1] < self._soonest:  # too soon: the reply answers the previous line
             left.appendleft(self._passed)
             self._base = float(at - left[lines - 1])
         lost = 0
-        while len(left) > lines:
+        while len(left) > began and not again:
             late = at - left[judged] - self._base
             if late <= self._batch + 2 * JITTER_NS or at - left[lines] < soonest:
                 break
             self._passed, lost = left.popleft(), lost + 1
+            self._given.append(self._passed)
         self._losses += LOSING * (lost / (lines + lost) - self._losses)
         # If a line is given up too late, a reply looks late, but nothing makes a reply look early.
         # So the base is the least delay, which rises slowly.

@@ -339,9 +339,14 @@ class Prompted:
     def leave(self, ms: float) -> None:
         self.prompts.left(int(ms * MS))
 
-    def reply(self, ms: float, lines: int = 1, asked_ms: float | None = None) -> list[float]:
-        """Read this many replies; return the dt and the filled gap of each, in ms."""
-        self.prompts.read(int(ms * MS), lines)
+    def reply(
+        self, ms: float, lines: int = 1, asked_ms: float | None = None, cut: bool = False
+    ) -> list[float]:
+        """Read this many replies; return the dt and the filled gap of each, in ms.
+
+        `cut` says whether the read has a part of one more reply.
+        """
+        self.prompts.read(int(ms * MS), lines, cut)
         said = []
         for _ in range(lines):
             asked = None if asked_ms is None else int(asked_ms * MS)
@@ -544,6 +549,21 @@ def test_of_a_batched_link_each_answer_has_its_line(seed: int) -> None:
     bench = Prompted()
     assert batched(bench, seed, 300) == pytest.approx(1990.0, abs=0.1)
     assert not bench.prompts.lossy
+
+
+def test_answers_that_wait_on_in_an_adapter_behind_a_stall_have_their_own_lines() -> None:
+    """The adapter hands over whole packets first, and the rest with its next batch."""
+    bench = Prompted()
+    batched(bench, 0, 200)
+    for n in range(11):
+        bench.leave(2020.0 + 10 * n)
+    bench.leave(2182.0)
+    first = bench.reply(2184.0, lines=9, cut=True)
+    bench.leave(2191.0)
+    second = bench.reply(2191.5, lines=2, cut=True)
+    (last, _) = bench.reply(2194.0)
+    assert last == pytest.approx(62.0)
+    assert sum(first[::2]) + sum(second[::2]) == pytest.approx(2120.0 - 1990.0)
 
 
 @each("seed", range(5))
