@@ -111,6 +111,13 @@ TAPE_M = 0.01
 It includes the error with which a person chooses the point on the robot.
 """
 
+CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
+"""Limits for the difference between a distance by tape and by positions.
+
+They are a fraction of the distance, and a number of standard deviations. If the difference exceeds
+both, one of the distances is wrong.
+"""
+
 UNKNOWN = 1.0
 """Standard deviation of the logarithm of the scale if no sensor has measured the scale."""
 
@@ -168,7 +175,8 @@ def scaled(
         The corrected multipliers, and the name of the run that the distance belongs to.
 
     Raises:
-        RefusedError: the log has no such run, or the run is not straight enough.
+        RefusedError: the log has no such run, the run is not straight enough, or the distance
+            contradicts the positions.
     """
     if tape.run and tape.run not in names:
         raise RefusedError(
@@ -196,8 +204,16 @@ def scaled(
     if not known:
         covariance = covariance + UNKNOWN**2
     noise = (TAPE_M / tape.metres) ** 2
-    gain = covariance @ jacobian / (jacobian @ covariance @ jacobian + noise)
-    values = found.values * np.exp(gain * np.log(tape.metres / extent.distance))
+    variance = float(jacobian @ covariance @ jacobian + noise)
+    longer_by = math.log(tape.metres / extent.distance)
+    if known and abs(longer_by) > max(CONTRADICTS, CONTRADICTS_STD * math.sqrt(variance)):
+        raise RefusedError(
+            f"--distance: by the positions, run {names[best]} ends {extent.distance:.2f} m from "
+            f"its start, but you measured {tape.metres:g} m: was this distance measured straight "
+            "from the start to the end of this run, and are x and y in m?"
+        )
+    gain = covariance @ jacobian / variance
+    values = found.values * np.exp(gain * longer_by)
     rest = np.eye(3) - np.outer(gain, jacobian)
     covariance = rest @ covariance @ rest.T + np.outer(gain, gain) * noise
     back = np.diag(values)

@@ -279,7 +279,7 @@ def _calibrated(
     candidates: list[Candidate] = []
     refusals: list[RefusedError] = []
     places = any(len(run.place) for run in log.runs)
-    for length in LENGTHS_S[headings is None : None if places else 1]:
+    for length in LENGTHS_S[headings is None and places : None if places else 1]:
         try:
             made = prepared(log.runs, headings, base, length)
             if candidates and len(made.parts) < ENOUGH_BLOCKS:
@@ -424,11 +424,13 @@ def _calibration(
     delays = {headings.source: headings.delay} if headings is not None else {}
     if made.segments:
         delays["positions"] = float(fitted.parameters[P.DELAY])
-    scale, notes = ["positions"] if made.segments else [], list(log.notes)
+    # Without an improvement, the configured multipliers stay, and no sensor has measured the scale.
+    measured = bool(made.segments) and len(best.kept) < 2
+    scale, notes = ["positions"] if measured else [], list(log.notes)
     if tape is not None:
         follow = _follow(made, fitted, rate)
         names = [run.name for run in log.runs]
-        result, name = scaled(result, tape, names, follow, known=bool(made.segments))
+        result, name = scaled(result, tape, names, follow, known=measured)
         scale.append("distance")
         notes.append(f"the distance of {tape.metres:g} m is used for run {name}")
     plausibility.in_range(result.values)

@@ -411,7 +411,7 @@ class Board:
         began_s = self.now_s
         if self.settles(self.comma):
             return
-        turning = self.turning()
+        turning = motion.turning(self.replies, self.now_s)
         kept = turning == [3] and not self._slows()
         if self.settles(not self.comma):
             if kept:
@@ -423,7 +423,7 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
-        """Send zeros until two replies show that every motor stands.
+        """Send zeros until at least two replies show that every motor stands.
 
         `comma` says whether the lines end with a comma.
         Returns False if a motor still turns and none of the motors slows down any more.
@@ -431,7 +431,8 @@ class Board:
         began_s = self.now_s
         while True:
             last = motion.since(self.replies[-2:], began_s)
-            if len(last) == 2 and not any(motion.moving(r.motors, motion.STANDING) for r in last):
+            shown = any(motion.moving(reply.motors, motion.STANDING) for reply in last)
+            if len(last) == 2 and not (shown or motion.turning(self.replies, self.now_s)):
                 return True
             patience_s = motion.PATIENCE_S if self._slows() else motion.MOTOR_S
             if self.now_s - began_s >= patience_s:

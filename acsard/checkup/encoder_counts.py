@@ -8,11 +8,18 @@ from statistics import fmean, median
 
 from acsard.checkup import line_loss, outcomes
 from acsard.checkup.board import Board
-from acsard.checkup.findings import Finding
+from acsard.checkup.findings import Finding, motor_names
 from acsard.checkup.motion import GLANCE_S, Reply, steps
+from acsard.core.link.codec import LETTERS
 
 AGREES = 0.02
 """Largest relative difference between the measured and the stated counts per turn."""
+
+ALIKE = 0.75
+"""Smallest ratio of the counts per turn of two motors that are taken to be the same.
+
+A coarse encoder shows the counts of one motor only roughly.
+"""
 
 COARSE = 0.015
 """Mean jump of a motor's angle from line to line, rad. An encoder with this jump or more is coarse.
@@ -93,8 +100,15 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     unused: dict[str, object] = {"mcu.encoder_counts": 0} if configured else {}
     if measured is None and not named:
         return outcomes.find("encoder counts: not turned")
-    if measured is not None and measured < 1:
-        return outcomes.find("encoder counts: backward", unused, measured=measured)
+    # The mean over all motors may look right although the counts of one of them are wrong.
+    single = {motor: per_turn(board.replies, [motor]) for motor in motors}
+    each = {motor: counts for motor, counts in single.items() if counts is not None}
+    if wrong := [motor for motor, counts in each.items() if counts < 1]:
+        names, least = motor_names(board.mcu, wrong), min(each.values())
+        return outcomes.find("encoder counts: backward", unused, names=names, measured=least)
+    if each and min(each.values()) < ALIKE * max(each.values()):
+        shown = ", ".join(f"{LETTERS[motor]} {counts:.0f}" for motor, counts in each.items())
+        return outcomes.find("encoder counts: unequal", unused, shown=shown)
     if measured is None:
         counts, how = named, "by its identification; not measured"
     elif not named:

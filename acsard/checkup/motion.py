@@ -45,6 +45,8 @@ CUT_S = WATCHDOG_MOST_S + GLANCE_S  # a silence after which every correct watchd
 STOOD_S = WATCHDOG_MOST_S + MOTOR_S
 
 
+COUNT_S = 1.0  # longest wait for a count of a motor that may still turn at the speed `STANDING`
+
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
 TREND_S = 0.5
@@ -133,6 +135,27 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 
     course = list(steps([Reply(since_s, ZERO, b""), *since(replies, since_s)]))
     return each(lambda motor: sum(angle(step, motor) for step in course))
+
+
+def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
+    """Return the motors that turn at `now_s`, or may still turn between two encoder counts.
+
+    A motor at the speed `STANDING` turns by the angle of its last reading above `STANDING` in the
+    time of that angle divided by `STANDING`. A motor that shows nothing for this time stands. A
+    coarse encoder shows nothing in most replies, even if its motor is faster than `STANDING`.
+    """
+    found: set[int] = set()
+    for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):
+        ago_s = now_s - reply.at_s
+        if ago_s > COUNT_S:
+            break
+        gap_s = min(GLANCE_S, reply.at_s - earlier.at_s)
+        found.update(
+            motor
+            for motor in moving(reply.motors, STANDING)
+            if ago_s <= abs(reply.motors[motor]) * gap_s / STANDING
+        )
+    return sorted(found)
 
 
 def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:

@@ -138,6 +138,11 @@ WARN? motor: off | {figure}
     {error:.0%} {which} than the commanded {speed:g} rad/s: the robot will not drive straight
     -> if slower: does the wheel turn freely, are supply and driver strong enough, is the motor
     worn? Otherwise check counts per turn and gear ratio in the firmware
+FAIL motor: loose | {figure}
+    encoder {here} follows motor {here}, but you saw no wheel turn: the robot would count a distance
+    that it does not drive
+    -> is the wheel loose on its shaft, or a gear, coupling or belt of motor {here} broken? If a
+    wheel did turn, check again and name it
 FAIL? motor: dead, not seen | {figure}
     encoder {here} shows nothing: the encoder is dead, or the motor does not turn
     -> watch the wheel: if it turns, check the encoder's supply and leads; if not, check the
@@ -215,8 +220,11 @@ SKIPPED encoder counts: damaged
     {share:.1%} of the lines are lost, so the counts of the rest cannot be measured
 SKIPPED encoder counts: not turned
     the wheels turned too little to measure them
+FAIL encoder counts: unequal | {shown} per turn
+    the counts of the motors do not agree, but the daemon takes the same counts per turn for all
+    -> the firmware must compute counts and speeds of every motor with the same counts per turn
 FAIL encoder counts: backward | {measured:.0f} per turn
-    the counts run against the speeds, or do not change: the pose would run backward
+    the counts of {names} run against the speeds, or do not change: the pose would be wrong
     -> the firmware must count up when a motor turns in its p direction
 FAIL encoder counts: misnamed | {measured:.0f}
     the firmware names {named} per turn, but by its speeds there are {measured:.0f}

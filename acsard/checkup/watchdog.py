@@ -126,7 +126,8 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or found.first >= STOPPED):
         return _asked(board, motors, stop, (least_s, found.silent_s))
-    about_s = max(2 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)
+    # Each distance may err by a jump of its readings, and a motor that coasts may add half a jump.
+    about_s = max(2.5 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)
     return max(0.0, ran_on_s - about_s), max(0.0, ran_on_s + about_s)
 
 

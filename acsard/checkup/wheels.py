@@ -28,6 +28,9 @@ OFF = 0.05
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
+FOLLOWS: tuple[Kind, ...] = ("right", "off", "size")
+"""Results for a motor that moves only its own encoder, and not against the command."""
+
 
 class Channel(Struct, frozen=True):
     """Behaviour of one motor, as all four encoders and the operator saw it.
@@ -98,8 +101,9 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     # A computer that was late by this much would explain the error: in half of the measurements the
     # motor would have seemed to stand for that time.
     beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
+    loose = channel.kind in FOLLOWS and channel.wheel == ""
     return outcomes.find(
-        f"motor: {channel.kind}{_whose(mcu, channel)}",
+        "motor: loose" if loose else f"motor: {channel.kind}{_whose(mcu, channel)}",
         name=motor_name(mcu, motor),
         figure=f"{forth:+.2f} {'rad/s, probed' if channel.probed else f'{back:+.2f} rad/s'}",
         shown=", ".join(f"encoder {LETTERS[m]} {channel.forth[m]:+.2f}" for m in moved),
@@ -145,7 +149,7 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     entries: dict[str, str] = {}
     for channel in found:
         wheel, sign = wheel_of(mcu, channel.motor)
-        if channel.kind in ("right", "off", "size") and channel.wheel:
+        if channel.kind in FOLLOWS and channel.wheel:
             wheel, sign = channel.wheel, 1 if channel.forward else -1
         if wheel in entries:
             return outcomes.find("wheel map: twice", wheel=words(wheel))
@@ -288,7 +292,8 @@ def probe(board: Board, motor: int) -> Motors | None:
     if not moving(shown, motion.PROBE_MOVES):
         return _probe(board, motor, motion.SPEED)
     again = _probe(board, motor, motion.SPEED / 2)
-    return shown if again is not None and not any(again) else again
+    # What moved only once may have been a motor that still coasted.
+    return again if again is None or any(again) else _probe(board, motor, motion.SPEED)
 
 
 def _probe(board: Board, motor: int, speed: float) -> Motors | None:

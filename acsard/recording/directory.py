@@ -235,7 +235,9 @@ class Ring:
             with suppress(FileNotFoundError):
                 before_ns = cut_ns - path.stat().st_mtime_ns
                 earlier = (_number(path) or 0) < (_number(part) or 0)
-                if earlier and before_ns < AROUND_NS:
+                # A computer without a clock of its own starts in the past. Then all older files
+                # seem to have ended long after the crash.
+                if earlier and abs(before_ns) < AROUND_NS:
                     self.retain(path)
 
     def _open_files(self) -> None:

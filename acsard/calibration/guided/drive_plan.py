@@ -20,9 +20,11 @@ from collections.abc import Callable
 from typing import Literal
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig, OdometryConfig
-from acsard.core.values import AcsardError
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import AcsardError, Twist
 from acsard.terminal.prompt import Ask
 
 NEEDS: dict[str, str] = {
@@ -236,19 +238,31 @@ class Setup(Struct, frozen=True):
             track: the ratio of effective track to wheel separation.
         """
         command = abs(self.command(rate * track))
-        multiplier = self.drive.wheel_separation_multiplier
-        seconds = abs(angle) * track / (command * multiplier)
+        seconds = abs(angle) * track / (command * self.rate_per_command)
         return Move(seconds, 0.0, math.copysign(command, angle))
 
     def command(self, rate: float) -> float:
         """Return the angular command for the turn rate `rate` without skidding, both in rad/s.
 
-        The command is within the limits. The daemon multiplies an angular command by the configured
-        multiplier of the wheel separation. So the command is divided by that multiplier here.
+        The command is within the limits.
         """
-        multiplier = self.drive.wheel_separation_multiplier
-        most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * multiplier)
-        return max(-most, min(most, rate)) / multiplier
+        per_command = self.rate_per_command
+        most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * per_command)
+        return max(-most, min(most, rate)) / per_command
+
+    @property
+    def rate_per_command(self) -> float:
+        """Turn rate without skidding, rad/s, for an angular command of 1 rad/s.
+
+        The daemon computes the wheel speeds of a command with the configured multipliers. The turn
+        rate is the one that these wheels cause by the radius and the separation alone.
+        """
+        bare = replace(
+            self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
+            right_wheel_radius_multiplier=1.0,
+        )  # fmt: skip
+        commanded = Kinematics(self.drive).wheel_speeds(Twist(0.0, 1.0))
+        return Kinematics(bare).twist(commanded).angular
 
 
 Legs = Callable[[Setup, float], tuple[Leg, ...]]

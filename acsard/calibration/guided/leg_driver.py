@@ -15,7 +15,8 @@ from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig
 from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.schema import RobotState
-from acsard.core.values import REST, Twist
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import REST, Twist, WheelSpeeds
 
 HELD_UP = "this computer was too busy for the calibration: end the other programs on it"
 
@@ -57,7 +58,8 @@ class LegDriver:
 
     def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
         """Start a leg. The daemon identifies the commands of this leg by `source` and `sender`."""
-        self._leg, self._source, self._drive, self._sender = leg, source, drive, sender
+        self._leg, self._source, self._sender = leg, source, sender
+        self._kinematics = Kinematics(drive)
         self.phase = Phase.OPENING
         self.halted = ""
         """The reason why the leg was cut short, or ""."""
@@ -231,13 +233,10 @@ class LegDriver:
             return ""
         if not state.wheels:
             return "the microcontroller sends no feedback: look at its cable and its power supply"
-        right, left = (state.wheels[a] + state.wheels[b] for a, b in ((0, 3), (1, 2)))
-        linear = self._drive.wheel_radius * (right + left) / 4
-        track = self._drive.wheel_separation * self._drive.wheel_separation_multiplier
-        angular = self._drive.wheel_radius * (right - left) / 2 / track
+        twist = self._kinematics.twist(WheelSpeeds(*state.wheels))
         for commanded, actual, off, unit in (
-            (self._command.linear, linear, LINEAR_OFF, "m/s"),
-            (self._command.angular, angular, ANGULAR_OFF, "rad/s"),
+            (self._command.linear, twist.linear, LINEAR_OFF, "m/s"),
+            (self._command.angular, twist.angular, ANGULAR_OFF, "rad/s"),
         ):
             if abs(actual - commanded) > off + OFF_SHARE * abs(commanded):
                 return (

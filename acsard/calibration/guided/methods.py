@@ -77,7 +77,7 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
     the questions after the turn, and `measures` the measurements that the answers give.
     """
     longest = MISSED * 2 * math.pi * WIDEST
-    rate = abs(setup.command(FIRST_TURN)) * setup.drive.wheel_separation_multiplier
+    rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
     words = f"The robot turns to the left on the spot. Press SPACE {until}"
     turn = setup.spin(FIRST_TURN, longest / rate)
     return Leg(ROUND, words, (turn,), asks, measures, by_key=True)

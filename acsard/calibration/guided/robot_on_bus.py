@@ -20,8 +20,8 @@ from msgspec import Struct
 
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
-from acsard.calibration.log_table import APPLIED, Floats, Table
-from acsard.calibration.runs import Run, on_arrival_clock, runs
+from acsard.calibration.log_table import APPLIED, FOUR, Floats, Table
+from acsard.calibration.runs import Log, Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_S, Watch
 from acsard.client.synchronous import Client
@@ -108,7 +108,7 @@ class Sensor:
 
 
 STREAMS = {
-    "wheels": ("left", "right"), "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
+    "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
 """Columns of the log by the name of their source."""
 
@@ -132,17 +132,13 @@ class Recorder:
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
-        self._right = joints[0], joints[3]
-        self._left = joints[1], joints[2]
+        self._joints = joints
         self.samples: dict[str, list[Sample]] = {name: [] for name in STREAMS}
 
     def wheels(self, message: JointState, came: float) -> float:
         """Add wheel speeds and return the speed of the fastest wheel, rad/s."""
         speeds = dict(zip(message.name, message.velocity, strict=False))
-        left, right = (
-            (speeds[one] + speeds[other]) / 2 for one, other in (self._left, self._right)
-        )
-        self._add("wheels", message.header.stamp, came, (left, right))
+        self._add("wheels", message.header.stamp, came, tuple(speeds[j] for j in self._joints))
         return max(map(abs, speeds.values()))
 
     def gyro(self, message: Imu, came: float) -> None:
@@ -164,14 +160,18 @@ class Recorder:
         made = stamp.to_ns() / NS_PER_S if stamp.sec else None
         self.samples[stream].append(Sample(came, made, values))
 
-    def run(self) -> Run:
-        """Return the leg as a run. Raises `LogError` if there are too few wheel samples."""
+    def log(self) -> Log:
+        """Return the leg as a log.
+
+        Raises `LogError` if there are too few wheel samples, or if two wheels of a side contradict
+        each other.
+        """
         sensors: list[dict[str, Floats]] = []
         for stream, names in STREAMS.items():
             samples = self.samples[stream]
             values = np.array([sample.values for sample in samples]).reshape(-1, len(names)).T
             sensors.append({"t": times(samples)} | dict(zip(names, values, strict=True)))
-        return runs(Table.joined(sensors)).runs[0]
+        return runs(Table.joined(sensors))
 
 
 def times(samples: Sequence[Sample]) -> Floats:
@@ -216,7 +216,8 @@ class RobotOnBus:
         Raises:
             DisturbedError: the leg was halted, and can be repeated.
             GuideError: the leg was halted for another reason.
-            LogError: the recording has too few samples of the wheels.
+            LogError: the recording has too few samples of the wheels, or two wheels of a side
+                contradict each other.
         """
         recorder = Recorder(self._joints)
         self._drain()
@@ -237,7 +238,10 @@ class RobotOnBus:
             if driver.disturbed or (driver.silent and self._returns()):
                 raise DisturbedError(driver.halted, text)
             raise GuideError(text)
-        return recorder.run()
+        log = recorder.log()
+        for note in log.notes:
+            self._prompt.say(f"note: {note}")
+        return log.runs[0]
 
     def _returns(self) -> bool:
         """Return whether the silent daemon sends its state again within `RETURNS_S`."""

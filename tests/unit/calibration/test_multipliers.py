@@ -31,6 +31,12 @@ def test_positions_that_know_better_give_way_little() -> None:
     assert made.values == pytest.approx(FOUND.values, rel=1e-3)
 
 
+@pytest.mark.parametrize("metres", [2.5, 4.8, 5.2, 10.0])
+def test_a_tape_that_contradicts_the_positions_is_refused(metres: float) -> None:
+    with pytest.raises(RefusedError, match=r"ends 5\.00 m from its start, but you measured"):
+        scaled(FOUND, Tape(metres), NAMES, follow, known=True)
+
+
 @pytest.mark.parametrize(("run", "words"), [("turns", "from its start"), ("no", "no run")])
 def test_a_run_that_gets_nowhere_is_refused(run: str, words: str) -> None:
     with pytest.raises(RefusedError, match=words):

@@ -250,6 +250,27 @@ def test_a_tape_measures_the_wheels_of_a_robot_whose_track_is_right() -> None:
     assert "odometry.left_wheel_radius_multiplier_std" not in given
 
 
+def test_a_tape_measures_the_wheels_if_positions_are_too_coarse_to_improve_them() -> None:
+    robot = Robot(place_noise=0.2, rng=np.random.default_rng(1))
+    seen, ahead = drive(robot, GUIDED), drive(robot, [(2, 0, 0), (8, 0.3, 0), (2, 0, 0)])
+    large = DriveConfig(
+        wheel_separation_multiplier=1.688, left_wheel_radius_multiplier=1.02 * 0.998,
+        right_wheel_radius_multiplier=1.02 * 1.002,
+    )  # fmt: skip
+    found = calibrate(
+        log_of_runs([seen, ahead], gyro=False), large, Tape(abs(ahead.where[-1]), "2")
+    )
+    assert set(found.kept) == {TRACK, RATIO}
+    assert found.multipliers.values[1:] == pytest.approx([0.998, 1.002], abs=0.01)
+    assert found.scale == "distance"
+    assert found.odometry["distance_scale_std"] == pytest.approx(0.004, abs=0.002)
+
+
+def test_a_log_whose_sensors_have_no_value_is_refused() -> None:
+    with pytest.raises(RefusedError, match="no positions or turn rates"):
+        calibrated(table(usual(), gyro=False, places=False))
+
+
 @so_many
 def test_bias_and_time_offset_are_reported(count: int) -> None:
     for c, _ in robots("gyro", count):

@@ -104,6 +104,26 @@ def test_counts_against_the_speeds_are_a_fault() -> None:
         assert "against" in encoder_counts.finding(board, [0]).text
 
 
+@each(
+    ("share", "words"),
+    [(-1.0, "motor b (front left) run against"), (0.0, "do not change"), (2.0, "do not agree")],
+)
+def test_the_wrong_counts_of_one_motor_do_not_hide_in_the_mean(share: float, words: str) -> None:
+    with Robot().board() as board:
+        board.sampled = True
+        board.replies = []
+        for reply in replies(3200):
+            assert reply.reading is not None
+            count, speed = reply.reading.counts[0], reply.motors[0]
+            counts = (count, round(share * (count - 65000)) % 65536, 0, 0)
+            motors = (speed, speed, 0.0, 0.0)
+            reading = Reading(reply.reading.mcu_ms, counts)
+            board.replies.append(Reply(reply.at_s, motors, b"", reading))
+        finding = encoder_counts.finding(board, [0, 1])
+    assert (finding.verdict, finding.keys) == ("FAIL", {})
+    assert words in finding.text
+
+
 def test_more_counts_than_the_host_takes_are_a_warning() -> None:
     with Robot().board() as board:
         board.sampled, board.identity = True, {"counts": "400000"}

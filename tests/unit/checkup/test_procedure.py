@@ -233,10 +233,47 @@ def test_a_dead_motor_is_told_from_a_dead_encoder_by_who_sees_the_wheel(
     assert says in checked[f"motor {letter}"].text
 
 
+def test_an_encoder_that_moves_while_no_wheel_turns_is_a_loose_wheel() -> None:
+    robot = Robot("plain_only")
+
+    class Watching(Person):
+        def ask(self, question: str, answers: Sequence[str]) -> str | None:
+            answer = super().ask(question, answers)
+            return "none" if "did motor b turn" in question else answer
+
+    checked = Checked(robot, Watching(robot))
+    assert checked.failed == ["motor b (front left)"]
+    assert "you saw no wheel turn" in checked["motor b"].text
+
+
 def test_a_dead_last_motor_is_no_missing_comma() -> None:
     checked = check("dead_motor=d")
     assert checked["trailing comma"].verdict == "SKIPPED"
     assert "mcu.trailing_comma" not in checked.changes
+
+
+@pytest.mark.parametrize("fault", ["dead_motor=d", "stuck_encoder=d"])
+@pytest.mark.parametrize("counts", [16, 48, 150, 400])
+def test_a_motor_that_coasts_between_two_counts_is_not_moved_by_the_next_one(
+    counts: int, fault: str
+) -> None:
+    checked = check("plain_only", fault, config=Config(sim=SimConfig(encoder_counts=counts)))
+    assert checked.failed == ["motor d (rear right)"]
+    assert "shows nothing" in checked["motor d"].text
+
+
+@pytest.mark.parametrize("counts", [16, 48, 400])
+def test_a_missing_comma_is_found_with_coarse_encoders(counts: int) -> None:
+    checked = check("comma_latched", config=Config(sim=SimConfig(encoder_counts=counts)))
+    assert checked["trailing comma"].figure == "needed"
+    assert checked.changes["mcu.trailing_comma"] is True
+
+
+@pytest.mark.parametrize("counts", [16, 48, 96])
+def test_nobody_is_asked_about_a_wheel_with_a_coarse_encoder_before_it_stands(counts: int) -> None:
+    """The simulated person of the check fails if a wheel still turns."""
+    config = Config(sim=SimConfig(encoder_counts=counts))
+    assert check("plain_only", config=config, person=True).failed == []
 
 
 def test_old_firmware_with_its_comma_configured_fails_by_its_broken_lines_only() -> None:

@@ -300,6 +300,26 @@ def test_a_file_that_a_crash_cut_is_finished_and_protected(tmp_path: Path) -> No
     again.close()
 
 
+@pytest.mark.parametrize(("behind_ns", "retained"), [(0, True), (365 * DAY_NS, False)])
+def test_a_crash_retains_the_minute_before_it_but_not_all_files_if_the_clock_was_behind(
+    tmp_path: Path, behind_ns: int, retained: bool
+) -> None:
+    one = ring(tmp_path)
+    for _ in range(3):
+        record(one)
+    writing = one.begin(about(NOW_NS - behind_ns))
+    writing.add("steps", NOW_NS - behind_ns, b"whole")
+    writing.flush()
+    writing.close()
+    os.utime(writing.path, ns=(0, NOW_NS - behind_ns))
+    one.close()
+    again = ring(tmp_path)
+    *earlier, cut = listed(tmp_path)
+    assert [path.name.endswith(NEAR) for path in earlier] == [retained] * 3
+    assert cut.name.endswith(KEPT)
+    again.close()
+
+
 def test_a_file_that_a_disk_error_cut_is_finished_and_keeps_its_class(tmp_path: Path) -> None:
     one = ring(tmp_path)
     writing = one.begin(about())

@@ -53,12 +53,24 @@ def test_no_command_is_beyond_the_limits_or_faster_than_slow(
     assert math.copysign(1, spin.angular) == math.copysign(1, rate)
 
 
-@given(angle=SPIN, track=st.floats(1.0, 2.5), multiplier=st.floats(0.5, 2.5))
+RADIUS = st.floats(0.8, 1.3)
+
+
+@given(
+    angle=SPIN, track=st.floats(1.0, 2.5), multiplier=st.floats(0.5, 2.5), left=RADIUS, right=RADIUS
+)
 def test_a_turn_by_the_true_track_is_the_angle_whatever_is_configured(
-    angle: float, track: float, multiplier: float
+    angle: float, track: float, multiplier: float, left: float, right: float
 ) -> None:
-    move = setup(robot(multiplier=multiplier)).turn(angle, 0.9, track)
-    assert move.angular * multiplier / track * move.seconds == pytest.approx(angle)
+    config = robot(multiplier=multiplier)
+    drive = msgspec.structs.replace(
+        config.drive, left_wheel_radius_multiplier=left, right_wheel_radius_multiplier=right
+    )
+    move = setup(msgspec.structs.replace(config, drive=drive)).turn(angle, 0.9, track)
+    # The daemon divides the speed of each side's rim by the radius multiplier of that side.
+    rim = move.angular * multiplier * drive.wheel_separation / 2
+    turn_rate = (rim / right + rim / left) / (track * drive.wheel_separation)
+    assert turn_rate * move.seconds == pytest.approx(angle)
 
 
 @pytest.mark.parametrize("way", METHODS)

@@ -80,6 +80,18 @@ def test_it_opens_with_zeros_drives_the_moves_and_ends_when_the_wheels_stand() -
     assert world.driver.progress(world.now) == 1.0
 
 
+def test_wheels_that_follow_their_command_by_the_configured_radii_are_no_deviation() -> None:
+    leg, size = Leg("", "", (Move(4.0, 0.3, 0.0),)), 0.6
+    world = World(leg)
+    drive = DriveConfig(left_wheel_radius_multiplier=size, right_wheel_radius_multiplier=size)
+    world.driver = LegDriver(leg, "app", drive, world.now, US)
+    world.tells = lambda state: msgspec.structs.replace(
+        state, wheels=[speed / size for speed in state.wheels]
+    )
+    world.run(6.0)
+    assert (world.driver.phase, world.driver.halted) == (Phase.DONE, "")
+
+
 def test_nothing_moves_until_zeros_count() -> None:
     world = World(LEG)
     waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero")]

@@ -53,7 +53,7 @@ def recorded() -> Recorder:
 
 
 def test_samples_are_as_far_apart_as_their_stamps_say_and_the_soonest_came_at_once() -> None:
-    run = recorded().run()
+    run = recorded().log().runs[0]
     assert np.diff(run.t) == pytest.approx(0.02)
     # The gyro began at 10.0 s on this computer's clock, the wheels 0.1 s later.
     assert run.gyro_t[0] == pytest.approx(-0.1)
@@ -85,7 +85,7 @@ def test_the_commands_of_the_wheels_are_part_of_the_run() -> None:
     for k in range(100):
         twist = Twist(Vector3(x=0.4), Vector3(z=-0.5))
         recorder.command(TwistStamped(stamped(5010.0 + 0.02 * k), twist), 10.1 + 0.02 * k)
-    run = recorder.run()
+    run = recorder.log().runs[0]
     assert (set(run.linear), set(run.angular)) == ({0.4}, {-0.5})
     assert run.commands_t[0] == pytest.approx(0.0)
 
@@ -96,4 +96,19 @@ def test_the_fastest_wheel_is_told_whichever_way_it_turns() -> None:
 
 def test_without_wheels_there_is_no_run() -> None:
     with pytest.raises(LogError):
-        Recorder(JOINTS).run()
+        Recorder(JOINTS).log()
+
+
+def test_a_wheel_that_contradicts_the_other_of_its_side_is_noted_or_refused() -> None:
+    def with_rear_left(speed: float) -> Recorder:
+        recorder = Recorder(JOINTS)
+        for k in range(100):
+            message = wheels(0.02 * k + 1.0, 6.0, 6.0)
+            message.velocity[2] = speed
+            recorder.wheels(message, 0.02 * k)
+        return recorder
+
+    assert with_rear_left(6.0).log().notes == ()
+    assert "fl and rl differ by 25%" in with_rear_left(4.5).log().notes[0]
+    with pytest.raises(LogError, match="rl hardly turns while fl does"):
+        with_rear_left(0.0).log()
