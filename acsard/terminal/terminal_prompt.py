@@ -124,7 +124,8 @@ class TerminalPrompt(Screen):
         self._clear()
         choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
         # A line that was typed before the question appeared must not answer it.
-        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+        if sys.stdin.isatty():
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
         while True:
             self._print(f"\n{question}{choice} ")
             line = sys.stdin.readline()
@@ -138,7 +139,8 @@ class TerminalPrompt(Screen):
     def start(self, text: str, by_key: bool = False) -> None:
         self.say(text)
         # Keys that were pressed before the text appeared must not start anything.
-        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+        if sys.stdin.isatty():
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
         self.say("Enter starts it, then any key stops it; q quits.")
         while True:
             pressed = _read()
