@@ -54,15 +54,15 @@ SILENCE_NS = 3 * NS_PER_S // 10
 source is 0.25 s."""
 
 GATHER_NS = NS_PER_S // 25
-"""Time within which all commands of a delayed burst arrive, ns.
+"""Time for which the first command after a silence waits, ns, to see whether a burst follows.
 
-A panel that sends at 20 Hz sends at most one command in this time. Only the first command after a
-silence waits this long, and the first one after a burst of more than `CROWD` commands.
+A panel that sends at 20 Hz sends at most one command in this time. The first command after a burst
+of more than `CROWD` commands waits as well.
 """
 
 CROWD = 5
-"""Largest number of commands that a panel sends in `GATHER_NS`, at 125 Hz. If more arrive, the rest
-of the burst may follow."""
+"""Largest number of commands that a panel sends in `GATHER_NS`, at 125 Hz. If more arrive, they
+come from a queue, which may hold further ones."""
 
 STALE_NS = NS_PER_S // 10
 """Age above which a speed is not sent, ns: it no longer shows the operator's intention."""

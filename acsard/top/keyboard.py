@@ -52,6 +52,7 @@ class Keyboard:
         self._move = (0, 0)
         self._until = 0.0
         self._old_until = 0.0
+        """Monotonic time until which all keys belong to the last burst, s."""
         self._zeros = ZEROS
 
     def take(self, text: str, now: float) -> None:

@@ -529,7 +529,9 @@ class PromptedTimes:
         if self._batched:
             self._soon = 0.0
             self._weigh(lines, since, cut)
-        elif self._delay is not None:
+            return
+        self._given = []
+        if self._delay is not None:
             self._base, self._losses = self._delay, 0.0
 
     def place(self, asked_ns: int | None = None) -> Placed | None:

@@ -216,9 +216,10 @@ class _Side:
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
             against = self.witnesses[self.out].speed * self.expected.commanded < 0.0
-            if fault == "stuck" and not same[self.out]:
-                self._out_s = 0.0  # it has another speed, so it was not stuck
-            elif fault == "stuck" or (fault == "reversed" and against):
+            if fault == "stuck":
+                # A wheel that reports another speed is not stuck.
+                self._out_s = self._out_s + dt if same[self.out] else 0.0
+            elif fault == "reversed" and against:
                 self._out_s += dt
         # A finding that a wheel is reversed may be wrong on a slow robot, so the test goes on after
         # it.
