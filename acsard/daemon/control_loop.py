@@ -68,6 +68,10 @@ LATE_NS = 1_000_000
 robot. Most delays are shorter and are passed as 0, because the sample times are not that accurate.
 """
 
+NOT_STORED = "the disk has not stored this yet, and a restart may lose a stop until it has"
+"""Addition to an answer that does not wait any longer for the latch file, because the disk is slow.
+"""
+
 BUS_STUCK = Event("bus_stuck", "the bus accepts no messages; driving goes on", "warning")
 
 
@@ -485,7 +489,7 @@ class ControlLoop:
         If `last` is true, send all answers.
         """
         held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
-        trouble = "" if held else self._handover.trouble
+        trouble = "" if held else self._handover.trouble or NOT_STORED
         while self._answers and (held or last or self._answers[0][0] < before_ns):
             _, answer = self._answers.popleft()
             if trouble and answer.success:

@@ -1,9 +1,11 @@
 """The file that stores stop, fault, `inactive` and lowered limits for the next start of the daemon.
 
-A thread writes the file. The control loop only hands the newest latches to the thread, and never
-waits for the disk. After the thread has renamed the new file, a kill of the process loses nothing.
-After the thread has synced it, a power cut loses nothing. The file is read once, before the robot
-exists. `latch_rules.py` decides with which latches the robot starts.
+A thread writes the file, and another thread syncs it. The control loop only hands the newest
+latches to the first thread, and never waits for the disk. After that thread has renamed the new
+file, a kill of the process loses nothing. After the other thread has synced it, a power cut loses
+nothing. A sync takes up to seconds on an SD card, and a stop must not wait for the sync of the
+latches before it. The file is read once, before the robot exists. `latch_rules.py` decides with
+which latches the robot starts.
 """
 
 from __future__ import annotations
@@ -134,7 +136,10 @@ class LatchFile:
         self._hung = False
         """True if the last event about the speed of the disk said that it hangs. False if the event
         said that it works again."""
-        self._thread: threading.Thread | None = None
+        self._renamed = Mailbox[Latches](1)
+        """The newest latches that the file has, until the syncing thread has seen them."""
+        self._threads: tuple[threading.Thread, ...] = ()
+        """The threads that write and sync the file, in this order. Empty until both run."""
 
     # the start
 
@@ -157,13 +162,19 @@ class LatchFile:
             else:
                 latches = doubted(found, at_start(unwritable(self.where, why)), now)
             self.keep(latches)
-        thread = threading.Thread(target=self._work, args=(now,), name="latches", daemon=True)
+        threads = (
+            threading.Thread(target=self._work, args=(now,), name="latches", daemon=True),
+            threading.Thread(target=self._sync_each, name="latches to disk", daemon=True),
+        )
         try:
-            thread.start()
+            for thread in threads:
+                thread.start()
         except RuntimeError as error:
-            self._fail(f"this process cannot start another thread ({error})")
+            # One of the threads may run. Without the other one it must not report a recovery.
+            self._barred = f"this process cannot start another thread ({error})"
+            self._fail(self._barred)
             return doubted(latches, at_start(unwritable(self.where, self._failed)), now)
-        self._thread = thread
+        self._threads = threads
         return latches
 
     def _look(self, now: Instant) -> Latches:
@@ -172,8 +183,6 @@ class LatchFile:
             if self._abandoned:
                 return Latches()
             latches = self._found = self._read(now)
-            # The writing thread syncs the file later, because a sync takes up to seconds on an SD
-            # card.
             trouble = self._replace(latches)
             if trouble and not self._abandoned:
                 self._fail(trouble)
@@ -262,7 +271,7 @@ class LatchFile:
     @property
     def trouble(self) -> str:
         """Why the latches in force are not kept, in words; "" if they are kept."""
-        if self._thread is not None and not self._thread.is_alive():
+        if not all(thread.is_alive() for thread in self._threads):
             return "the thread that keeps a stop over a restart has ended; restart the daemon"
         failed = self._failed or (HANGS if self._hangs else "")
         return unwritable(self.where, failed) if failed else ""
@@ -280,15 +289,16 @@ class LatchFile:
         return Event("latch_file", f"a stop is kept again in {self.where}")
 
     def close(self) -> None:
-        """Wait until the newest latches are written, but at most `CLOSE_S`."""
-        if self._thread is not None:
-            self._box.close()
-            self._thread.join(CLOSE_S)
+        """Wait until the newest latches are written and synced, but at most `CLOSE_S`."""
+        end_ns = clock.mono_ns() + CLOSE_S * NS_PER_S
+        for box, thread in zip((self._box, self._renamed), self._threads, strict=False):
+            box.close()
+            thread.join(max(0.0, (end_ns - clock.mono_ns()) / NS_PER_S))
 
     # The writing thread runs the methods below.
 
     def _work(self, now: Instant) -> None:
-        latches = None if self._failed else self._sync_first()
+        latches: Latches | None = None
         while True:
             # Read `closed` before the latches, so that the last latches are not missed.
             over = self._box.closed
@@ -302,7 +312,7 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches, and report a failure or a recovery.
+        """Write these latches, and report a failure.
 
         Return the reason of a failure, or "". `now` is the time of the daemon's start.
         """
@@ -310,27 +320,11 @@ class LatchFile:
         with self._disk:
             if self._blind:
                 self._read_late(now)
-            trouble = self._write(latches)
-        if trouble and trouble != self._failed:
+            trouble = self._replace(latches)
+        if trouble:
             self._fail(trouble)
         self._busy_ns = None
-        if not trouble:
-            self._recover()
         return trouble
-
-    def _sync_first(self) -> Latches | None:
-        """Sync the file that `start` has written.
-
-        If the sync fails, return the latches to write again, else None.
-        """
-        self._busy_ns = clock.mono_ns()
-        with self._disk:
-            trouble = self._sync()
-        self._busy_ns = None
-        if not trouble or self._found is None:
-            return None
-        self._fail(trouble)
-        return self._found
 
     def _read_late(self, now: Instant) -> None:
         """Read the file that the start could not read, so that no latch in it is overwritten."""
@@ -342,10 +336,6 @@ class LatchFile:
                 # `_barred` says why the file is not written.
                 self._found = Latches()
         self._missed = replace_fields(self._found, stop=None)
-
-    def _write(self, latches: Latches) -> str:
-        """Replace and sync the file; return the reason of a failure, or "" on success."""
-        return self._replace(latches) or self._sync()
 
     def _replace(self, latches: Latches) -> str:
         """Replace the file without a sync; return the reason of a failure, or "" on success."""
@@ -361,7 +351,33 @@ class LatchFile:
         except OSError as error:
             return _reason(error)
         self._held = latches
+        self._renamed.put(latches)
         return ""
+
+    # The syncing thread runs the methods below.
+
+    def _sync_each(self) -> None:
+        """Sync the file after each write, and report a failure or a recovery."""
+        failed = False
+        while True:
+            # Read `closed` before the latches, so that the last latches are not missed.
+            over = self._renamed.closed
+            if failed:
+                # The kernel may have dropped the bytes that it could not sync, so write them again.
+                with self._disk:
+                    if self._held is not None:
+                        self._replace(self._held)
+            if self._renamed.pop() is not None:
+                trouble = self._sync()
+                failed = bool(trouble)
+                if failed:
+                    self._fail(trouble)
+                elif self._handed is None or self._held is self._handed:
+                    # Otherwise the newest latches are not written yet.
+                    self._recover()
+            if over:
+                return
+            self._renamed.wait(RETRY_S if failed else None)
 
     def _sync(self) -> str:
         """Sync the file that `_replace` has written; return the reason of a failure, or ""."""
@@ -393,12 +409,14 @@ class LatchFile:
         )
 
     def _fail(self, reason: str) -> None:
+        if reason == self._failed:
+            return
         self._failed = reason
         text = f"{unwritable(self.where, reason)}; the daemon tries again every {RETRY_S:g} s"
         self._news.put(Event("latch_file", text, "warning"))
 
     def _recover(self) -> None:
-        if self._failed:
+        if self._failed and not self._barred:
             self._failed = ""
             self._news.put(self._again)
 

@@ -82,6 +82,9 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     """A daemon whose board reports its battery, so that each published key has messages."""
     config: Tables = {"sim": {"faults": ["battery=80:600"]}}
     with Daemon(tmp_path_factory.mktemp("shared"), config=config) as daemon:
+        with Bus(daemon.endpoint) as bus:
+            # The link is up before the board has reported its battery for the first time.
+            until(lambda: bus.ask("battery"), 5.0, "the battery")
         yield daemon
 
 

@@ -11,6 +11,7 @@ import os
 import select
 import termios
 import threading
+import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -155,6 +156,27 @@ async def test_a_reader_whose_turn_comes_behind_a_late_step_s_finds_nothing_and_
             loop.call_soon(late_step)
             await asyncio.sleep(0.001)
         assert (b"".join(taken).count(GO), port.is_open, port.trouble) == (10, True, "")
+
+
+async def test_a_line_right_behind_the_hang_up_of_the_device_is_lost_without_an_error() -> None:
+    """The reader and the step notice the hang-up in the same round of the event loop."""
+    loop, errors, told = asyncio.get_running_loop(), list[str](), list[str]()
+    loop.set_exception_handler(lambda _, context: errors.append(str(context)))
+    board, device = os.openpty()
+    tty.setraw(board)
+    unplugged = Line(board, device, os.ttyname(device))
+    async with unplugged.port(lambda event: told.append(event.name)) as port:
+        assert port.offer(STOP, clock.now()) == "sent"
+        await asyncio.sleep(0.01)  # the wire is free again
+        offered = list[str]()
+        loop.call_later(0.001, lambda: offered.append(port.offer(GO, clock.now())))
+        os.close(board)
+        os.close(device)
+        time.sleep(0.005)  # both are due when the event loop looks next
+        await asyncio.sleep(0.01)
+        assert offered == ["down"]
+        assert told == ["port_open", "port_lost"]
+    assert errors == []
 
 
 @pytest.mark.parametrize("name", ["tcgetattr", "tcsetattr", "tcflush"])

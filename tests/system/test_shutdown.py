@@ -9,14 +9,18 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from tests.system.bystander import lost
 from tests.system.harness import (
+    ROOT,
     ZERO_LINE,
+    Bus,
     Daemon,
     Heard,
     Peer,
     Program,
+    environment,
     running,
     silence,
     until,
@@ -146,6 +150,45 @@ def test_a_signal_while_the_peer_is_silent_ends_with_stop_and_exits_0(
         assert daemon.ended(5.0) == 0
         assert time.monotonic() - sent < 1.0 + lost(sent)
     assert peer.last_line() == ZERO_LINE
+
+
+BUG = """\
+import os
+from {module} import {kind}
+whole = {kind}.{method}
+def method(*arguments):
+    if os.path.exists(os.environ["BUG"]):
+        raise ZeroDivisionError("a bug")
+    return whole(*arguments)
+{kind}.{method} = method
+"""
+"""Put into the daemon: while the file $BUG exists, a method raises an exception."""
+
+
+@pytest.mark.parametrize(
+    ("module", "kind", "method"),
+    [
+        ("acsard.daemon.bus.inbox", "Replies", "_reply"),
+        ("acsard.daemon.bus.outlets", "Outlets", "_send"),
+        ("acsard.daemon.bus.router_links", "RouterLinks", "_poll"),
+    ],
+)
+def test_a_bug_in_a_thread_of_the_bus_ends_the_daemon_with_stop_last(
+    tmp_path: Path, peer: Peer, module: str, kind: str, method: str
+) -> None:
+    (there := tmp_path / "there").mkdir()
+    (there / "sitecustomize.py").write_text(BUG.format(module=module, kind=kind, method=method))
+    bug = tmp_path / "bug"
+    env = environment(PYTHONPATH=f"{there}:{ROOT}", BUG=str(bug))
+    with Daemon(tmp_path, peer.path, env=env) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        with bus.follow("odom"), bus.commanding(0.5):
+            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
+            bug.touch()
+            bus.session.get("acsard/acsar/info", zenoh.handlers.FifoChannel(1))
+            assert daemon.ended(5.0) == 1
+    assert peer.last_line() == ZERO_LINE
+    assert "ZeroDivisionError: a bug" in daemon.stderr
 
 
 @pytest.mark.slow

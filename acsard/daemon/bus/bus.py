@@ -81,8 +81,13 @@ class ZenohBus:
         self._outlets.publish(key, message)
 
     def flush(self) -> None:
-        """Wake the thread that sends the queued messages. Never wait for it."""
+        """Wake the thread that sends the queued messages. Never wait for it.
+
+        Raise the error that has ended a thread of the bus, if there was one.
+        """
         self._outlets.flush()
+        self._replies.check()
+        self._links.check()
 
     def reply(self, reply: Reply) -> None:
         """Send a reply to the query that `reply.ticket` names."""

@@ -11,8 +11,8 @@ When a ticket is retired, Zenoh's query is dropped, and the client stops waiting
 from __future__ import annotations
 
 import queue
-import threading
 from collections import deque
+from functools import partial
 from itertools import count
 
 import zenoh
@@ -30,6 +30,7 @@ from acsard.core.messages.keys_and_roles import (
     source_keys,
 )
 from acsard.core.ros.transports import Endpoint
+from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
@@ -46,6 +47,7 @@ class Replies:
         self._tickets = count(1)
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
         """Replies and retired tickets, in order. None ends the thread."""
+        self._thread: BusThread | None = None
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
         """Return a ticket for this query, or None if there are too many unfinished queries.
@@ -69,7 +71,13 @@ class Replies:
 
     def start(self, session: zenoh.Session) -> None:
         """Start the thread that sends the replies. Replies that are queued already wait for it."""
-        threading.Thread(target=self._run, args=(session,), name="replies", daemon=True).start()
+        self._thread = BusThread("replies", partial(self._run, session))
+        self._thread.start()
+
+    def check(self) -> None:
+        """Raise the error that has ended the thread, if there was one."""
+        if self._thread is not None:
+            self._thread.check()
 
     def stop(self) -> None:
         """Let the thread send the queued replies and end."""
@@ -82,12 +90,12 @@ class Replies:
             if held is None:
                 continue
             query, key = held
-            if isinstance(item, int):
-                del self._queries[ticket]
-                query.drop()
-                continue
             try:
-                self._reply(session, query, key, item)
+                if isinstance(item, int):
+                    del self._queries[ticket]
+                    query.drop()
+                else:
+                    self._reply(session, query, key, item)
             except zenoh.ZError:
                 # The client has disconnected.
                 pass

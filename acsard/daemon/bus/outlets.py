@@ -11,7 +11,7 @@ period is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from threading import Lock, Thread
+from threading import Lock
 from typing import Any
 
 import zenoh
@@ -21,6 +21,7 @@ from acsard.core.messages.encodings import Format, encode
 from acsard.core.messages.schema import Message
 from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Bell, Mailbox
 
@@ -93,8 +94,7 @@ class Outlets:
         """Number of messages that newer ones have displaced since the last call of `losses`."""
         self._began_ns: int | None = None
         """Monotonic time at which the present round of puts began, ns; None between rounds."""
-        self._error: BaseException | None = None
-        self._thread = Thread(target=self._run, name="outlets", daemon=True)
+        self._thread = BusThread("outlets", self._run)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
         # Several threads of Zenoh call this method, so it needs a lock. It replaces the set as a
@@ -117,8 +117,7 @@ class Outlets:
 
     def flush(self) -> None:
         """Wake the thread that sends the messages; raise the error that has ended it."""
-        if self._error is not None:
-            raise self._error
+        self._thread.check()
         if self._waiting:
             self._waiting = False
             self._bell.ring()
@@ -151,18 +150,15 @@ class Outlets:
     # The thread runs `_run` and `_send`.
 
     def _run(self) -> None:
-        try:
-            leaving = False
-            while not leaving:
-                self._bell.wait()
-                leaving = self._leaving
-                self._began_ns = clock.mono_ns()
-                for topic, slot in self._slots.items():
-                    while slot.waiting:
-                        self._send(topic, slot.waiting.popleft())
-                self._began_ns = None
-        except BaseException as error:  # noqa: BLE001 - raised again by flush(), so it ends the process
-            self._error = error
+        leaving = False
+        while not leaving:
+            self._bell.wait()
+            leaving = self._leaving
+            self._began_ns = clock.mono_ns()
+            for topic, slot in self._slots.items():
+                while slot.waiting:
+                    self._send(topic, slot.waiting.popleft())
+            self._began_ns = None
 
     def _send(self, topic: str, message: Message) -> None:
         payloads: dict[Format, bytes] = {}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import socket
-from threading import Event, Thread
+from threading import Event
 
 import zenoh
 
 from acsard.core.config.settings import BusConfig
 from acsard.core.values import RoutersStatus
+from acsard.daemon.bus.bus_thread import BusThread
 from acsard.daemon.bus.inbox import Inbox
 from acsard.host.mailbox import Mailbox
 
@@ -33,12 +34,16 @@ class RouterLinks:
         self._status: RoutersStatus | None = None
         self._changes = Mailbox[RoutersStatus](1, lambda: None)
         self._over = Event()
-        self._thread = Thread(target=self._run, name="links", daemon=True)
+        self._thread = BusThread("links", self._run)
         self._session: zenoh.Session
 
     def changed(self) -> RoutersStatus | None:
         """Return the status if it has changed since the last call, else None. Never wait."""
         return self._changes.pop()
+
+    def check(self) -> None:
+        """Raise the error that has ended the thread, if there was one."""
+        self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
         """Start polling, also without `bus.connect`: a router may connect to the daemon."""

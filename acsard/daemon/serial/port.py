@@ -228,7 +228,9 @@ class SerialPort:
             # instead.
             transport.pause_reading()
             close(transport.serial, lost=error is not None)
-            transport.abort()
+            # The reader may have seen the hang-up just before. The transport then closes already.
+            if not transport.is_closing():
+                transport.abort()
         if error is not None:
             self.trouble = f"the serial port {self._path} was lost ({error}); the daemon reopens it"
             self._log(Event("port_lost", self.trouble, "warning"))

@@ -352,7 +352,7 @@ def test_latches_that_come_with_the_end_are_written(
 
     monkeypatch.setattr(file._box, "pop", late)
     file.keep(FAULT)
-    until(lambda: file._thread is not None and not file._thread.is_alive())
+    until(lambda: not file._threads[0].is_alive())
     assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
 
 
@@ -440,19 +440,52 @@ def test_a_disk_that_syncs_slowly_does_not_stop_the_robot_at_the_start(
         goes.set()
 
 
-def test_a_first_sync_that_hangs_is_reported_when_a_stop_waits_for_it(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("before", [None, FAULT], ids=["the start", "a fault"])
+def test_a_stop_does_not_wait_for_the_sync_of_the_latches_before_it(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch, before: Latches | None
 ) -> None:
-    goes = threading.Event()
-    monkeypatch.setattr(module, "sync", lambda path: goes.wait(10.0))
+    syncs, goes = threading.Event(), threading.Event()
+
+    def slow(path: Path) -> None:
+        syncs.set()
+        goes.wait(10.0)
+
+    if before is None:
+        monkeypatch.setattr(module, "sync", slow)
     file, _ = started(tmp_path)
-    monkeypatch.setattr(module, "START_S", 0.05)
+    if before is not None:
+        monkeypatch.setattr(module, "sync", slow)
+        file.keep(before)
     try:
+        assert syncs.wait(10.0)
         file.keep(STOP)
-        until(lambda: module.HANGS in file.trouble)
+        file.wait(STOP, 5.0)
+        assert file.holds(STOP)
+        assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
     finally:
         goes.set()
-    until(lambda: file.trouble == "")
+
+
+def test_a_stop_that_was_written_during_a_sync_is_synced_before_the_end(
+    tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    syncs, goes, synced = threading.Event(), threading.Event(), list[bytes]()
+
+    def slow(path: Path) -> None:
+        synced.append((tmp_path / NAME).read_bytes())
+        syncs.set()
+        goes.wait(10.0)
+
+    monkeypatch.setattr(module, "sync", slow)
+    monkeypatch.setattr(module, "CLOSE_S", 10.0)
+    file.keep(FAULT)
+    assert syncs.wait(10.0)
+    file.keep(STOP)
+    file.wait(STOP, 5.0)
+    goes.set()
+    file.close()
+    assert synced[0] != encode("acsar", STOP)
+    assert synced[-2:] == [encode("acsar", STOP)] * 2, "the file and its directory"
 
 
 def fails_to_sync(path: Path) -> None:
@@ -490,13 +523,14 @@ def test_a_first_sync_that_fails_does_not_undo_a_stop_that_came_meanwhile(
     assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
 
 
+@pytest.mark.parametrize("name", ["latches", "latches to disk"])
 def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     usual = threading.Thread.start
 
     def start(self: threading.Thread) -> None:
-        if self.name == "latches":
+        if self.name == name:
             raise RuntimeError("can't start new thread")
         usual(self)
 
@@ -504,6 +538,9 @@ def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
     file, latches = started(tmp_path)
     assert latches.stop
     assert "cannot start another thread" in latches.stop.why
+    file.keep(FAULT)
+    file.wait(FAULT, 0.2)
+    assert not file.holds(FAULT)
     assert "cannot start another thread" in file.trouble
 
 

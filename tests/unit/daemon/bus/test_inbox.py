@@ -97,9 +97,9 @@ def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
 class Asked:
     """A query without Zenoh. It records its replies and, at the end, that it was dropped."""
 
-    def __init__(self, gone: bool = False) -> None:
+    def __init__(self, gone: bool = False, closed: bool = False) -> None:
         self.told: list[str] = []
-        self._gone = gone
+        self._gone, self._closed = gone, closed
 
     def reply(self, key: str, payload: bytes, **_: object) -> None:
         if self._gone:
@@ -110,6 +110,8 @@ class Asked:
         self.told.append(f"error={payload.decode()}")
 
     def drop(self) -> None:
+        if self._closed:
+            raise zenoh.ZError("closed")
         self.told.append("dropped")
 
 
@@ -153,6 +155,16 @@ def test_a_client_that_left_and_an_unknown_ticket_block_no_other_reply() -> None
         replies.retire(ticket)
     ended(replies)
     assert (gone.told, here.told) == (["dropped"], ["odom=1", "dropped"])
+
+
+def test_a_query_that_cannot_be_ended_blocks_no_other_reply() -> None:
+    replies, closed, here = Replies(""), Asked(closed=True), Asked()
+    first, second = issued(replies, closed), issued(replies, here)
+    replies.retire(first)
+    replies.send(Reply(second, "odom", b"1", ""))
+    ended(replies)
+    replies.check()
+    assert here.told == ["odom=1"]
 
 
 def test_the_number_of_tickets_is_limited_until_some_are_retired() -> None:
