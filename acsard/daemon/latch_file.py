@@ -133,6 +133,8 @@ class LatchFile:
         """The latches that the last call of `keep` was given."""
         self._busy_ns: int | None = None
         """Monotonic time at which the present write began, ns; None between two writes."""
+        self._syncing_ns: int | None = None
+        """Monotonic time at which the present sync began, ns; None between two syncs."""
         self._hung = False
         """True if the last event about the speed of the disk said that it hangs. False if the event
         said that it works again."""
@@ -278,11 +280,12 @@ class LatchFile:
 
     @property
     def _hangs(self) -> bool:
-        """Return whether the newest latches still wait for a write that has taken too long."""
-        busy_ns = self._busy_ns
-        if busy_ns is None or self._failed or self._held is self._handed:
+        """Return whether a sync takes too long, or a write for which the newest latches wait."""
+        if self._failed:
             return False
-        return clock.mono_ns() - busy_ns > START_S * NS_PER_S
+        busy_ns = None if self._held is self._handed else self._busy_ns
+        begun_ns = [one for one in (busy_ns, self._syncing_ns) if one is not None]
+        return any(clock.mono_ns() - one > START_S * NS_PER_S for one in begun_ns)
 
     @property
     def _again(self) -> Event:
@@ -368,7 +371,9 @@ class LatchFile:
                     if self._held is not None:
                         self._replace(self._held)
             if self._renamed.pop() is not None:
+                self._syncing_ns = clock.mono_ns()
                 trouble = self._sync()
+                self._syncing_ns = None
                 failed = bool(trouble)
                 if failed:
                     self._fail(trouble)

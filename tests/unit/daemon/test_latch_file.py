@@ -488,6 +488,23 @@ def test_a_stop_that_was_written_during_a_sync_is_synced_before_the_end(
     assert synced[-2:] == [encode("acsar", STOP)] * 2, "the file and its directory"
 
 
+def test_a_sync_that_hangs_is_reported_until_it_ends(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stop is in the file, but a power cut would lose it."""
+    goes = threading.Event()
+    monkeypatch.setattr(module, "sync", lambda path: goes.wait(10.0))
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "START_S", 0.05)
+    try:
+        file.keep(STOP)
+        until(lambda: file.holds(STOP))
+        until(lambda: module.HANGS in file.trouble)
+    finally:
+        goes.set()
+    until(lambda: file.trouble == "")
+
+
 def fails_to_sync(path: Path) -> None:
     raise OSError(errno.EIO, os.strerror(errno.EIO))
 
