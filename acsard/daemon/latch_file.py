@@ -368,8 +368,8 @@ class LatchFile:
             if failed:
                 # The kernel may have dropped the bytes that it could not sync, so write them again.
                 with self._disk:
-                    if self._held is not None:
-                        self._replace(self._held)
+                    assert self._held is not None
+                    self._replace(self._held)
             if self._renamed.pop() is not None:
                 self._syncing_ns = clock.mono_ns()
                 trouble = self._sync()
