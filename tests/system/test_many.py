@@ -93,8 +93,8 @@ def test_get_of_named_robots_says_whose_each_answer_is(robots: Robots) -> None:
     ended = robots.tool("get", "info", who=f"{TWO},{ONE}")
     assert (ended.code, ended.err) == (0, "")
     found = [json.loads(line) for line in ended.out.splitlines()]
-    assert [one["robot"] for one in found] == [ONE, TWO]
-    assert [one["message"]["id"] for one in found] == [ONE, TWO]
+    assert [one["robot"] for one in found] == [TWO, ONE]
+    assert [one["message"]["id"] for one in found] == [TWO, ONE]
 
 
 HOSTILE = "[2J\x1b]0;x\x07"
