@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from tests.simulate.board_inputs import Inputs
+from tests.simulate.board_inputs import Inputs, kinds
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
@@ -98,7 +98,7 @@ class Run:
         self.liveness = Liveness(self)
         self.plugging = Plugging(self.witness.period_ns)
         self.reasons = Reasons(self)
-        self.inputs = Inputs(self.witness, plan["board"])
+        self.inputs = Inputs(self.witness, bool(kinds(plan)))
         self.failure: BrokenError | None = None
         self.todo: list[tuple[int, int, Callable[[], None]]] = []
         self._order = 0

@@ -1,4 +1,5 @@
-"""Plans whose board reports inputs, and their promises: emergency stop, bumpers and battery.
+"""Plans whose board reports inputs, and their promises: emergency stop, bumpers, motor drivers and
+battery.
 
 `deploy/firmware/README.md` says what each status line means. `Inputs` reads the bytes that reached
 the daemon and takes each line at the step that takes it, so it knows which lines the daemon has
@@ -19,7 +20,7 @@ from typing import Any
 
 from tests.simulate.ages import MARGIN_NS
 from tests.simulate.product import Seen
-from tests.simulate.promises import INPUTS, LINE, ZERO, BrokenError, Witness
+from tests.simulate.promises import DRIVER, INPUTS, LINE, ZERO, BrokenError, Witness
 from tests.simulate.roads import NS
 
 Plan = dict[str, Any]
@@ -44,6 +45,9 @@ the daemon waits for the second time, because the lines of that time come with i
 
 STOPPED = {"stopped", "fault", "shutdown"}
 """Modes of a robot that is stopped: a fault and the end of the daemon come before a stop."""
+
+NEVER_S = 1e6
+"""Time after which a board without a fault of a motor driver would report one, s."""
 
 LONGEST = 4096
 """Bytes of a line that are kept. A status line is much shorter."""
@@ -70,8 +74,10 @@ def add(plan: Plan) -> None:
     # A line without a checksum does not count once the link has the check.
     if dice.random() <= SHARE and "link_check" not in plan["config"]["mcu"]:
         _bumpers(plan, dice)
-    kinds = (("emergency stop", _emergency_stop), ("away", _away), ("battery", _battery))
-    for name, give in kinds:
+    more = {
+        "emergency stop": _emergency_stop, "away": _away, "battery": _battery, "driver": _driver,
+    }  # fmt: skip
+    for name, give in more.items():
         dice = random.Random(f"{name} {plan['seed']}")
         if dice.random() < OTHERS:
             give(plan, dice)
@@ -181,6 +187,13 @@ def _away(plan: Plan, dice: random.Random) -> None:
             sender["phases"] = sorted([*others, [round(at + 0.5, 3), 0.0, 0.0], push])
 
 
+def _driver(plan: Plan, dice: random.Random) -> None:
+    """Add faults of a motor driver."""
+    plan["board"].append(["driver_fault", NEVER_S, 1.0])
+    for _ in range(1 + int(plan["seconds"] / 15)):
+        _pressed(plan, dice, "driver_fault", "driver_fault")
+
+
 def _battery(plan: Plan, dice: random.Random) -> None:
     """Add a battery that is nearly full, and becomes nearly empty for some time."""
     battery: dict[str, Any] = {"measure": "percent", "hysteresis": 5.0}
@@ -199,9 +212,12 @@ def _battery(plan: Plan, dice: random.Random) -> None:
 
 
 def kinds(plan: Plan) -> set[str]:
-    """Return the inputs of a plan: `estop`, bumpers that `stop` or let drive `away`, `battery`."""
+    """Return the inputs of a plan.
+
+    They are `estop`, bumpers that `stop` or let drive `away`, `battery` and `driver_fault`.
+    """
     safety, names = plan["config"].get("safety", {}), {name for name, *_ in plan["board"]}
-    found = names & {"estop", "battery"}
+    found = names & {"estop", "battery", "driver_fault"}
     return found | ({safety.get("bumper", "stop")} if "bumpers" in safety else set())
 
 
@@ -286,10 +302,10 @@ class _Mean:
 class Inputs:
     """Judges what the robot does while an input counts as pressed or the battery is empty."""
 
-    def __init__(self, witness: Witness, board: list[list[Any]]) -> None:
-        """`board` are the lasting faults of the board, which name the inputs that it reports."""
+    def __init__(self, witness: Witness, reports: bool) -> None:
+        """`reports` says whether the board ever reports an input."""
         self._witness = witness
-        self._reports = any(name in INPUTS for name, *_ in board)
+        self._reports = reports
         config = witness.config
         safety = config.get("safety", {})
         self._places: list[str] = safety.get("bumpers", [])
@@ -302,7 +318,9 @@ class Inputs:
 
     def new_life(self) -> None:
         """Note that a daemon starts: it knows no input."""
-        self.estop, self.bumpers = _Input(), _Input()
+        self.estop, self.bumpers, self.driver = _Input(), _Input(), _Input()
+        self._driver_faulted = False
+        """Whether a line of this step certainly reports a fault of a motor driver."""
         self.battery = _Mean(self._witness.config.get("battery", {}))
         self._mode = ""
         self._looked_ns = self._stepped_ns = 0
@@ -325,6 +343,7 @@ class Inputs:
         """Note that the port was closed, or the daemon ended, before it has read all bytes."""
         if self._came:
             self._doubt()
+            self.driver.sure = False
         self._came.clear()
         self._held = b""
 
@@ -339,7 +358,8 @@ class Inputs:
 
         True time is later by `offset`. At `calm_ns` the last stall of the host was over.
         """
-        self._fresh = self._latches = False
+        self._fresh = self._latches = self._driver_faulted = False
+        self._witness.driver_fault = False
         while self._came and self._came[0][0] <= decided_ns:
             at_ns, data = self._came.popleft()
             *lines, self._held = (self._held + data).split(b"\n")
@@ -373,6 +393,8 @@ class Inputs:
             self._report(self.estop, mark, certain, at_ns, true_ns)
         if b"bumpers" in fields and len(fields[b"bumpers"]) == len(self._places):
             self._report(self.bumpers, fields[b"bumpers"], certain, at_ns, true_ns)
+        if b"driver" in fields:
+            self._driver(fields[b"driver"] == b"fault", certain, true_ns)
         if self._field in fields:
             self.battery.sure &= certain
             self.battery.take(at_ns, float(fields[self._field].rstrip(b"%")))
@@ -398,6 +420,17 @@ class Inputs:
             self._doubt()
         elif any(now > then for now, then in zip(marks, before, strict=True)):
             self._press(known, true_ns, self._away and known is self.bumpers)
+
+    def _driver(self, faulty: bool, certain: bool, true_ns: int) -> None:
+        """Take the report about the motor drivers, which counts until the next one."""
+        driver = self.driver
+        driver.marks, driver.sure = b"X" if faulty else b".", certain
+        if not faulty or not certain:
+            driver.pressed_ns = None
+        elif driver.pressed_ns is None:
+            driver.pressed_ns = true_ns
+        self._witness.driver_fault |= faulty
+        self._driver_faulted |= faulty and certain
 
     def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
         """Take a silence: it counts as a press, at the latest when the host has had time."""
@@ -463,6 +496,7 @@ class Inputs:
             raise BrokenError("a press stops the robot, however short", true_ns, text)
         if self._fresh and moving:
             raise BrokenError("a press is a zero at once", true_ns, str(moving))
+        self._drivers(true_ns, seen)
         self._answers(true_ns, seen, calm)
         for name in self._needed:
             known = self.estop if name == "estop" else self.bumpers
@@ -485,6 +519,24 @@ class Inputs:
         if seen.decided_ns - self._looked_ns > NS:
             self._looked_ns = seen.decided_ns
             self._state(true_ns, state(), seen.decided_ns)
+
+    def _drivers(self, true_ns: int, seen: Seen) -> None:
+        """Judge the fault of a motor driver. A pressed emergency stop causes one that is none."""
+        estop = self.estop
+        free = not estop.marks and not self._fresh
+        free |= estop.known and estop.marks == b"." and not self._fresh
+        pressed = estop.pressed_ns is not None and estop.pressed_ns < self._stepped_ns
+        began = seen.mode == "fault" != self._mode and DRIVER in seen.reason
+        if self._driver_faulted and free:
+            if seen.mode not in ("fault", "shutdown"):
+                text = f"{seen.mode}: {seen.reason}"
+                raise BrokenError("a fault of a motor driver stops the robot", true_ns, text)
+            if began:
+                self._witness.counts["driver fault"] += 1
+                self._ramps(true_ns, "a fault of a motor driver")
+        if began and pressed and self._mode:
+            text = f"the emergency stop is pressed since {estop.pressed_ns} ns"
+            raise BrokenError("drivers without power are no fault", true_ns, text)
 
     def _stopping(self) -> Iterator[tuple[str, int]]:
         """Yield each input that certainly stops the robot, and the true time since when."""
@@ -558,20 +610,20 @@ class Inputs:
         if battery.may["stop"] and seen.mode == "stopped" != self._mode and not witness.stops:
             witness.counts["battery empty"] += 1
             witness.stops.append(true_ns)
-            self._ramps(true_ns)
+            self._ramps(true_ns, "an empty battery")
         self._empty_ns = (self._empty_ns or true_ns) if battery.must["stop"] else None
         if battery.must["stop"] and seen.mode not in STOPPED:
             text = f"{seen.mode}: {seen.reason}, the mean is {battery.mean:.2f}"
             raise BrokenError("an empty battery stops the robot", true_ns, text)
 
-    def _ramps(self, true_ns: int) -> None:
-        """Judge the first line of an empty battery's stop: the robot does not stand at once."""
+    def _ramps(self, true_ns: int, cause: str) -> None:
+        """Judge the first line of a stop by this cause: the robot does not stand at once."""
         witness, (before, before_ns) = self._witness, self._before
         even = witness.last_ns - before_ns < 3 * witness.period_ns
         if witness.last != ZERO or witness.cut or not even:
             return
         if witness.ramp_ns(True, before) > 5 * witness.period_ns + NS // 20:
-            raise BrokenError("an empty battery stops the robot with a ramp", true_ns, str(before))
+            raise BrokenError(f"{cause} stops the robot with a ramp", true_ns, str(before))
 
     def cleared(self, asked_ns: int) -> None:
         """Judge a clear that worked, at the step that has answered it."""
@@ -579,6 +631,10 @@ class Inputs:
             if asked_ns > pressed_ns:
                 text = f"pressed since {pressed_ns / NS:.3f} s"
                 raise BrokenError(f"no clear works while {name} is pressed", asked_ns, text)
+        driver = self.driver
+        if driver.sure and driver.pressed_ns is not None and asked_ns > driver.pressed_ns:
+            text = f"the last report of a fault began at {driver.pressed_ns / NS:.3f} s"
+            raise BrokenError("no clear works while a motor driver has a fault", asked_ns, text)
         if self.battery.sure and self._empty_ns is not None and asked_ns > self._empty_ns:
             text = f"the mean is {self.battery.mean:.2f}"
             raise BrokenError("no clear works while the battery is empty", asked_ns, text)

@@ -30,6 +30,8 @@ class Fault(NamedTuple):
     def kind(self) -> str:
         """The kind of inputs of the plans that are played, "" for all plans."""
         first = self.name.split()[0]
+        if first == "driver":
+            return "driver_fault"
         return first if first in ("estop", "away", "battery") else ""
 
 
@@ -723,6 +725,36 @@ FAULTS = (
         "return Latches(stop, None, inactive, self.lowered)",
     ),
     # inputs of the board
+    fault(
+        "driver ignored",
+        "a fault of a motor driver that the board reports does not stop the robot",
+        ROBOT,
+        "        if not estop.why and any(status.driver_fault for _, status in statuses):\n",
+        "        if not estop.why and estop.pressed_now:\n",
+    ),
+    fault(
+        "driver clear",
+        "a clear works while a motor driver has a fault",
+        ROBOT,
+        "        elif self.session.status.driver_fault:\n",
+        "        elif self.session.status.driver_fault and estop.why:\n",
+    ),
+    fault(
+        "driver without power",
+        "a pressed emergency stop latches a fault of the motor drivers",
+        ROBOT,
+        "        if not estop.why and any(status.driver_fault for _, status in statuses):\n",
+        "        if any(status.driver_fault for _, status in statuses):\n",
+    ),
+    fault(
+        "driver cut",
+        "a fault of a motor driver stops the robot without a ramp",
+        ROBOT,
+        "            self._fault(DRIVER_FAULT, now, events)\n",
+        "            self._fault(DRIVER_FAULT, now, events)\n"
+        "            self._limiter.cut()\n            self._speeds = STILL\n"
+        "            self._made = self._said = (self._limiter.state, self._made_ns)\n",
+    ),
     fault(
         "estop ramp",
         "a robot whose emergency stop is pressed ramps down",

@@ -71,9 +71,12 @@ DIALECTS = {"unpadded", "spaces", "trailing_comma", "no_sample", "no_check"}
 
 INPUTS = {
     "estop", "estop_pressed", "estop_silent", "bumpers", "bumper_pressed", "bumpers_silent",
-    "battery",
+    "battery", "driver_fault",
 }  # fmt: skip
 """Faults of the simulated board that report inputs. They give no trouble to lines and wheels."""
+
+DRIVER = "motor driver"
+"""Words in the reason of a fault that a motor driver has reported."""
 
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
 """Refused messages that may have been speeds of a program that shares its identity, so a zero
@@ -146,6 +149,8 @@ class Witness:
         self.fault_ns: int | None = None
         self.mode_ns = 0
         """Time of the last change of the mode."""
+        self.driver_fault = False
+        """Whether a line that this step has read may report a fault of a motor driver."""
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
         self.lies: list[tuple[str, tuple[Any, ...]]] = []
@@ -421,7 +426,8 @@ class Witness:
             recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
             if "pushed" in recent and self.last == ZERO and self.rested_ns >= self.last_ns:
                 recent.remove("pushed")  # a hand turns wheels that were at rest: never a fault
-            if self.mode and self.fault_ns is None and set(recent) <= HARMLESS:
+            caused = self.driver_fault if DRIVER in reason else not set(recent) <= HARMLESS
+            if self.mode and self.fault_ns is None and not caused:
                 raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
             if self.fault_ns is None:
                 self.fault_ns = at_ns

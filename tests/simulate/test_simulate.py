@@ -197,8 +197,9 @@ class Bench:
         config = PLAIN["config"] | {"safety": safety}
         self.witness = Witness(config)
         self.witness.step(NS // 2, "driving", "driving: commanded by app")
-        self.inputs = Inputs(self.witness, [["estop"], ["bumpers"]])
+        self.inputs = Inputs(self.witness, True)
         self.state: dict[str, Any] = {}
+        self.reason = "a reason"
 
     def step(self, at: float, data: bytes = b"", mode: str = "stopped", *lines: Any) -> None:
         """Have a step read these bytes and send these lines."""
@@ -208,7 +209,7 @@ class Bench:
         if data:
             self.inputs.fed(at_ns, data)
         self.inputs.take(at_ns, 0, -NS)
-        seen = Seen(at_ns, at_ns, mode, "a reason", None, "up", [*lines], ())
+        seen = Seen(at_ns, at_ns, mode, self.reason, None, "up", [*lines], ())
         self.inputs.step(at_ns, seen, 0, True, lambda: self.state)
 
 
@@ -367,11 +368,56 @@ def test_a_clear_is_obeyed_while_a_bumper_is_pressed_that_lets_the_robot_drive_a
         bench.inputs.cleared(2 * NS + 1)
 
 
+GOOD, FAULTY = b"!status driver=ok\r\n", b"!status driver=fault\r\n"
+
+
+@pytest.mark.parametrize(
+    ("before", "data", "mode", "promise"),
+    [
+        (OK, FAULTY, "driving", "a fault of a motor driver stops the robot"),
+        (OK, FAULTY + GOOD, "ready", "a fault of a motor driver stops the robot"),
+        (OK, FAULTY, "fault", ""),
+        (OK, FAULTY + PRESSED, "stopped", ""),
+        (PRESSED, FAULTY, "stopped", ""),
+        (PRESSED, FAULTY, "fault", "drivers without power are no fault"),
+    ],
+)
+def test_a_fault_of_a_motor_driver_stops_the_robot_unless_its_emergency_stop_is_pressed(
+    before: bytes, data: bytes, mode: str, promise: str
+) -> None:
+    bench = Bench()
+    bench.step(1.0, before, "driving" if before is OK else "stopped", RESTS)
+    bench.reason = "the board reports a fault of a motor driver"
+    bench.step(1.05, b"", "driving" if before is OK else "stopped", RESTS)
+    with pytest.raises(BrokenError, match=promise) if promise else nullcontext():
+        bench.step(1.1, data, mode, RESTS)
+
+
+def test_no_clear_works_until_the_board_reports_that_the_motor_drivers_are_in_order() -> None:
+    bench = Bench()
+    bench.step(1.0, FAULTY, "fault", RESTS)
+    bench.inputs.cleared(9 * NS // 10)
+    with pytest.raises(BrokenError, match="no clear works while a motor driver has a fault"):
+        bench.inputs.cleared(11 * NS // 10)
+    bench.step(1.2, GOOD, "fault", RESTS)
+    bench.inputs.cleared(13 * NS // 10)
+
+
+def test_a_fault_of_a_motor_driver_needs_a_line_that_reports_it() -> None:
+    for data in (FAULTY, GOOD):
+        bench = Bench()
+        bench.inputs.fed(NS, data)
+        bench.inputs.take(NS, 0, -NS)
+        expected = pytest.raises(BrokenError, match="no fault without a cause")
+        with expected if data is GOOD else nullcontext():
+            bench.witness.step(NS, "fault", "the board reports a fault of a motor driver")
+
+
 def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> None:
     bench = Bench()
     config = {"measure": "volts", "stop_below": 22.0, "hysteresis": 0.5}
     bench.witness.config = bench.witness.config | {"battery": config}
-    bench.inputs = Inputs(bench.witness, [["battery"]])
+    bench.inputs = Inputs(bench.witness, True)
 
     def report(begin: int, end: int, volts: float, mode: str) -> None:
         for tenth in range(begin, end):
@@ -396,7 +442,7 @@ def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> Non
 def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -> None:
     plans = list(map(made, range(200)))
     with_inputs = [one for one in plans if kinds(one)]
-    for kind in ("estop", "stop", "away", "battery"):
+    for kind in ("estop", "stop", "away", "battery", "driver_fault"):
         assert 4 <= sum(kind in kinds(one) for one in plans) <= 30
     for one in with_inputs:
         assert problems(one["config"]) == []
