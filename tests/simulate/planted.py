@@ -199,7 +199,8 @@ breaks a promise of the sound product does not count. Core-minutes are the proce
 process that plays, on a machine that other work kept busy.
 
 For a fault of the emergency stop, of bumpers that let the robot drive away, of a motor driver, or
-of the battery, only plans with this input are played, about one in fifteen. A fault must be found within {fault:g}
+of the battery, only plans with this input are played, about one in fifteen. A fault must be
+found within {fault:g}
 core-minutes, a case within {case:g}. A row keeps its last measurement. Its last column is the
 version of the simulator that measured it: a digest of the modules that make, play and judge plans.
 With the present plans, another seed may find an older row's fault. `--again` prints the present
