@@ -111,6 +111,7 @@ class Run:
         self._names: set[str] = set()
         """Names of the active faults."""
         self._troubling: list[str] = []
+        self._link = ""
         """Names of the active faults that the plan has begun, without dialects."""
         self._fed_ns = 0
         self._ended = b""
@@ -637,6 +638,10 @@ class Run:
             self.liveness.event()
         self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
+        if seen.link == "up" and self._link not in ("up", "stale"):
+            # Commands that came before the link do not count.
+            witness.disarmed_ns = max(witness.disarmed_ns, true_ns)
+        self._link = seen.link
         witness.linked = seen.link == "up"
         # Lines without the check that the configuration requires make no link.
         self._linked |= witness.linked

@@ -436,7 +436,8 @@ class Inputs:
         """Take a silence: it counts as a press, at the latest when the host has had time."""
         reported_ns, witness = known.reported_ns or 0, self._witness
         latest_ns = max(reported_ns + SILENT_NS, calm_ns + EXCUSE_NS)
-        if decided_ns < latest_ns + 2 * witness.period_ns + MARGIN_NS:
+        early = decided_ns < latest_ns + 2 * witness.period_ns + MARGIN_NS
+        if early or not known.counted_ns:  # an input that never was reported is not silent
             known.silent = "maybe"
             self._doubt()
         elif known.silent != "surely":

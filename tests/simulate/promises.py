@@ -426,7 +426,10 @@ class Witness:
             recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
             if "pushed" in recent and self.last == ZERO and self.rested_ns >= self.last_ns:
                 recent.remove("pushed")  # a hand turns wheels that were at rest: never a fault
-            caused = self.driver_fault if DRIVER in reason else not set(recent) <= HARMLESS
+            # Echoes pass the lines that a stalled adapter holds, and contradict them.
+            caused = not set(recent) <= HARMLESS or {"echo", "stalls"} <= set(recent)
+            if DRIVER in reason:
+                caused = self.driver_fault
             if self.mode and self.fault_ns is None and not caused:
                 raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
             if self.fault_ns is None:

@@ -213,6 +213,19 @@ class Bench:
         self.inputs.step(at_ns, seen, 0, True, lambda: self.state)
 
 
+@pytest.mark.parametrize(
+    ("troubles", "finding"), [({"echo"}, True), ({"stalls"}, True), ({"echo", "stalls"}, False)]
+)
+def test_echoes_that_contradict_the_lines_of_a_stalled_adapter_are_the_cause_of_a_fault(
+    troubles: set[str], finding: bool
+) -> None:
+    witness = Witness(PLAIN["config"])
+    witness.step(NS // 2, "driving", "driving: commanded by app")
+    witness.troubles = dict.fromkeys(troubles, NS)
+    with pytest.raises(BrokenError, match="without a cause") if finding else nullcontext():
+        witness.step(NS, "fault", "impossible feedback: front_right is too fast")
+
+
 def test_a_pressed_input_is_a_stop_until_its_release_and_a_clear_behind_that() -> None:
     bench = Bench(bumpers=["front", "rear"])
     bench.step(1.0, FREE + OK + HIT[:8], "driving", MOVES)
@@ -263,6 +276,14 @@ def test_a_status_line_without_a_check_may_not_end_a_silence(at: float, finding:
     expected = pytest.raises(BrokenError, match="without a cause") if finding else nullcontext()
     with expected:
         bench.step(at, b"", "stopped")
+
+
+def test_an_input_that_perhaps_never_was_reported_is_not_silent() -> None:
+    bench = Bench(bumpers=["front", "rear"])
+    bench.inputs._checked = True
+    bench.step(1.0, FREE, "waiting", RESTS)
+    bench.step(2.0, b"", "waiting", RESTS)
+    bench.inputs.cleared(3 * NS)
 
 
 @pytest.mark.parametrize("silent", [True, False])
