@@ -75,7 +75,7 @@ INPUTS = {
 }  # fmt: skip
 """Faults of the simulated board that report inputs. They give no trouble to lines and wheels."""
 
-DRIVER = "motor driver"
+DRIVER = "reports a fault of a motor driver"
 """Words in the reason of a fault that a motor driver has reported."""
 
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
