@@ -8,6 +8,7 @@ from contextlib import aclosing, asynccontextmanager, closing
 from functools import partial
 from typing import Any
 
+from acsard.client.commander import AGAIN_S
 from acsard.client.driving import UnheardError, drive
 from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
 from acsard.core.messages import schema
@@ -55,7 +56,7 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive as `Client.drive` does. If the drive is cancelled, it sends a zero at once."""
+        """Drive as `Client.drive` does. If it is cancelled, it sends zeros at once."""
         try:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
@@ -63,6 +64,10 @@ class AsyncClient:
         except (UnheardError, NoAnswerError) as error:
             found = await in_thread(partial(self._client.unheard, error), 2 * REPLY_TIMEOUT_S)
             raise found from None
+        except BaseException:
+            await asyncio.sleep(AGAIN_S)
+            self._client.zero_again()
+            raise
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, as `Client.call` does."""

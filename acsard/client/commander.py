@@ -24,6 +24,12 @@ SPACING_S = 0.003
 The daemon accepts 1000 commands per second.
 """
 
+AGAIN_S = 0.02
+"""Pause before a zero is sent a second time, s.
+
+A busy receiver handles several commands in a row, and drops those that seem to come too fast.
+"""
+
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
 """Duration and period of the zeros at the beginning of a drive, s.
 

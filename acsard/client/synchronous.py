@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.client.commander import LONGEST_S, SPACING_S, Sender, no_command
+from acsard.client.commander import AGAIN_S, LONGEST_S, SPACING_S, Sender, no_command
 from acsard.client.driving import UnheardError, drive
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
@@ -197,12 +197,14 @@ class Client:
         several seconds.
         """
         begun_s = time.monotonic()
+        # After the longest timeout a zero would only stop the next sender that drives.
+        moving = [one for one, at_s in self._puts.moving.items() if begun_s - at_s < LONGEST_S]
         try:
-            for client, sent_s in list(self._puts.moving.items()):
-                # After the longest timeout a zero would only stop the next sender that drives.
-                if begun_s - sent_s < LONGEST_S:
+            for pause_s in (AGAIN_S, 0.0) if moving else ():
+                for client in moving:
                     with suppress(zenoh.ZError):  # the program has closed the session itself
                         client.send(0.0)
+                time.sleep(pause_s)
         finally:
             close(self.session)
 
@@ -220,6 +222,15 @@ class Client:
                     time.sleep(pause)
         except (UnheardError, NoAnswerError) as error:
             raise self.unheard(error) from None
+        except BaseException:
+            time.sleep(AGAIN_S)
+            self.zero_again()
+            raise
+
+    def zero_again(self) -> None:
+        """Send a zero a second time, because a busy daemon may have dropped the first one."""
+        with suppress(NoAnswerError):
+            self.send(0.0)
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, such as "stop", with the fields of its payload.

@@ -24,21 +24,28 @@ async def in_thread(
 ) -> T:
     """Return the result of `call`, or raise `TimeoutError` after `timeout` s (None: wait for ever).
 
-    Raises `NoThreadError` at once if no thread can be started. If `call` returns after the caller
-    has stopped waiting, the thread passes the result to `late`, which releases it.
+    Raises `NoThreadError` at once if no thread can be started. If the caller has stopped waiting
+    when the result comes, or stops in the same round of the loop, a thread passes the result to
+    `late`, which releases it.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
     lock = threading.Lock()
     abandoned = False
 
-    def settle(result: T | None, error: BaseException | None) -> None:
+    def settle(result: T, error: BaseException | None) -> None:
         if future.done():
-            return
-        if error is not None:
+            if error is None:
+                release(result)
+        elif error is not None:
             future.set_exception(error)
         else:
-            future.set_result(result)  # type: ignore[arg-type]
+            future.set_result(result)
+
+    def release(result: T) -> None:
+        """Pass a result to `late` in a thread, because `late` may block."""
+        if late is not None:
+            threading.Thread(target=late, args=(result,), daemon=True).start()
 
     def work() -> None:
         result, problem = None, None
@@ -48,7 +55,7 @@ async def in_thread(
             problem = error
         with lock:
             if not abandoned:
-                loop.call_soon_threadsafe(settle, result, problem)
+                loop.call_soon_threadsafe(settle, result, problem)  # type: ignore[arg-type]
                 return
         if problem is None and late is not None:
             late(result)  # type: ignore[arg-type]
@@ -62,6 +69,9 @@ async def in_thread(
         # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):
             return await future
-    finally:
+    except BaseException:
         with lock:
-            abandoned = not future.done() or future.cancelled()
+            abandoned = True
+        if future.done() and not future.cancelled() and future.exception() is None:
+            release(future.result())
+        raise

@@ -119,8 +119,11 @@ def test_the_end_of_a_connection_sends_a_zero_to_each_robot_that_may_still_move(
     sent = len(session.heard)
     robot.end()
     zeros = session.heard[sent:]
-    assert [command.twist for command in zeros] == [REST, REST]
-    assert {command.sender for command in zeros} == {robot.sender, other.sender}
+    assert [command.twist for command in zeros] == [REST] * 4
+    by = [command.sender for command in zeros]
+    # A busy daemon may drop a zero that comes directly behind a command, so each goes out twice.
+    assert by[:2] == by[2:]
+    assert set(by) == {robot.sender, other.sender}
     assert session.closed
 
 
