@@ -660,7 +660,7 @@ class Run:
         self.liveness.look(true_ns)
         self.reasons.look(true_ns, self._stalled_ns)
         if self._plain and not self.echo.on:
-            self.damage.look(true_ns, self._lines)
+            self.damage.look(true_ns, self._lines, self._stalled_ns == true_ns)
         if seen.estimates:
             lies, truth = self._names, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)

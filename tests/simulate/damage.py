@@ -53,9 +53,15 @@ class Damage:
                 self._whole, self._counted, self._short_ns = 0, None, None
         self._held = rest[-MAX_LINE:]
 
-    def look(self, at_ns: int, lines: Callable[[], int]) -> None:
-        """Judge a step. `lines` returns the number of good lines that the daemon has counted."""
-        if self._whole < LOST:
+    def look(self, at_ns: int, lines: Callable[[], int], stalled: bool = False) -> None:
+        """Judge a step.
+
+        `lines` returns the number of good lines that the daemon has counted. A step that `stalled`
+        leaves the lines that came meanwhile to the next step.
+        """
+        if stalled:
+            self._short_ns = None
+        if stalled or self._whole < LOST:
             return
         if self._counted is None:
             self._counted, self._then = lines(), self._whole

@@ -1179,6 +1179,19 @@ def test_whole_lines_that_are_not_heard_behind_a_damaged_one_are_a_finding(
             damage.look(n * NS, lambda n=n: max(0, n - lost))  # type: ignore[misc]
 
 
+@pytest.mark.parametrize("stalled", [True, False])
+def test_a_step_that_stalls_leaves_whole_lines_to_the_next_step(stalled: bool) -> None:
+    damage, whole = Damage(), b"ap00.10,bp00.10,cp00.10,dp00.10\r\n"
+    damage.fed(whole + whole[9:] + 2 * whole)
+    damage.look(NS, lambda: 2)
+    damage.fed(4 * whole)
+    damage.look(2 * NS, lambda: 5, stalled)
+    with nullcontext() if stalled else pytest.raises(BrokenError, match="are heard behind"):
+        damage.look(3 * NS, lambda: 5, stalled)
+    if stalled:
+        damage.look(4 * NS, lambda: 6)
+
+
 SIGNED = made(1)["senders"][0] | {
     "way": "signed", "source": "app", "wheels": False, "delay": 0.0, "churn": False,
     "jitter": 0.0, "congestion": [], "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0,
