@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from acsard.core.config.settings import BatteryConfig, Config, SimConfig
 from acsard.core.messages.schema import Battery, RobotState
 from tests.scenarios.taped import Tape, replayed
@@ -86,6 +88,7 @@ def test_the_battery_key_has_the_battery_about_once_a_second() -> None:
     assert last.percentage == 0.57
 
 
+@pytest.mark.slow
 def test_a_recording_replays_a_battery_that_runs_empty() -> None:
     tape = Tape()
     world = World(DRAINED, recorder=tape)

@@ -49,6 +49,7 @@ class Lines:
         return at_ns - self.pressed_ns, line
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("config", [STOP, Config()], ids=["places", "no places"])
 def test_each_press_stops_the_robot_within_a_period_until_a_clear(
@@ -78,6 +79,7 @@ def test_each_press_stops_the_robot_within_a_period_until_a_clear(
     assert slowest_ns <= world.period_ns
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [5, pytest.param(25, marks=pytest.mark.slow), MOST[1]])
 @pytest.mark.parametrize(("place", "sign"), [*zip(PLACES, (-1, 1, 0, 0), strict=True)])
 def test_a_bumper_that_limits_stands_within_a_period_and_then_lets_it_only_away(

@@ -206,6 +206,7 @@ def forged_files(original: Path, path: Path, forge: Forge, count: int) -> Iterat
         yield path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", FORGERIES)
 @each(
     "forge",

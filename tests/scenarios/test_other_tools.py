@@ -195,6 +195,7 @@ class JoyTeleop(Joystick):
     zero_on_release = False
 
 
+@pytest.mark.variations(4)
 @by_each_road
 @pytest.mark.parametrize("kind", [Joystick, JoyTeleop])
 def test_joystick_drives_after_the_button_was_held_for_a_second_with_the_stick_at_rest(
@@ -422,6 +423,7 @@ class Nav2(Speaker):
             )
 
 
+@pytest.mark.variations(4)
 @by_each_road
 @pytest.mark.parametrize("smoother", [True, False])
 @pytest.mark.parametrize("cancelled_at", [0.1, FAST])
@@ -483,6 +485,7 @@ def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
     drives(world, lambda: nav2.goal(FAST, 1.0))
 
 
+@pytest.mark.variations(2)
 @by_each_road
 def test_the_first_goal_of_nav2_after_a_start_does_not_move_the_robot_and_the_second_one_does(
     world: World, road: Road
@@ -514,6 +517,7 @@ def test_a_nav2_that_was_started_again_must_send_a_zero_by_rmw_and_not_by_the_br
     (drives if moves else stands)(world, lambda: again.goal(FAST, 2.0))
 
 
+@pytest.mark.variations(4)
 @by_each_road
 @pytest.mark.parametrize("smoother", [True, False])
 @pytest.mark.parametrize("later", [0.0, 60.0])

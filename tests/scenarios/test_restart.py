@@ -158,11 +158,13 @@ def cut(data: bytes) -> bytes:
     return data[: random.Random(len(data)).randrange(len(data) - 1)]
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_latched_robot_stands_after_a_restart_until_it_is_released(kind: Kind) -> None:
     stands_until_released(Host(random.Random(1)), kind, whole)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_robot_whose_latch_file_is_cut_stands_until_it_is_cleared(kind: Kind) -> None:
     stands_until_released(Host(random.Random(2)), kind, cut)
@@ -332,6 +334,7 @@ def test_a_stop_while_the_bus_closes_is_there_at_the_next_start() -> None:
     assert host.world.state.mode == "stopped"
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("by", ["put", "call"])
 @pytest.mark.parametrize(
     ("owner", "name", "works"),

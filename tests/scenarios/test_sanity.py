@@ -217,6 +217,7 @@ INTERRUPTIONS = (
 )  # fmt: skip
 
 
+@pytest.mark.variations(7)
 @pytest.mark.parametrize(
     ("lag", "interruption"),
     [

@@ -694,6 +694,7 @@ def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> N
     assert not +found
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("way", SHARED)
 @pytest.mark.parametrize("count", [4, slow(12)])
 def test_another_s_zeros_while_one_that_looks_like_it_is_stalled_do_not_set_that_off(

@@ -476,6 +476,7 @@ def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -
         assert not {"safety", "battery", "estop", "bumper"} & set(re.findall("[a-z]+", text))
 
 
+@pytest.mark.slow
 def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_does() -> None:
     plans = [one for one in map(made, range(100)) if kinds(one) == {"stop"}]
     plan = min(plans, key=lambda one: one["seconds"])
@@ -1011,6 +1012,7 @@ def test_a_stop_that_arrives_in_the_step_that_crashes_is_latched_afterwards(mome
     assert result.counts["clear"] == 1
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("damage", ["cut", "zeros", "version"])
 def test_a_robot_with_a_damaged_latch_file_starts_stopped(damage: str) -> None:
     restart = {"do": "restart", "way": "kill", "damage": damage}
@@ -1019,6 +1021,7 @@ def test_a_robot_with_a_damaged_latch_file_starts_stopped(damage: str) -> None:
     assert result.counts["mode stopped"] == 1
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("fault", [["endless"], ["wrong_baud", 9600], ["partial_line"], ["noise"]])
 def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[Any]) -> None:
     links = Counter[str]()

@@ -196,6 +196,7 @@ class End(NamedTuple):
     spoil: Callable[[Path], None] = whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ends",
     [

@@ -368,6 +368,7 @@ def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> No
     assert "chance errors of the distance after 10 m" in told
 
 
+@pytest.mark.slow
 def test_noise_that_is_right_already_stays(found: Calibration) -> None:
     """The geometry of the log is wrong again, and only it is written."""
     log = log_of_runs(LOG)

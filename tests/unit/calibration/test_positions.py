@@ -113,7 +113,7 @@ def squares(chi: float) -> Plan:
     return [(3, 0, 0), *side * 8, *[(seconds, v, -w) for seconds, v, w in side * 8]]
 
 
-@pytest.mark.variations(6)
+@pytest.mark.slow
 @pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
 @pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
 def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: complex) -> None:

@@ -45,7 +45,7 @@ def finite(bag: Table, name: str) -> int:
     return int(np.isfinite(bag.columns[name]).sum())
 
 
-@pytest.mark.variations(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("speeds", [False, True])
 def test_a_bag_calibrates_as_the_csv_of_the_same_drive_does(speeds: bool) -> None:
     seen = usual()

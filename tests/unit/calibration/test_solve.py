@@ -134,6 +134,7 @@ def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> N
     assert least < ratio < 1.4
 
 
+@pytest.mark.variations(3)
 @so_many
 @each_way
 def test_what_is_said_to_remain_is_what_remains(way: str, count: int) -> None:
@@ -169,7 +170,7 @@ def slow_drives(seed: int, **other: float) -> list[Drive]:
     return [drive(robot, slow_squares(turn=turn)) for turn in (0.3, -0.3) * 2]
 
 
-@pytest.mark.variations(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 6])
 def test_slow_squares_of_a_sound_robot_make_it_no_worse(seed: int) -> None:
     """The errors of the wheels hide the small turns of a short block, so its track is too wide."""
@@ -250,6 +251,7 @@ def test_a_tape_measures_the_wheels_of_a_robot_whose_track_is_right() -> None:
     assert "odometry.left_wheel_radius_multiplier_std" not in given
 
 
+@pytest.mark.slow
 def test_a_tape_measures_the_wheels_if_positions_are_too_coarse_to_improve_them() -> None:
     robot = Robot(place_noise=0.2, rng=np.random.default_rng(1))
     seen, ahead = drive(robot, GUIDED), drive(robot, [(2, 0, 0), (8, 0.3, 0), (2, 0, 0)])
@@ -278,6 +280,7 @@ def test_bias_and_time_offset_are_reported(count: int) -> None:
         assert c.delays["yaw_rate"] == pytest.approx(0.02, abs=0.012)
 
 
+@pytest.mark.slow
 def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
     """A gyro bias looks like a curve to one side that is equal in every block."""
     z = []

@@ -56,7 +56,7 @@ MOMENTS = [
 DIALECTS = pytest.mark.parametrize("faults", [(), ("no_sample",), ("plain_only",)], ids=str)
 
 
-@pytest.mark.variations(3)
+@pytest.mark.slow
 @DIALECTS
 @pytest.mark.parametrize(("at_s", "when"), MOMENTS)
 def test_a_board_that_starts_anew_fails_by_that_and_all_else_is_found_as_before(

@@ -161,6 +161,7 @@ def of_bag(where: Path, log: Path, *words: str) -> int:
     return int(args.main(args))
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("form", ["directory", "file"])
 def test_a_bag_that_another_library_wrote_is_read(
     form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -185,6 +186,7 @@ def test_the_options_of_a_bag_choose_its_sensor(
         of_bag(tmp_path, log, "--topic", "/imu")
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(
     compression: CompressionType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -253,7 +255,7 @@ def converted(name: str, where: Path, *words: str) -> str:
     return (where / "drive.csv").read_text()
 
 
-@pytest.mark.variations(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("sqlite", [False, True])
 def test_the_page_s_converter_makes_a_log_of_a_bag(
     sqlite: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -62,6 +62,7 @@ def recording(where: Path, *words: str) -> tuple[int, str, str]:
     return told.code, told.out, told.err
 
 
+@pytest.mark.slow
 def test_a_time_is_found_in_every_file_of_the_ring(ring: Ring) -> None:
     where, names, stops = ring
     for number, stop in enumerate(stops):

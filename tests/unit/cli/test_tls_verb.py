@@ -417,6 +417,7 @@ def locked() -> Iterator[Path]:
         directory.chmod(0o755)
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("below", [".", "tls"])
 @pytest.mark.parametrize("words", [["init"], ["add", "anna", "--role", "viewer"]], ids=str)
 def test_without_permission_it_ends_with_77_and_says_how_to_get_it(

@@ -147,6 +147,7 @@ def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
     return share(budget(Received(made, [], gyro=True), CONFIG), "gyro")
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("before", [-10, 10])
 def test_what_a_gyro_costs_a_turn_does_not_depend_on_what_was_turned_before(before: int) -> None:
     found, fresh = (with_a_gyro(driven().lines, turns) for turns in (before, 0.0))

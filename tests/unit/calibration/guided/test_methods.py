@@ -45,6 +45,7 @@ def robots(way: str, count: int) -> list[tuple[Robot, Calibration, Player, Drive
     return made
 
 
+@pytest.mark.variations(5)
 @so_many
 @each_way
 def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> None:
@@ -132,6 +133,7 @@ def talk(way: str) -> Talk:
     return talk
 
 
+@pytest.mark.variations(5)
 @each_way
 def test_a_person_reads_what_is_needed_and_how_long_each_leg_takes(way: str) -> None:
     first, *legs = talk(way).shown
