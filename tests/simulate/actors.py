@@ -631,6 +631,7 @@ class Run:
             clock = self.reports.follows(true_ns, seen.followed_ns)
             if clock:
                 witness.ages.clocks[clock].followed = True
+        witness.away = self.inputs.limiting
         if self.inputs.limiting:
             # Any command may disarm all senders, and the robot follows only a part of it.
             witness.disarmed_ns = max(witness.disarmed_ns, true_ns)

@@ -219,6 +219,8 @@ class Liveness:
         if not product.alive:
             run.run_to(max(at for at, _, _ in run.todo) if run.todo else end_ns)
         run.run_to(run.true_ns + NS // 2)
+        # Messages that came while a step stalled wait for the next step.
+        run.run_to(run.true_ns + NS // 10)
         if not product.plugged:
             run.plug(False)
         product.disk.fill(False)

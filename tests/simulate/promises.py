@@ -149,6 +149,8 @@ class Witness:
         self.fault_ns: int | None = None
         self.mode_ns = 0
         """Time of the last change of the mode."""
+        self.away = False
+        """Whether a bumper may be pressed that lets the robot only drive away."""
         self.driver_fault = False
         """Whether a line that this step has read may report a fault of a motor driver."""
         self.troubles: dict[str, int] = {}
@@ -197,6 +199,8 @@ class Witness:
     def new_life(self, at_ns: int) -> None:
         """Note that the daemon started."""
         self.born_ns = at_ns
+        if self.blocked_ns is not None:
+            self.blocked_ns = at_ns  # this daemon has not yet had the time to find that out
         self.unfaulted_ns = -LOOK_NS
         """When a clear last released a fault and left the stop."""
         self.timeout = dict(self.file_timeout)
@@ -810,6 +814,8 @@ class Witness:
     def _leads(self, wish: Wish, wheels: tuple[float, ...], before: tuple[float, ...]) -> bool:
         """Return whether the way from `before` to `wheels` leads towards the wish."""
         goal_v, goal_w = self.clamped(wish.v, wish.w)
+        if self.away:
+            goal_v, _ = self.clamped(wish.v, 0.0)  # away from a bumper the robot does not turn
         for new, old, goal, room in zip(
             self.twist(wheels),
             self.twist(before),

@@ -48,7 +48,10 @@ class Spread:
         # Slow motors, odd radii, and few counts or short periods look like slip, which widens it.
         usual = SHORTEST_NS <= witness.period_ns < LONGEST_NS
         counts = config.get("sim", {}).get("encoder_counts")
-        coarse = counts == 96 and not config["mcu"].get("encoder_counts")
+        told = config["mcu"].get("encoder_counts")
+        coarse = counts == 96 and not told
+        self._rough = counts == 400 and not told
+        """Whether lines that follow each other sooner than `SHORTEST_NS` look like slip."""
         self._judged = not config.get("odometry") and usual and not coarse
         self._track = 2 * witness.half
         every_s = max(witness.period_ns / NS, config["mcu"].get("reply_period", 0.0))
@@ -70,6 +73,8 @@ class Spread:
         if not faults <= DIALECTS:
             self._calm_ns = now_ns + CALM_NS
         last, self._last = self._last, estimate
+        if self._rough and last is not None and estimate[0] - last[0] < SHORTEST_NS:
+            self._calm_ns = now_ns + CALM_NS
         _, x, y, yaw, (xx, _, _, yy, _, yawyaw), _ = estimate
         if last is None or now_ns < self._calm_ns or estimate[0] - last[0] > self._longest_ns:
             self._place, self._yaw = math.sqrt(xx + yy), math.sqrt(yawyaw)

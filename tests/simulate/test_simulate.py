@@ -38,7 +38,7 @@ from tests.simulate.plan import KINDS, Plan, _rare_events, made
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, Product, Seen, problems
-from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.promises import ZERO, BrokenError, Witness
 from tests.simulate.reasons import Reasons, kind_of
 from tests.simulate.reports import Reports, judge_pose
 from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
@@ -856,6 +856,39 @@ def test_a_covariance_that_no_motion_explains_is_a_finding(factor: float, findin
             place, yaw = factor * 1e-4 * x, factor * 1e-4 * x
             covariance = (place, 0.0, 0.0, place + yaw * x * x / 3, 0.0, yaw)
             spread.see(2 * NS, (n * NS // 100, x, 0.0, 0.0, covariance, ()), set())
+
+
+@pytest.mark.parametrize(("counts", "finding"), [(400, False), (3200, True)])
+def test_lines_in_quick_succession_from_coarse_encoders_look_like_slip(
+    counts: int, finding: bool
+) -> None:
+    spread = Spread(Witness(PLAIN["config"] | {"sim": {"encoder_counts": counts}}))
+    with pytest.raises(BrokenError, match="grows by motion only") if finding else nullcontext():
+        for n in range(1000):
+            x = 0.0025 * n
+            covariance = (1e-2 * x, 0.0, 0.0, 1e-2 * x, 0.0, 1e-2 * x)
+            spread.see(2 * NS, (n * NS // 200, x, 0.0, 0.0, covariance, ()), set())
+
+
+def test_a_new_daemon_has_its_own_time_to_find_its_output_blocked() -> None:
+    witness = Witness(PLAIN["config"])
+    witness.blocked_ns = NS
+    witness.new_life(5 * NS)
+    witness.step(51 * NS // 10, "driving", "driving: commanded by app", 5 * NS)
+    with pytest.raises(BrokenError, match="a blocked board is not driven"):
+        witness.step(56 * NS // 10, "driving", "driving: commanded by app", 55 * NS // 10)
+
+
+@pytest.mark.parametrize("away", [True, False])
+def test_away_from_a_bumper_a_robot_that_may_not_turn_goes_as_fast_as_it_is_asked(
+    away: bool,
+) -> None:
+    witness = witnessed()
+    witness.away = away
+    fast = witness.limits["angular_speed"]
+    wish = SimpleNamespace(v=-0.1, w=10.0 * fast)
+    wheels = (-0.1 / witness.radius,) * 4
+    assert witness._leads(wish, wheels, ZERO) == away  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
