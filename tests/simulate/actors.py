@@ -470,6 +470,7 @@ class Run:
             if self.witness.blocked_ns is not None:
                 self.witness.blocked_ns = self.true_ns  # The new port has taken no line either.
             self.damage.forget()
+            self.echo.restart()
             self._disarmed(self.true_ns)
             self._linked = False
 
@@ -528,6 +529,7 @@ class Run:
             self.log_lines = LogLines()
             self.spread.forget()
             self.inputs.new_life()
+            self.echo.restart()
             self.pose.latest = None
             self.damage.forget()
             self.reasons.restart()

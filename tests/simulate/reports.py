@@ -135,6 +135,10 @@ class Echo:
     def begin(self) -> None:
         """Note that from now on the daemon hears itself."""
         self.on = True
+        self.restart()
+
+    def restart(self) -> None:
+        """Note that the daemon, or the opening of its port, begins anew."""
         self._lines, self._change, self._last = 0, 0.0, ()
 
     def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:

@@ -40,7 +40,7 @@ from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, Product, Seen, problems
 from tests.simulate.promises import ZERO, BrokenError, Witness
 from tests.simulate.reasons import Reasons, kind_of
-from tests.simulate.reports import Reports, judge_pose
+from tests.simulate.reports import Echo, Reports, judge_pose
 from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
 from tests.simulate.spread import Spread
 from tests.simulate.unjudged import Unjudged
@@ -868,6 +868,17 @@ def test_lines_in_quick_succession_from_coarse_encoders_look_like_slip(
             x = 0.0025 * n
             covariance = (1e-2 * x, 0.0, 0.0, 1e-2 * x, 0.0, 1e-2 * x)
             spread.see(2 * NS, (n * NS // 200, x, 0.0, 0.0, covariance, ()), set())
+
+
+@pytest.mark.parametrize("restarts", [True, False])
+def test_a_new_daemon_learns_anew_that_it_hears_itself(restarts: bool) -> None:
+    echo = Echo()
+    echo.begin()
+    with nullcontext() if restarts else pytest.raises(BrokenError, match="an echo is no board"):
+        for n in range(1, 60):
+            if restarts and n == 30:
+                echo.restart()
+            echo.line(n * NS, (0.2 * n,) * 4)
 
 
 def test_a_new_daemon_has_its_own_time_to_find_its_output_blocked() -> None:
