@@ -6,6 +6,10 @@
 #define CONTACTS_MS 100
 #define VALUES_MS 1000
 
+/* A fault of a driver is reported so soon after its begin, also if it is over by then. A press that cuts
+ * the drivers' supply has this time to become known first. */
+#define FAULT_MS 100
+
 #define ESTOP_BIT (ESTOP_INPUT ? 0x01 : 0)
 #define BUMPER_BITS (((1 << (BUMPER_INPUTS)) - 1) << 1)
 #define DRIVER_BIT (DRIVER_INPUT ? 0x20 : 0)
@@ -38,6 +42,8 @@ void status_contacts(struct status *status, uint8_t levels)
             if (contact->pressed < PRESS_SAMPLES && ++contact->pressed == PRESS_SAMPLES) {
                 status->known |= bit;
                 status->pressed |= bit;
+                if (bit == DRIVER_BIT && !status->fault_ms)
+                    status->fault_ms = 1;
             }
         } else if (contact->free < FREE_SAMPLES && ++contact->free == FREE_SAMPLES) {
             status->known |= bit;
@@ -45,6 +51,8 @@ void status_contacts(struct status *status, uint8_t levels)
             contact->pressed = 0;
         }
     }
+    if (DRIVER_INPUT && status->fault_ms && status->fault_ms < FAULT_MS)
+        status->fault_ms++;
 }
 
 void status_reading(struct status *status, uint8_t analog, uint16_t value)
@@ -108,8 +116,12 @@ static char *put_contacts(char *at, uint8_t pressed)
 
 static char *put_values(char *at, struct status *status)
 {
-    if (DRIVER_INPUT)
-        at = put_text(at, status->pressed & DRIVER_BIT ? " driver=fault" : " driver=ok");
+    if (DRIVER_INPUT) {
+        bool fault = status->fault_ms || status->pressed & DRIVER_BIT;
+
+        at = put_text(at, fault ? " driver=fault" : " driver=ok");
+        status->fault_ms = 0;
+    }
     if (BATTERY_TOP_OHM)
         at = put_hundredths(put_text(at, " volts="), mean_mv(status, 0) * VOLTS_PER_MV, 9999);
     if (CURRENT_UV_PER_A)
@@ -122,10 +134,12 @@ uint8_t status_line(struct status *status, uint32_t now_ms, char *out)
 {
     char *at = put_text(out, "!status");
     bool changed = contacts_changed(status);
+    bool values = HAS_VALUES && (now_ms - status->values_ms >= VALUES_MS ||
+                                 (DRIVER_INPUT && status->fault_ms == FAULT_MS));
 
     /* A change is first, so that a press is known before the fault of a driver that lost its supply.
      * Else the values are: on a wire that replies fill, the contacts would leave them no room. */
-    if (!changed && HAS_VALUES && now_ms - status->values_ms >= VALUES_MS) {
+    if (!changed && values) {
         status->values_ms = now_ms;
         at = put_values(at, status);
     } else if (changed || (status->sent >= 0 && now_ms - status->contacts_ms >= CONTACTS_MS)) {

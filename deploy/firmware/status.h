@@ -1,7 +1,8 @@
 /* The inputs of the board, and the status lines that report them beside the replies. Pure logic.
  *
  * Two kinds of line share the wire: the emergency stop and the bumpers ten times a second, and at once
- * when one changes; the drivers' fault and the measured values once a second.
+ * when one changes; the drivers' fault and the measured values once a second, and soon after a fault
+ * has begun.
  */
 #ifndef STATUS_H
 #define STATUS_H
@@ -32,6 +33,7 @@ struct status {
     } analogs[ANALOGS];
     uint32_t contacts_ms, values_ms; /* when each line was sent last */
     int16_t sent;                    /* the emergency stop and the bumpers in the last one; -1: none yet */
+    uint8_t fault_ms;                /* since a fault of a driver began that no line has reported; 0: none */
 };
 
 /* Sets the state after boot: the inputs are unknown. */

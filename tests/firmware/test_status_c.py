@@ -194,6 +194,31 @@ def test_bumpers_open_or_close_when_pressed(
     assert not inputs.stopped
 
 
+@pytest.mark.parametrize("length_ms", [3, 40, 500])
+def test_a_driver_s_fault_is_reported_soon_however_short_it_is(
+    build: Build, length_ms: int
+) -> None:
+    inputs = build("-DDRIVER_INPUT=1")
+    inputs.boot()
+    inputs.lines(CLOSED, 1200)
+    begun = inputs.milliseconds
+    while (told := inputs.sample(0 if inputs.milliseconds < begun + length_ms else CLOSED)) is None:
+        pass
+    assert told.driver_fault
+    assert inputs.milliseconds - begun <= 110
+    assert [one.driver_fault for one in inputs.lines(CLOSED, 1000)] == [False]
+
+
+def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply_a_little_earlier(
+    inputs: Inputs,
+) -> None:
+    inputs.boot()
+    inputs.lines(CLOSED, 1200, (600, 512))
+    told = inputs.lines(0, 50, (600, 512)) + inputs.lines(1, 100, (600, 512))
+    pressed = next(i for i, one in enumerate(told) if one.estop)
+    assert [i for i, one in enumerate(told) if one.driver_fault] > [pressed]
+
+
 @pytest.mark.parametrize("high", [0, 1])
 def test_a_driver_s_fault_is_low_or_high(build: Build, high: int) -> None:
     inputs = build("-DDRIVER_INPUT=1", f"-DDRIVER_FAULT_HIGH={high}")
