@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from copy import copy
 from datetime import UTC, datetime
+from functools import cache
 from typing import NamedTuple
 
 import pytest
@@ -638,6 +639,7 @@ class Edge(NamedTuple):
     mode: Mode
 
 
+@cache
 def explore() -> list[Edge]:
     """Return every edge of the machine: each trigger, soon and late, in each reachable state."""
     edges: list[Edge] = []
@@ -668,18 +670,15 @@ def explore() -> list[Edge]:
     return edges
 
 
-EDGES = explore()
-
-
 def test_every_combination_of_facts_and_latches_is_reached() -> None:
-    states = {edge.before for edge in EDGES}
+    states = {edge.before for edge in explore()}
     # A pressed emergency stop is always latched.
     assert len(states) == 2**6 * 3
-    assert len({(e.before, e.trigger, e.pause_s) for e in EDGES}) == 2**6 * 3 * len(TRIGGERS) * 2
+    assert len({(e.before, e.trigger, e.pause_s) for e in explore()}) == 2**6 * 3 * len(TRIGGERS) * 2
 
 
 def test_the_mode_always_follows_from_the_list() -> None:
-    for edge in EDGES:
+    for edge in explore():
         *held, inactive, linked, commanded, dormant, _ = edge.after
         shutting_down, fault, stopped = held
         assert edge.mode is mode_of(
@@ -691,7 +690,7 @@ def test_the_mode_always_follows_from_the_list() -> None:
 def test_nothing_but_clear_releases_a_stop_or_a_fault() -> None:
     releases = {
         edge.trigger
-        for edge in EDGES
+        for edge in explore()
         if edge.before.stopped > edge.after.stopped or edge.before.fault > edge.after.fault
     }
     assert releases == {"clear by number", "clear without a number"}
@@ -699,7 +698,7 @@ def test_nothing_but_clear_releases_a_stop_or_a_fault() -> None:
 
 def test_clear_releases_exactly_one_latch_and_the_fault_first() -> None:
     cleared = 0
-    for edge in EDGES:
+    for edge in explore():
         if not edge.trigger.startswith("clear") or edge.refused:
             continue
         before, after = edge.before, edge.after
@@ -717,13 +716,13 @@ def test_clear_releases_exactly_one_latch_and_the_fault_first() -> None:
 def test_a_clear_by_the_current_number_succeeds_unless_the_daemon_goes_down_or_it_is_pressed() -> (
     None
 ):
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger == "clear by number":
             assert edge.refused == (edge.before.shutting_down or edge.before.pressed)
 
 
 def test_nothing_releases_a_latch_while_the_emergency_stop_is_pressed() -> None:
-    pressed = [edge for edge in EDGES if edge.before.pressed]
+    pressed = [edge for edge in explore() if edge.before.pressed]
     assert len(pressed) > 1000
     for edge in pressed:
         assert edge.after.stopped
@@ -732,13 +731,13 @@ def test_nothing_releases_a_latch_while_the_emergency_stop_is_pressed() -> None:
 
 
 def test_a_released_emergency_stop_stays_a_latched_stop() -> None:
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger == "release":
             assert edge.after == edge.before._replace(pressed=False)
 
 
 def test_a_press_always_ends_in_a_latched_stop_with_a_new_number() -> None:
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger == "press":
             assert edge.after == edge.before._replace(stopped=True, pressed=True)
             (before, after) = (latches.stop for latches in edge.latches)
@@ -748,7 +747,7 @@ def test_a_press_always_ends_in_a_latched_stop_with_a_new_number() -> None:
 
 def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -> None:
     wrong = {"clear by the number before", "clear by a later number", "clear from before"}
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger in wrong:
             assert edge.before == edge.after
             held = edge.before.fault or edge.before.stopped or edge.before.shutting_down
@@ -756,7 +755,7 @@ def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -
 
 
 def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger == "clear without a number" and edge.pause_s > LOOK_FIRST_S:
             assert edge.refused == (edge.before.shutting_down or edge.before.pressed)
 
@@ -764,14 +763,14 @@ def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
 def test_nothing_but_activate_ends_inactive() -> None:
     ends = {
         edge.trigger
-        for edge in EDGES
+        for edge in explore()
         if edge.before.inactive > edge.after.inactive or edge.before.dormant > edge.after.dormant
     }
     assert ends == {"activate by number", "activate without a number"}
 
 
 def test_an_activate_that_names_another_latch_or_came_before_it_switches_nothing_on() -> None:
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger in ("activate by the number before", "activate from before"):
             assert edge.before == edge.after
 
@@ -779,26 +778,26 @@ def test_an_activate_that_names_another_latch_or_came_before_it_switches_nothing
 def test_a_plain_activate_is_refused_until_two_seconds_after_a_deactivate() -> None:
     soon = {
         edge.refused
-        for edge in EDGES
+        for edge in explore()
         if edge.trigger == "activate without a number" and edge.mode is Mode.INACTIVE
     }
     assert soon == {True}
 
 
 def test_a_refused_request_changes_nothing() -> None:
-    for edge in EDGES:
+    for edge in explore():
         if edge.refused:
             assert edge.latches[0] is edge.latches[1]
             assert edge.before == edge.after
 
 
 def test_a_fact_and_a_stop_are_never_refused() -> None:
-    refused = {edge.trigger for edge in EDGES if edge.refused}
+    refused = {edge.trigger for edge in explore() if edge.refused}
     assert not refused & {*FACTS, "stop", "the last stop again"}
 
 
 def test_a_stop_always_ends_in_a_latched_stop() -> None:
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger == "stop":
             assert edge.after.stopped
             (before, after) = (latches.stop for latches in edge.latches)
@@ -807,17 +806,17 @@ def test_a_stop_always_ends_in_a_latched_stop() -> None:
 
 
 def test_the_shutdown_is_for_good() -> None:
-    assert all(edge.after.shutting_down for edge in EDGES if edge.before.shutting_down)
+    assert all(edge.after.shutting_down for edge in explore() if edge.before.shutting_down)
 
 
 def test_latches_stay_the_same_object_until_one_changes() -> None:
-    for edge in EDGES:
+    for edge in explore():
         before, after = edge.latches
         assert (before is after) == (before == after)
 
 
 def test_switching_off_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> None:
-    for edge in EDGES:
+    for edge in explore():
         if edge.trigger == "deactivate":
             before = edge.before
             assert edge.refused == (before.shutting_down or before.fault or before.stopped)
@@ -827,7 +826,7 @@ def test_switching_off_is_refused_exactly_while_a_latch_holds_or_the_daemon_leav
 def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> (
     None
 ):
-    for edge in EDGES:
+    for edge in explore():
         late = edge.trigger == "activate without a number" and edge.pause_s > LOOK_FIRST_S
         if edge.trigger == "activate by number" or late:
             before = edge.before
