@@ -34,6 +34,10 @@ VAGUE = 0.05
 """Variance, m2, from which on a gap may be lost in it: the variance of a robot whose heading is
 nearly unknown also falls."""
 
+FRESH_NS = NS // 50
+"""Age of a sample up to which the present pose stands for that at the sample. Behind a gap nothing
+is known in between."""
+
 SIGMAS = 6.0
 COARSE_COUNTS = 6
 """Counts by which encoders of 96 counts may be off if the configuration does not tell the counts:
@@ -144,7 +148,7 @@ class PoseWitness:
             self.doubt(silent_only)
         before = self._before
         if before is not None and silent_only:
-            self._gap(now_ns, before, estimates[0], offset_ns, (x, y, yaw))
+            self._gap(now_ns, before, estimates[0], offset_ns, at_ns, (x, y, yaw))
         for sampled_ns, ex, ey, eyaw, covariance, _ in estimates:
             # A sum is finite only if each of its numbers is.
             if not math.isfinite(ex + ey + eyaw + sum(covariance)):
@@ -226,6 +230,7 @@ class PoseWitness:
         before: tuple[int, Pose, Pose, float, float],
         estimate: Any,
         offset_ns: int,
+        true_ns: int,
         true: Pose,
     ) -> None:
         """Judge the first estimate after a gap: its covariance grew by the motion in the gap."""
@@ -234,10 +239,11 @@ class PoseWitness:
         if sampled_ns + offset_ns - then_ns < GAP_NS or speed < MOVES:
             return
         # A step that stands still reads older samples than its own time.
-        at_sample = self._true_at(sampled_ns + offset_ns)
-        if at_sample is None:
-            return
-        true = at_sample
+        if true_ns - sampled_ns > FRESH_NS:
+            at_sample = self._true_at(sampled_ns + offset_ns)
+            if at_sample is None:
+                return
+            true = at_sample
         if variance > VAGUE:
             variance = 0.0
         x, y, _ = _through((true_then, pose), true)

@@ -143,7 +143,9 @@ class CountRecovery:
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:
             if line.turned is None and own > 0.0:
-                counted = self._whole.turned(speeds, own)
+                counted = self._whole.turned(speeds, own, line.bridged)
+                if self._whole.covers_gap:
+                    line = replace(line, bridged=0.0)
             else:
                 self._whole.pause()
         elif own > 0.0 and self._coarseness.add(speeds, own):

@@ -16,6 +16,11 @@ With fine encoders, the host's time is too inaccurate to find n. Then the angle 
 speed times the host's time. That time includes the time carried from earlier lines, so no time is
 lost or counted twice.
 
+If the line before is missing, it is unknown whether the reply was lost, so that T covers the time
+since that reply, or the command, so that T covers the whole time since the last good line. If the
+speeds are whole counts in the longer time, and not in the shorter one, the command was lost. A line
+that shows neither is treated like most of the others, if only one line is missing.
+
 Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
 whole counts. The module detects this because the counts of the other wheels are not whole. The
 caller then uses speed times time.
@@ -42,7 +47,8 @@ Above it, a fit proves nothing.
 EXACT = 0.3
 """Largest accepted difference, in counts, between n and the host's time, if a fit proves nothing.
 
-This is the case with fine encoders.
+This is the case with fine encoders. The limit also decides whether a line covers the time of a
+missing one.
 """
 
 WIDE, WIDE_S = 0.6, 0.005
@@ -93,6 +99,10 @@ class WholeCounts:
         self._run = 0
         """Number of lines with recovered counts since the last line without them."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
+        self.covers_gap = False
+        """Whether the last line covers the time of the missing line before it."""
+        self._cover = 0.0
+        """Filtered share of such lines, of those that show whether they cover it."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines that are not whole counts. `_unsure` is the
         filtered error of the host's time, in counts."""
@@ -106,7 +116,7 @@ class WholeCounts:
         """Whether the firmware reports whole counts, as far as its lines show."""
         return self.angle > 0.0 and self._doubt < DOUBTFUL
 
-    def turned(self, speeds: Motors, own: float) -> Motors | None:
+    def turned(self, speeds: Motors, own: float, gap: float = 0.0) -> Motors | None:
         """Return the angle by which each wheel turned since the previous line, rad.
 
         Return None if the firmware does not report whole counts, or if all speeds are too low.
@@ -114,7 +124,9 @@ class WholeCounts:
         Args:
             speeds: The speeds in the line, rad/s.
             own: The host's estimate of the time since the previous line, s.
+            gap: The time before that since the last good line, s, if the previous line is missing.
         """
+        self.covers_gap = False
         before, self._before = self._before, speeds
         a, b, c, d = speeds
         fastest = max(a, b, c, d, -a, -b, -c, -d)
@@ -124,6 +136,16 @@ class WholeCounts:
             return speeds if fastest == 0.0 else None
         want = own + self._apart
         number, shown = self._number(speeds, fastest, want)
+        if gap:
+            longer, proved = self._number(speeds, fastest, want + gap)
+            fits = self._fits(number, fastest, want), self._fits(longer, fastest, want + gap)
+            if (proved and fits == (False, True)) or (shown and fits == (True, False)):
+                self._cover += GAIN * (fits[1] - self._cover)
+                self.covers_gap = fits[1]
+            else:
+                self.covers_gap = self._cover > 0.5 and gap < 1.5 * own
+            if self.covers_gap:
+                number, shown, want = longer, proved, want + gap
         period = number * self.angle / fastest
         if (
             speeds == before
@@ -141,6 +163,7 @@ class WholeCounts:
             self._doubt += GAIN * ((not shown) - self._doubt)
         if not self.believed:
             self.pause()
+            self.covers_gap = False
             return None
         if number and shown is None:
             off = abs(want - period) * fastest / self.angle
@@ -164,6 +187,10 @@ class WholeCounts:
             round(c * count) * size,
             round(d * count) * size,
         )
+
+    def _fits(self, number: int, fastest: float, want: float) -> bool:
+        """Return whether the host's time `want`, s, is that of `number` counts."""
+        return abs(number - want * fastest / self.angle) <= EXACT
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
         """Return n, the counts of the fastest wheel, or 0 if the line does not show n.
