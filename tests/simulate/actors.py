@@ -364,7 +364,7 @@ class Run:
                 if name == "echo":
                     self.echo.begin()
                 elif name == "mute":
-                    self.at(self.true_ns + NS // 2, self._look)
+                    self.at(self.true_ns + NS // 2 + 2 * self.witness.period_ns, self._look)
                 self.at(after_ns, lambda: self._mended(fault))
             case "reset":
                 product.reset(int(event["deaf"] * NS))
@@ -416,7 +416,7 @@ class Run:
         if self.echo.on or not product.alive:
             return
         if self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
-            state, quiet_ns = product.state(), self.witness.quiet_ns
+            state, quiet_ns = product.state(), self.witness.quiet_ns + self.witness.period_ns
             judge_state(self.true_ns, state, self._fed_ns, quiet_ns)
             if self.pose.latest is not None and not self._calls:
                 judge_pose(self.true_ns, state, self.pose.latest, self._fed_ns, quiet_ns)

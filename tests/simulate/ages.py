@@ -23,6 +23,9 @@ EARLY_NS = 60_000_000
 BURST_NS = 1_000_000
 """Messages within this time count as one, with the lowest of their delays."""
 
+STAYS_NS = 4_000_000_000
+"""Time after which the daemon surely knows lower delays of a foreign clock."""
+
 REMEMBERED = 1000
 """Number of new names after which a sender that paused is new. The robot remembers 1024 clocks."""
 
@@ -54,6 +57,8 @@ class Clock:
 
     def __init__(self) -> None:
         self.least_ns: int | None = None
+        self.lower: tuple[int, int] | None = None
+        """Since when all delays of a foreign clock are lower than that, and the lowest of them."""
         self.recent: deque[tuple[int, int]] = deque()
         self.stamp_ns = 0
         self.constant = False
@@ -65,6 +70,22 @@ class Clock:
         self.loose = False
         """It was adjusted, or its sender paused or stamps falsely. The pages promise nothing about
         the age of its commands."""
+
+    def learn(self, age: int, arrived_ns: int, foreign: bool) -> None:
+        """Take note of a delay.
+
+        A foreign clock that the daemon knows may have been set, so the daemon believes lower delays
+        only when they have stayed.
+        """
+        least, lower = self.least_ns, self.lower
+        known = foreign and (self.followed or self.constant)
+        if least is None or not known or age >= least - EARLY_NS:
+            self.least_ns, self.lower = age if least is None else min(least, age), None
+            return
+        since_ns, lowest = lower or (arrived_ns, age)
+        self.lower = since_ns, min(lowest, age)
+        if arrived_ns - since_ns > STAYS_NS:
+            self.least_ns, self.lower = self.lower[1], None
 
 
 class Ages:
@@ -110,7 +131,7 @@ class Ages:
             # The proof begins again, and the pages promise no more.
             clock.least_ns, clock.constant = None, False
         least = clock.least_ns
-        clock.least_ns = age if least is None else min(least, age)
+        clock.learn(age, arrived_ns, foreign)
         while recent and recent[0][0] < arrived_ns - 3 * NS:
             recent.popleft()
         prompt: int = int(sender["delay"] * NS)

@@ -183,8 +183,12 @@ class Liveness:
     def _stays_armed(self, now_ns: int) -> None:
         """A sender that the robot has followed is armed until an event asks it for a zero."""
         run = self.run
-        sender = run.followed.sender
-        if sender is not None and self._sole_senders.get(sender["source"]) == sender["name"]:
+        sender, moves = run.followed.sender, run.witness.mode in ("ready", "driving")
+        if (
+            sender is not None
+            and moves
+            and self._sole_senders.get(sender["source"]) == sender["name"]
+        ):
             self._followed_ns[sender["source"]] = now_ns
         witness = run.witness
         if witness.mode != "ready" or "must send a zero" not in witness.reason or witness.pending:

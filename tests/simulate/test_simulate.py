@@ -742,6 +742,30 @@ def test_a_delay_that_falls_is_a_backlog_unless_the_robot_knew_it_before(known: 
     assert not fresh(10_001, 550)
 
 
+@pytest.mark.parametrize(("lower_s", "obeyed"), [(0.5, True), (6.0, False)])
+def test_the_robot_knows_a_lower_delay_of_a_foreign_clock_only_when_it_has_stayed(
+    lower_s: float, obeyed: bool
+) -> None:
+    """Seed 2009000117: a hole in the network closed for a moment, and another one followed."""
+    ages, sender = Ages(0), {"way": "zenoh", "delay": 0.001, "clock": []}
+
+    def fresh(at_ns: int, delay_ns: int) -> bool:
+        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        by = Sample("cmd/app", b"", {}, "ann", False, "ann")
+        return ages.fresh(sender, one, by, at_ns, NS // 4, loose=False)
+
+    for at_ns in range(NS, 2 * NS, NS // 20):
+        fresh(at_ns, NS)
+    ages.clocks["ann"].followed = True
+    until_ns = int((2.0 + lower_s) * NS)
+    for at_ns in range(2 * NS, until_ns, NS // 20):
+        fresh(at_ns, NS // 1000)
+    later = [
+        fresh(at_ns, 2 * NS) for at_ns in range(until_ns + 2 * NS, until_ns + 4 * NS, NS // 20)
+    ]
+    assert all(later) if obeyed else not any(later)
+
+
 @pytest.mark.parametrize("dropped", [True, False])
 def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
     dropped: bool,
