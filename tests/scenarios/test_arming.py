@@ -88,6 +88,7 @@ def test_a_pause_arms_no_sender(way: Way, pauses: tuple[float, ...]) -> None:
     assert not moved(world, since_ns)
 
 
+@pytest.mark.slow
 @each("way", get_args(Way))
 def test_a_network_that_loses_all_for_a_while_arms_nobody(way: Way) -> None:
     world, (speaker,) = cleared(way, "a")
@@ -121,6 +122,7 @@ def test_a_zero_of_a_shared_identity_arms_when_no_speed_has_followed_for_a_secon
         assert world.state.mode == mode
 
 
+@pytest.mark.slow
 @each("way", SHARED)
 @each("hz", [1.5, 5.0, 20.0])
 def test_more_zeros_of_a_shared_identity_neither_help_nor_harm(way: Way, hz: float) -> None:

@@ -21,6 +21,7 @@ def level(world: World) -> str:
     return world.state.battery.level
 
 
+@pytest.mark.slow
 def test_a_drained_battery_warns_and_then_stops_the_robot_until_it_is_charged() -> None:
     world = World(DRAINED)
     world.run(0.3)

@@ -49,7 +49,7 @@ class Lines:
         return at_ns - self.pressed_ns, line
 
 
-@pytest.mark.variations(2)
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("config", [STOP, Config()], ids=["places", "no places"])
 def test_each_press_stops_the_robot_within_a_period_until_a_clear(

@@ -75,7 +75,7 @@ class Square:
         return math.dist((pose.x, pose.y), (true.x, true.y)), yaw
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(12)
 @pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 @pytest.mark.parametrize("stalls", [False, True], ids=["", "stalls"])
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
     print(f"\n{mode}: {count} presses, first zero line after at most {slowest_ns / 1e6:.2f} ms")
 
 
-@pytest.mark.variations(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("kind", ["flood", "damaged", "9600 baud", "checked"])
 def test_a_press_is_as_fast_in_a_flood_on_a_bad_wire_and_on_a_slow_one(

@@ -99,6 +99,7 @@ def ends_as_it_always_did(minutes: int) -> None:
     assert ended == json.loads(GOLDEN.read_text())[f"{minutes} minutes"]
 
 
+@pytest.mark.slow
 def test_two_minutes_end_as_they_always_did() -> None:
     ends_as_it_always_did(SHORT)
 

@@ -637,6 +637,7 @@ def test_a_checked_link_that_begins_to_echo_while_it_drives_is_found_out(
     assert "the daemon's own lines come back" in world.state.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speeds", [4, pytest.param(40, marks=pytest.mark.slow)])
 @each("period", [0.0, 0.05])
 @each(

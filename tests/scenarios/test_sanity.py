@@ -139,6 +139,7 @@ def shove(world: World, mode: str, dice: random.Random) -> None:
                     world.run(seconds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "count",
     [

@@ -281,6 +281,7 @@ def test_ros_sets_parameters_the_same_way(world: World, service: str, via: Via) 
     assert config(world).limits.linear_speed == 0.7
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_brake_is_stopped_by_the_guard_whatever_is_set_meanwhile(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:

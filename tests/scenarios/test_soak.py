@@ -673,6 +673,7 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     return moved(world, since_ns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "count"),
     [

@@ -59,6 +59,9 @@ TROUBLE_NS = 2 * NS
 """After another fault of the board, and after a reset, the daemon knows within this time that the
 link was lost or that the board has started again."""
 
+ASKS_NS = 3 * NS // 2
+"""Longest time for which the daemon asks a board without a check for its check."""
+
 
 class Liveness:
     """Judges that a lawful sender drives, and counts and memory at the end of a plan."""
@@ -183,12 +186,11 @@ class Liveness:
     def _stays_armed(self, now_ns: int) -> None:
         """A sender that the robot has followed is armed until an event asks it for a zero."""
         run = self.run
-        sender, moves = run.followed.sender, run.witness.mode in ("ready", "driving")
-        if (
-            sender is not None
-            and moves
-            and self._sole_senders.get(sender["source"]) == sender["name"]
-        ):
+        sender = run.followed.sender
+        # Behind a stall the daemon may ask the board for its check, and finds the loss only then.
+        asks = run.witness.mode == "waiting" and now_ns < self._stall[1] + ASKS_NS
+        sole = sender is not None and self._sole_senders.get(sender["source"]) == sender["name"]
+        if sender is not None and sole and not asks:
             self._followed_ns[sender["source"]] = now_ns
         witness = run.witness
         if witness.mode != "ready" or "must send a zero" not in witness.reason or witness.pending:

@@ -460,6 +460,7 @@ def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> Non
     bench.inputs.cleared(40 * NS)
 
 
+@pytest.mark.slow
 def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -> None:
     plans = list(map(made, range(200)))
     with_inputs = [one for one in plans if kinds(one)]
@@ -503,6 +504,7 @@ def driven(**changes: Any) -> Plan:
     return quiet() | {"seconds": 12.0, "senders": [sender]} | changes
 
 
+@pytest.mark.slow
 def test_in_a_quarter_of_the_plans_nobody_outranks_a_sender_that_keeps_all_rules() -> None:
     plans = [Run(plan).liveness for plan in map(made, range(80))]
     assert 12 <= sum(bool(one.lawful) for one in plans) <= 32
@@ -1011,6 +1013,7 @@ def test_a_port_that_is_opened_again_has_no_rest_of_a_line() -> None:
     assert run._fed_ns == 3 * NS
 
 
+@pytest.mark.slow
 def test_rare_events_come_at_the_time_of_a_drive() -> None:
     found = {"echo": 0, "block": 0}
     for seed in range(200, 400):
@@ -1458,6 +1461,7 @@ def copy_of_the_package(where: Path) -> Path:
     return where
 
 
+@pytest.mark.slow
 def test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_one_else(
     tmp_path: Path,
 ) -> None:

@@ -118,6 +118,7 @@ def test_a_screen_has_colours_where_nobody_minds(
     assert colours(shown(typed_at(shared, words), tmp_path, text))
 
 
+@pytest.mark.slow
 def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Path) -> None:
     words = [sys.executable, "-c", EVERY_HELP]
     told = shown(words, tmp_path, "that was all", NO_COLOR="1")

@@ -531,6 +531,7 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
     assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S + lost(sent, slower.at) + waited
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0.6, pytest.param(60.0, marks=pytest.mark.soak)])
 def test_starved_of_both_cores_every_missed_period_is_counted_and_none_made_up_in_a_burst(
     far: tuple[FarPeer, Daemon], length: float

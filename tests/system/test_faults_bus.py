@@ -468,6 +468,7 @@ def flooded(where: Path, length: float) -> Flooded:
     return found
 
 
+@pytest.mark.slow
 def test_in_a_flood_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
     found = flooded(tmp_path, 1.0)
     assert len(found.arrived) > 20

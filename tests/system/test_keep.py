@@ -6,6 +6,8 @@ import time
 import tomllib
 from pathlib import Path
 
+import pytest
+
 from acsard.client import connect
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -70,6 +72,7 @@ def test_keep_and_a_refusal_of_the_robot(tmp_path: Path) -> None:
         assert tool(daemon, KEY, "1", "--keep", "--write").code == 2
 
 
+@pytest.mark.slow
 def test_keeping_settings_costs_no_control_period(tmp_path: Path) -> None:
     """A file like the reference takes a tenth of a second, in a process of its own."""
     endpoint, file = free_endpoint(), tmp_path / "robot.toml"

@@ -313,6 +313,7 @@ def test_a_second_daemon_of_the_same_robot_on_another_bus_ends_with_75(
     assert "another daemon stores the stop of robot acsar" in second.err
 
 
+@pytest.mark.slow
 def test_the_built_in_simulator_keeps_nothing(tmp_path: Path) -> None:
     states = {"control": {"state_directory": str(tmp_path / "states")}}
     with Daemon(tmp_path, config=states) as daemon, Bus(daemon.endpoint) as bus:

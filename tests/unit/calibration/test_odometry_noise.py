@@ -358,6 +358,7 @@ def found() -> Calibration:
     return SETS["differential"].calibration(LOG, "both")
 
 
+@pytest.mark.slow
 def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> None:
     before, after = OdometryConfig(), configs(found)[1]
     assert after.yaw_variance_per_metre < before.yaw_variance_per_metre

@@ -152,6 +152,7 @@ def test_motion_capture_on_a_good_floor_is_believed() -> None:
     assert not any("same wheels" in note for note in notes)
 
 
+@pytest.mark.slow
 def test_positions_of_another_drive_are_refused() -> None:
     x, y = np.random.default_rng(1).normal(size=(2, len(DRIVE.place)))
     still = replace(DRIVE, place=x + 1j * y)

@@ -332,6 +332,7 @@ def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
     assert (worth.turn.after or math.inf) < 3.0  # deg in 360; 2 % of that are 7 deg
 
 
+@pytest.mark.slow
 def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
     """The robot drives one small square. Pieces of four seconds are straights and noise."""
     side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
@@ -399,6 +400,7 @@ def test_order_repetition_standstill_and_epoch_change_nothing() -> None:
     assert np.allclose(plain.values, other.values, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gaps_and_jumps_are_reported_and_cost_little() -> None:
     made = usual()
     kept = np.sin(made.t / 7) > -0.6

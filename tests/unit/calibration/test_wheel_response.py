@@ -105,6 +105,7 @@ def test_commands_of_another_drive_show_nothing() -> None:
     assert response([mixed], DriveConfig(), FeedbackConfig()) is None
 
 
+@pytest.mark.slow
 def test_the_calibration_writes_a_response_time_that_is_needed() -> None:
     made = calibrate(log([*GUIDED, *REVERSING], 2.0), DriveConfig())
     assert keys(made)["feedback.response_time"] > 1.0  # type: ignore[operator]

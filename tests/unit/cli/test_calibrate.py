@@ -161,7 +161,7 @@ def of_bag(where: Path, log: Path, *words: str) -> int:
     return int(args.main(args))
 
 
-@pytest.mark.variations(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["directory", "file"])
 def test_a_bag_that_another_library_wrote_is_read(
     form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -176,6 +176,7 @@ def test_a_bag_that_another_library_wrote_is_read(
     assert found["notes"][0].startswith("used: the wheels from /joint_states (JointState)")
 
 
+@pytest.mark.slow
 def test_the_options_of_a_bag_choose_its_sensor(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

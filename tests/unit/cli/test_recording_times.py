@@ -75,6 +75,7 @@ def test_a_time_is_found_in_every_file_of_the_ring(ring: Ring) -> None:
         assert f"1 of 30 recordings in {where}: {names[number]}" in err
 
 
+@pytest.mark.slow
 def test_a_range_over_several_files_names_all_of_them(ring: Ring) -> None:
     where, names, stops = ring
     times = ("--from", local(stops[3] - 0.05), "--to", local(stops[6] + 0.05))
@@ -174,6 +175,7 @@ def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
     assert any("  drive: drove " in one and one.endswith(counted) for one in last)
 
 
+@pytest.mark.slow
 def test_an_export_goes_on_across_a_rotation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

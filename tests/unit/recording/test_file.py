@@ -307,6 +307,7 @@ def test_the_beginnings_of_two_neighbouring_damaged_chunks_are_read(tmp_path: Pa
     assert (recording.damaged, recording.ended) == (2, True)
 
 
+@pytest.mark.slow
 def test_random_bytes_in_a_file_raise_only_recording_errors(whole: Path, tmp_path: Path) -> None:
     data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
     said: list[str] = []

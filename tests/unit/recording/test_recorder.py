@@ -195,6 +195,7 @@ def test_a_disk_that_takes_long_for_every_sync_is_reported_once(bench: Bench) ->
     assert [e.level for e in bench.said if e.text != f"to {bench.where}"] == ["warning"]
 
 
+@pytest.mark.slow
 def test_a_disk_that_takes_two_seconds_for_every_sync_is_not_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

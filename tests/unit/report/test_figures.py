@@ -38,6 +38,7 @@ def all_that_happens(world: World) -> None:
     happenings(world, random.Random(1))
 
 
+@pytest.mark.slow
 def test_no_two_symbols_of_a_picture_look_alike() -> None:
     report, _ = report_of(all_that_happens)
     for figure in TimeFigures(report, OFFSET_S).all():

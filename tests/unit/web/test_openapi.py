@@ -8,6 +8,7 @@ from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
+import pytest
 from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
@@ -49,6 +50,7 @@ def test_every_reference_leads_to_a_schema() -> None:
         assert name in WHOLE["components"]["schemas"], one
 
 
+@pytest.mark.slow
 def test_it_is_openapi_as_its_validator_reads_it() -> None:
     whole: dict[Hashable, Any] = dict(WHOLE.items())
     assert [one.message for one in OpenAPIV31SpecValidator(whole).iter_errors()] == []

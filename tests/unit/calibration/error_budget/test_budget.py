@@ -55,7 +55,7 @@ def as_predicted(case: str, seconds: float, seeds: int) -> float:
     return math.sqrt(sum(ratio**2 for ratio in ratios) / seeds)
 
 
-@pytest.mark.variations(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["an adapter that holds lines for 16 ms", "two decimals",
                                   "400 counts a turn", "up to five lines lost"])  # fmt: skip
 def test_the_share_of_a_cause_is_about_the_error_it_makes_on_a_short_drive(case: str) -> None:

@@ -59,6 +59,7 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
     assert np.mean(better >= 10) >= 0.95
 
 
+@pytest.mark.slow
 @so_many
 @each_way
 def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:

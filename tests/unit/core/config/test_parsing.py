@@ -621,6 +621,7 @@ def is_config_or_lines(found: Config | list[str]) -> bool:
     return bool(found) and not any("\n" in line for line in found)
 
 
+@pytest.mark.slow
 @given(st.lists(LINES, max_size=12).map("\n".join))
 @settings(max_examples=400)
 def test_any_toml_like_text_is_a_configuration_or_a_list_of_lines(text: str) -> None:

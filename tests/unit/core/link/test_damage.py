@@ -67,6 +67,7 @@ def hurt(kind: int, line: bytes, after: bytes, chance: float, place: int) -> byt
             return line[:place] + few + line[place + place % 5 :]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "count",
     [100_000, pytest.param(10_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])],

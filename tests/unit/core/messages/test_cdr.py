@@ -902,6 +902,7 @@ def damaged(payload: bytes, dice: random.Random) -> bytes:
     return payload
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "count",
     [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])],

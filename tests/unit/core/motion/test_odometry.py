@@ -446,7 +446,7 @@ def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
     assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == NOWHERE
 
 
-@pytest.mark.variations(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.0, 1e6], ids=["driving", "gaps"])
 def test_the_covariance_stays_finite_for_years(gap: float) -> None:
     robot = odometry(
