@@ -98,6 +98,9 @@ ONE_SIDED = 0.1
 ODD_SIZE = 1.25
 """Factor between the measured and the configured radius from which the radius is reported."""
 
+ODD_RATIO = 1.1
+"""Ratio of the radii of both sides from which it is reported. Equal wheels differ far less."""
+
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 """Usual range of the ratio of effective track to wheel separation.
 
@@ -385,6 +388,13 @@ def remarks(
         yield (
             f"the wheels are {size:.3g} times as large as drive.wheel_radius = {base.radius:g}: "
             "measure it, and check that wheel speeds are in rad/s and x, y in m"
+        )
+    ratio = float(values[2] / values[1])
+    if not 1 / ODD_RATIO < ratio < ODD_RATIO:
+        yield (
+            f"the right wheels are {ratio:.3g} times as large as the left ones, which is unusual: "
+            "compare them, and check that the speeds of both sides have the same unit and that no "
+            "encoder counts only in part"
         )
     track = float(values[0])
     if not LEAST_TRACK < track < MOST_TRACK:

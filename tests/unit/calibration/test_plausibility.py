@@ -176,6 +176,14 @@ def test_what_is_unusual_is_reported() -> None:
     )
 
 
+def test_sides_of_different_size_are_reported() -> None:
+    turned = np.array([1.0, -1.0])
+    told = list(remarks({}, 0.0, turned, np.array([1.6, 0.75, 1.5]), BASE, sized=False))
+    assert [text for text in told if "the right wheels are 2 times as large" in text] == told
+    assert len(told) == 1
+    assert not list(remarks({}, 0.0, turned, np.array([1.6, 0.96, 1.04]), BASE, sized=True))
+
+
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True), (True, True)])
 def test_it_begins_near_the_truth(gyro: bool, places: bool) -> None:
     made = ready(table(usual(), gyro=gyro, places=places))
