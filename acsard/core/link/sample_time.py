@@ -382,9 +382,10 @@ LEAST = 0.002
 """Gain per reply with which the least delay rises towards the usual delay: a time constant of 500
 replies. So an outdated least delay is forgotten."""
 
-CREEP = 0.05
-"""Rise per reply of the least delay of the last replies, as a fraction of the usual time between
-two lines. So the delays of older replies are forgotten."""
+CREEP, CREEPS_FOR = 0.05, 3
+"""Rise of the least delay of the last replies, as a fraction of the time since the last reply. So
+the delays of older replies are forgotten. The time counts as one usual time between two lines at
+least, and as `CREEPS_FOR` of them at most, because a board may stall and then answer all lines."""
 
 LATE = 1.25
 """Largest difference between the least delay of the last replies and the long-term least delay, in
@@ -461,6 +462,8 @@ class PromptedTimes:
         because replies to the last ones may still come.
         """
         self._delay: float | None = None
+        self._first = False
+        """Whether only the first reply has shown the usual delay."""
         self._spread = self._least = 0.0
         """Mean deviation from the usual delay, and the long-term least delay, both ns."""
         self._soon = 0.0
@@ -480,7 +483,7 @@ class PromptedTimes:
         self._given: list[int] = []
         """Lines that the last read of a batched link gave up, in order. Their replies may have
         waited in an adapter that stalled."""
-        self._at, self._alone = 0, False
+        self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         """For a batched link: least delay and usual time between two reads, both ns, and share of
         lost replies."""
@@ -522,7 +525,7 @@ class PromptedTimes:
         shows it only if it is longer than the adapter ever holds a reply back.
         """
         alone, since = lines == 1, at_ns - self._at
-        self._at, self._alone = at_ns, alone
+        self._at, self._alone, self._since = at_ns, alone, since
         self._several += FAST * ((not alone) - self._several)
         varies = THOUGHT_NS < self._spread < BATCH_NS and not self._batched
         self._thinking += SLOW * (varies - self._thinking)
@@ -547,8 +550,9 @@ class PromptedTimes:
             if left and left[0] == asked_ns:
                 left.popleft()
             if self._delay is None:
-                self._delay = self._least = float(max(self._at - asked_ns, self._soonest))
+                self._start(max(self._at - asked_ns, self._soonest))
             return self._answered(asked_ns)
+        second = self._first
         if self._delay is None:
             self._begin()
         elif self._alone and not self._batched and self._given_up_too_early(self._delay):
@@ -556,7 +560,11 @@ class PromptedTimes:
         if not left:
             self._last = None
             return None
-        return self._answered(left.popleft())
+        line = left.popleft()
+        placed = self._answered(line)
+        if second:
+            self._shorten(line)
+        return placed
 
     def _answered(self, line: int) -> Placed:
         last, before = self._last, self._passed
@@ -585,7 +593,24 @@ class PromptedTimes:
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
         if left:
-            self._delay = self._least = float(self._at - left[0])
+            self._start(self._at - left[0])
+            self._first = True
+
+    def _start(self, delay_ns: int) -> None:
+        self._delay = self._least = self._soon = float(delay_ns)
+
+    def _shorten(self, line: int) -> None:
+        """Replace the delay of a first reply that a stall had held back.
+
+        The next reply, to `line`, shows it: it comes much earlier than usual. Without this, the
+        usual delay would fall by 5 % of the difference per reply, and the difference would count as
+        variation. A delay that varies much hides lost replies.
+        """
+        own = self._at - line
+        self._first = own < (self._delay or 0) - self._apart / 2
+        if self._first and self._alone and not self._batched:
+            self._start(own)
+            self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
         """Give up lines whose replies were lost: the last reply of a batch is too late for them.
@@ -641,7 +666,9 @@ class PromptedTimes:
         # reply to the previous line.
         soonest = max(float(self._soonest), self._least)
         if left:
-            self._soon = min(self._soon + CREEP * self._apart, at - left[0])
+            most = CREEPS_FOR * self._apart
+            rise = CREEP * min(max(self._since, self._apart), most)
+            self._soon = min(self._soon + rise, at - left[0])
             if self._soon - soonest > LATE * self._apart:
                 # All of the last replies are late by more than the time between two lines. So
                 # replies were lost, but the large spread had hidden this.

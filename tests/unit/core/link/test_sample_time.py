@@ -501,6 +501,58 @@ def test_without_loss_the_dts_add_up_to_the_time_between_the_lines(seed: int) ->
     assert total == pytest.approx(at, abs=0.1)
 
 
+def assigned(prompts: PromptedTimes, replies: dict[int, float], hz: int) -> list[float]:
+    """Return by how much older each reply's assigned line is than the line which it answers, ms.
+
+    Lines are sent for 10 s from 100 ms on. `replies` has the delay of each line's reply, ms, by the
+    number of the line.
+    """
+    lines = [100 + number * 1000 / hz for number in range(10 * hz)]
+    events = [(line, 0.0) for line in lines]
+    events += [(lines[number] + delay, lines[number]) for number, delay in replies.items()]
+    older = []
+    for ms, line in sorted(events):
+        if not line:
+            prompts.left(int(ms * MS))
+            continue
+        prompts.read(int(ms * MS), 1)
+        if prompts.place() is not None:
+            older.append(line - prompts._line / MS)
+    assert len(older) > 0.9 * len(replies)
+    return older
+
+
+def test_a_first_reply_behind_a_stall_hides_no_lost_replies() -> None:
+    """The first reply is read 44 ms late. Later only every 16th of 300 lines a second is answered.
+
+    Then no reply is assigned to a line that is more than one line too old.
+    """
+    prompts, chance = PromptedTimes(soonest_ns=2 * MS), random.Random(1)
+    prompts.left(0)
+    prompts.read(81 * MS, 1)
+    assert prompts.place() is not None
+    replies = {n: 37 + 3 * chance.random() for n in range(3000) if n < 15 or n % 16 == 0}
+    assert max(assigned(prompts, replies, 300)) < 4.0
+
+
+@pytest.mark.parametrize(("hz", "each"), [(100, 2), (100, 5), (300, 2), (300, 16)])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_delay_that_varies_hides_lost_replies_only_shortly(hz: int, each: int, seed: int) -> None:
+    """A board takes 8 to 16 ms for a reply, and after 2 s answers only some of the lines.
+
+    Then no reply is assigned to a line that is more than 20 ms too old.
+    """
+    prompts, chance = PromptedTimes(soonest_ns=2 * MS), random.Random(seed)
+    replies, last = {}, 0.0
+    for number in range(10 * hz):
+        if number < 2 * hz or number % each == 0:
+            at = number * 1000 / hz
+            last = max(last, at + 8 + 8 * chance.random())
+            replies[number] = last - at
+    older = assigned(prompts, replies, hz)
+    assert max(older[50:]) <= 21.0
+
+
 def test_a_new_session_begins_without_a_past() -> None:
     bench = Prompted().talk()
     bench.prompts.forget()
