@@ -104,10 +104,11 @@ class Robot:
             self._first_events.append(Event("mode", why, "warning", kind=f"start -> {mode}"))
         self._choice = Choice()
         self._speeds = STILL
-        self._made_of: tuple[int | None, Mode] = (None, self._life.mode)
+        self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
         """Arrival time of the command and the mode from which the last line was computed.
 
-        The time is monotonic, ns, and None without a command.
+        The time is monotonic, ns, and None without a command. A new line is due at once after a
+        press of the emergency stop or of a bumper, so that sets this to None.
         """
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
@@ -208,7 +209,7 @@ class Robot:
         if self._bumpers.limiting:
             self._keep_away(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
-        # If the command or the mode is newer than the last line, a line may be sent at once.
+        # After a press, a new command and a change of the mode, a line may be sent at once.
         news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
@@ -326,11 +327,13 @@ class Robot:
         if estop.pressed_now or bumpers.pressed_now:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
             self._limiter.cut()
-            self._speeds = STILL
+            self._speeds, self._made_of = STILL, None
             self._made = self._said = (self._limiter.state, self._made_ns)
         # A driver without power reports a fault too, and the emergency stop cuts its power.
         if not estop.why and any(status.driver_fault for _, status in statuses):
             self._fault(DRIVER_FAULT, now, events)
+            # It may have ended in the same step. No clear that came before that releases it.
+            self._life.hold(DRIVER_FAULT, DRIVER_MEND, now.mono_ns)
         battery = self._battery
         events += battery.look(statuses, now.mono_ns)
         if battery.stopped_now:

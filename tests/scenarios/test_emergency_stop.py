@@ -113,6 +113,43 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
     print(f"\n{mode}: {count} presses, first zero line after at most {slowest_ns / 1e6:.2f} ms")
 
 
+@pytest.mark.parametrize("count", MOST)
+def test_a_press_on_the_ramp_of_a_stop_is_a_zero_line_within_a_period(count: int) -> None:
+    """The mode does not change, so only the press itself asks for a line."""
+    world, dice = World(), random.Random(count)
+    pressed_ns: list[int] = []
+
+    def look(outputs: Outputs) -> None:
+        if not pressed_ns and world.state.emergency_stop == "pressed":
+            pressed_ns.append(outputs.now.mono_ns)
+
+    slowest_ns = 0
+    with world.mcu.estop():
+        world.run(0.5)
+        for _ in range(count):
+            world.drive(0.8, seconds=0.5)
+            world.run(dice.uniform(0.0, world.period_ns / NS_PER_S))
+            for _ in range(
+                2
+            ):  # the first line of a period that goes early takes the next one's place
+                world.send(0.8)
+                world.run(0.001)
+            world.put("stop", b"")
+            world.run(dice.uniform(0.0, 0.02))
+            world.port.sent.clear()
+            pressed_ns.clear()
+            world.watch = look
+            with world.mcu.estop_pressed(0.0, 0.0):
+                world.run(0.05)
+            world.watch = lambda outputs: None
+            world.run(0.05)
+            first_ns = next(at_ns for at_ns, line in world.port.sent if line.startswith(ZERO))
+            slowest_ns = max(slowest_ns, first_ns - pressed_ns[0])
+            out_of(world)
+    assert slowest_ns <= world.period_ns
+    print(f"\n{count} presses, first zero line after at most {slowest_ns / 1e6:.2f} ms")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("kind", ["flood", "damaged", "9600 baud", "checked"])

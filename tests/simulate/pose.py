@@ -82,6 +82,10 @@ class PoseWitness:
         self._drifts = sure and (self._seldom or rounded)
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
+        self._gyro = bool(rates.get("gyro"))
+        self._corrects = False
+        """The wheels lied, and a gyro that had not proved itself yet may still correct the heading
+        once."""
         self._placed = False
         self._asked: Pose | None = None
         """The pose that a call of this step has set, if its time is known."""
@@ -106,6 +110,7 @@ class PoseWitness:
         self._anchor = self._expected = None
         if not mute:
             self._before = None
+            self._corrects = self._gyro
 
     def mended(self, fault: str, at_ns: int) -> None:
         """Note that a fault of the board ended."""
@@ -121,7 +126,7 @@ class PoseWitness:
     def begin(self) -> None:
         """Note that a new daemon or a new pose begins: nothing before it counts."""
         self.doubt()
-        self._last = None
+        self._last, self._corrects = None, False
 
     def placed(self, asked: Pose | None = None) -> None:
         """The pose was set: the estimates of this step are still the old ones.
@@ -219,6 +224,9 @@ class PoseWitness:
                 f"{off:.3f} m off, allowed {allowed:.3f} m",
             )  # fmt: skip
         if abs(dyaw) > SIGMAS * math.sqrt(yawyaw) + room_yaw:
+            if self._corrects:
+                self._corrects, self._anchor = False, None
+                return
             raise BrokenError(
                 "the pose stays within its covariance", now_ns,
                 f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",

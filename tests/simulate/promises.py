@@ -815,7 +815,8 @@ class Witness:
         """Return whether the way from `before` to `wheels` leads towards the wish."""
         goal_v, goal_w = self.clamped(wish.v, wish.w)
         if self.away:
-            goal_v, _ = self.clamped(wish.v, 0.0)  # away from a bumper the robot does not turn
+            # Away from a bumper the robot does not turn, which may allow a higher speed or a lower.
+            goal_v = max(goal_v, self.clamped(wish.v, 0.0)[0], key=abs)
         for new, old, goal, room in zip(
             self.twist(wheels),
             self.twist(before),

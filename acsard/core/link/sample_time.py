@@ -286,7 +286,8 @@ class FreeRunningTimes:
         if len(alone) >= LONE * len(gaps) and (usual := median(alone)) > 0:
             own = _slots(reads, usual)
             yield from ((own, LATE_ALONE, period) for period in known)
-        yield from ((plain, LATE_BATCHED, period) for period in known)
+        if len(alone) < len(gaps):  # an adapter that batches lines has delivered several at once
+            yield from ((plain, LATE_BATCHED, period) for period in known)
         slope = _slope(reads, own)
         if slope <= 0:
             return

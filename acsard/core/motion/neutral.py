@@ -116,7 +116,12 @@ class Sender:
             self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
             if zero and unarmed:
-                self.arrived_ns = None  # this zero must not make an earlier speed count
+                # This zero must not make an earlier speed count. Another program of a shared
+                # identity may have sent that speed, and its source keeps its priority.
+                if command.shared:
+                    self.twist = REST
+                else:
+                    self.arrived_ns = None
             self._doubt(command, verdict)
             return
         self._proven_armed, self._proven_zero_ns = self._armed, self._zero_ns

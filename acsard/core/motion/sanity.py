@@ -43,6 +43,9 @@ class Sanity:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._since = 0.0
+        self._covers = 0.0
+        """Longest time that one of the last lines may cover, s. Behind a pause, a line has the mean
+        of the whole pause, and its time is uncertain. It counts for as long as it lasted."""
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
@@ -52,7 +55,7 @@ class Sanity:
 
     def forget(self) -> None:
         """Start over, because the link was lost or a fault has been cleared."""
-        self._last, self._since, self._impossible = None, 0.0, 0
+        self._last, self._since, self._covers, self._impossible = None, 0.0, 0.0, 0
 
     @property
     def doubtful(self) -> bool:
@@ -63,9 +66,12 @@ class Sanity:
         """Return why this line is impossible for any robot, "" if it is possible.
 
         A change of speed is compared with the last possible line and the time since then. Therefore
-        a real jump of the speed is accepted as soon as it could have happened.
+        a real jump of the speed is accepted as soon as it could have happened. The speeds are means
+        over the time of a line, so the change takes at least the time between the two middles.
         """
-        self._since += max(feedback.dt, feedback.since)
+        since = max(feedback.dt, feedback.since)
+        self._since += since
+        self._covers = max(0.0, self._covers - since)
         if feedback.gap:
             self._last = None
         why = self._objection(feedback)
@@ -73,6 +79,7 @@ class Sanity:
         if why:
             self._impossible += 1
             return why
+        self._covers = max(self._covers, self._since)
         self._last, self._since, self._impossible = feedback.speeds, 0.0, 0
         return ""
 
@@ -101,7 +108,8 @@ class Sanity:
     def _objection(self, line: Feedback) -> str:
         speeds, fastest = line.speeds, self._settings.wheel_speed
         before = speeds if self._last is None else self._last
-        most = self._settings.wheel_acceleration * self._since + SLACK
+        seconds = max(self._since, (self._since + self._covers) / 2)
+        most = self._settings.wheel_acceleration * seconds + SLACK
         wheels, then_wheels = speeds.as_tuple(), before.as_tuple()
         changes = map(abs, map(sub, wheels, then_wheels))
         if max(map(abs, wheels)) <= fastest and max(changes) <= most:

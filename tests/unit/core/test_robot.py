@@ -569,6 +569,16 @@ def test_a_motor_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
     assert bench.step(GO).mode == "ready"
 
 
+def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_it() -> None:
+    bench = Button(DRIVER_OK)
+    bench.driving()
+    bench.status(DRIVER_FAULT).step(GO)
+    bench.status(DRIVER_OK).step(GO)
+    assert not bench.status(DRIVER_FAULT + DRIVER_OK).answer("clear").success
+    assert bench.mode() == "fault"
+    assert bench.status(DRIVER_OK).answer("clear").success
+
+
 def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
     bench = Button(PRESSED_LINE + DRIVER_FAULT)
     bench.linked()

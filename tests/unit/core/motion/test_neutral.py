@@ -141,7 +141,17 @@ def test_a_speed_before_an_unproven_zero_that_arms_never_counts_by_it(shared: bo
     one.take(sent(REST, 10, shared), 0, "unproven")
     at_ns = 1010 * MS if shared else 10 * MS
     assert one.armed(at_ns)
-    assert not one.live(at_ns)
+    assert one.twist == REST if shared else not one.live(at_ns)
+
+
+def test_an_unproven_zero_leaves_an_unarmed_shared_identity_live_so_its_source_keeps_priority() -> (
+    None
+):
+    one = sender()
+    one.take(sent(GO, 0, shared=True), 0)
+    one.take(sent(REST, 10, shared=True), 0, "unproven")
+    assert one.live(20 * MS)
+    assert not one.armed(20 * MS)
 
 
 def test_an_unproven_zero_of_an_armed_sender_leaves_its_last_command_in_force() -> None:

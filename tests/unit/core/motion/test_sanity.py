@@ -62,6 +62,16 @@ def test_a_real_step_is_believed_as_soon_as_it_could_have_happened() -> None:
     assert verdicts == [False, True, True]
 
 
+def test_behind_a_pause_a_mean_may_leap_for_as_long_as_the_pause_lasted_and_no_longer() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    for seconds in (0.01, 0.25, 0.01, 0.01):  # the board repeats the mean of the pause
+        assert sanity.impossible(line(TEN, dt=seconds)) == ""
+    assert sanity.impossible(line(STILL)) == ""
+    for _ in range(25):
+        assert sanity.impossible(line(STILL)) == ""
+    assert sanity.impossible(line(TEN))
+
+
 def test_the_first_line_and_the_first_after_a_gap_have_no_slew() -> None:
     sanity = Sanity(FeedbackConfig(wheel_acceleration=10.0))
     assert sanity.impossible(line(TEN, dt=0.0)) == ""
