@@ -80,6 +80,11 @@ than `EARLY_ALONE` slots in the window from which a clock is found. These came o
 answers a command that was sent between two periods. If there are more, the clock is not accepted,
 because it would make all others a slot late."""
 
+LATE_AT_LAST, LAST = 0.75, 3
+"""At least one of the last `LAST` lines in the window from which a clock is found must be less late
+than this, in slots. Otherwise a line was counted for a slot of its own that answered a command
+between two periods. The clock would make all following lines a slot late."""
+
 JUMP = 1.4
 """Time between two reads, in slots. If two reads with a single line each are closer together, no
 line is missing between them."""
@@ -250,7 +255,8 @@ class FreeRunningTimes:
         gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
         for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
-            if max(late) <= most and sorted(late)[1 + len(late) // ALONE] <= EARLY_ALONE:
+            promptest = sorted(late)[1 + len(late) // ALONE]
+            if max(late) <= most and promptest <= EARLY_ALONE and min(late[-LAST:]) <= LATE_AT_LAST:
                 break
         else:
             del reads[: len(reads) // 4]
@@ -286,8 +292,7 @@ class FreeRunningTimes:
         if len(alone) >= LONE * len(gaps) and (usual := median(alone)) > 0:
             own = _slots(reads, usual)
             yield from ((own, LATE_ALONE, period) for period in known)
-        if len(alone) < len(gaps):  # an adapter that batches lines has delivered several at once
-            yield from ((plain, LATE_BATCHED, period) for period in known)
+        yield from ((plain, LATE_BATCHED, period) for period in known)
         slope = _slope(reads, own)
         if slope <= 0:
             return

@@ -221,8 +221,7 @@ def test_a_reply_to_a_command_between_two_periods_makes_no_clock_that_is_a_slot_
     assert slots.period == period_ms / 1000
 
 
-def test_lone_replies_to_commands_at_odd_times_make_no_clock_of_batches() -> None:
-    """An adapter that batches lines delivers several at once."""
+def test_replies_to_commands_at_odd_times_make_no_clock_that_is_a_slot_late() -> None:
     slots = FreeRunningTimes((0.1,))
     odd = [0.70, 0.75, 0.80, 1.00, 1.07, 1.10, 1.20, 1.35, 1.40, 1.50, 1.70, 1.80, 1.90]
     for at in [*odd, *(2.0 + 0.1 * n for n in range(40))]:
