@@ -74,16 +74,15 @@ LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 """Largest lateness of a line, in slots, in the window from which a clock is found. `LATE_ALONE` is
 for lines that are read one by one, `LATE_BATCHED` for batches."""
 
+HELD_NS = 25_000_000
+"""Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
+16 ms. A later line of a slow board answers a command that was sent between two periods."""
+
 EARLY_ALONE, ALONE = 0.55, 12
 """At most one line, and one more for each `ALONE` lines, may be earlier than all others by more
 than `EARLY_ALONE` slots in the window from which a clock is found. These came out of turn: each
 answers a command that was sent between two periods. If there are more, the clock is not accepted,
 because it would make all others a slot late."""
-
-LATE_AT_LAST, LAST = 0.75, 3
-"""At least one of the last `LAST` lines in the window from which a clock is found must be less late
-than this, in slots. Otherwise a line was counted for a slot of its own that answered a command
-between two periods. The clock would make all following lines a slot late."""
 
 JUMP = 1.4
 """Time between two reads, in slots. If two reads with a single line each are closer together, no
@@ -255,8 +254,8 @@ class FreeRunningTimes:
         gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
         for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
-            promptest = sorted(late)[1 + len(late) // ALONE]
-            if max(late) <= most and promptest <= EARLY_ALONE and min(late[-LAST:]) <= LATE_AT_LAST:
+            latest = min(most, HELD_NS / guess)
+            if max(late) <= latest and sorted(late)[1 + len(late) // ALONE] <= EARLY_ALONE:
                 break
         else:
             del reads[: len(reads) // 4]

@@ -221,9 +221,17 @@ def test_a_reply_to_a_command_between_two_periods_makes_no_clock_that_is_a_slot_
     assert slots.period == period_ms / 1000
 
 
-def test_replies_to_commands_at_odd_times_make_no_clock_that_is_a_slot_late() -> None:
+@pytest.mark.parametrize(
+    "odd",
+    [
+        [0.70, 0.75, 0.80, 1.00, 1.07, 1.10, 1.20, 1.35, 1.40, 1.50, 1.70, 1.80, 1.90],
+        [0.60, 0.70, 0.90, 1.00, 1.10, 1.19, 1.30, 1.40, 1.50, 1.54, 1.70, 1.80, 1.84],
+    ],
+)
+def test_replies_to_commands_at_odd_times_make_no_clock_that_is_a_slot_late(
+    odd: list[float],
+) -> None:
     slots = FreeRunningTimes((0.1,))
-    odd = [0.70, 0.75, 0.80, 1.00, 1.07, 1.10, 1.20, 1.35, 1.40, 1.50, 1.70, 1.80, 1.90]
     for at in [*odd, *(2.0 + 0.1 * n for n in range(40))]:
         at_ns = 10**12 + int(at * 1e9)
         slots.read(at_ns, 1, True)
