@@ -107,8 +107,8 @@ class Robot:
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
         """Arrival time of the command and the mode from which the last line was computed.
 
-        The time is monotonic, ns, and None without a command. A new line is due at once after a
-        press of the emergency stop or of a bumper, so that sets this to None.
+        The time is monotonic, ns, and None without a command. The whole value is None after a press
+        of the emergency stop or of a bumper, so that a new line is due at once.
         """
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
@@ -332,8 +332,7 @@ class Robot:
         # A driver without power reports a fault too, and the emergency stop cuts its power.
         if not estop.why and any(status.driver_fault for _, status in statuses):
             self._fault(DRIVER_FAULT, now, events)
-            # It may have ended in the same step. No clear that came before that releases it.
-            self._life.hold(DRIVER_FAULT, DRIVER_MEND, now.mono_ns)
+            self._life.caused_again(now.mono_ns)
         battery = self._battery
         events += battery.look(statuses, now.mono_ns)
         if battery.stopped_now:
@@ -412,6 +411,7 @@ class Robot:
         if inputs.guard_trip:
             trip = f"the guard replaced a line: {inputs.guard_trip}"
             self._fault(trip, inputs.now, events)
+            self._life.caused_again(inputs.now.mono_ns)
         if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
         if not inputs.requests:

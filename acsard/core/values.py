@@ -510,7 +510,8 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Whether the command or the mode is newer than the last line that was computed."""
+    """Whether the command, the mode, or a press of the emergency stop or of a bumper is newer than
+    the last line that was computed."""
     latches: Latches = Latches()
     """The latches in force after the step; the same object until one of them changes."""
 

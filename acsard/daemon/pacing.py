@@ -1,4 +1,5 @@
-"""Decides when a line may be written: in every period, and early for a new command or mode.
+"""Decides when a line may be written: in every period, and early for a new command or mode or after
+a press of the emergency stop or of a bumper.
 
 A line that is written early, between two periods, replaces the line of the next period. So a flood
 of commands does not cause more lines. After the line before it there must be a gap of the wire time
@@ -77,7 +78,8 @@ class Pace:
             tick: Whether the step was to write the line of a period.
             due: Whether the step had a line to write.
             went: Whether the line was written.
-            news: Whether the command or the mode has changed since the last line that was due.
+            news: Whether the command or the mode has changed since the last line that was due, or
+                the emergency stop or a bumper was pressed.
             heard: Whether the bus had input for this step.
         """
         self._waiting = news and not due

@@ -129,9 +129,8 @@ def test_a_press_on_the_ramp_of_a_stop_is_a_zero_line_within_a_period(count: int
         for _ in range(count):
             world.drive(0.8, seconds=0.5)
             world.run(dice.uniform(0.0, world.period_ns / NS_PER_S))
-            for _ in range(
-                2
-            ):  # the first line of a period that goes early takes the next one's place
+            # The first early line of a period replaces the line of the next period.
+            for _ in range(2):
                 world.send(0.8)
                 world.run(0.001)
             world.put("stop", b"")

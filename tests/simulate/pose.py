@@ -34,6 +34,10 @@ VAGUE = 0.05
 """Variance, m2, from which on a gap may be lost in it: the variance of a robot whose heading is
 nearly unknown also falls."""
 
+PROVED_RAD = 3.0
+"""True turns, rad, within which a gyro has certainly proved itself: a turn of 0.1 rad to one side
+proves it, if its bias is known."""
+
 FRESH_NS = NS // 50
 """Age of a sample up to which the present pose stands for that at the sample. Behind a gap nothing
 is known in between."""
@@ -83,9 +87,9 @@ class PoseWitness:
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._gyro = bool(rates.get("gyro"))
-        self._corrects = False
-        """The wheels lied, and a gyro that had not proved itself yet may still correct the heading
-        once."""
+        self._unproved: float | None = None
+        """True turns since the wheels lied, rad, until a gyro has corrected the heading for that.
+        None if no correction is possible."""
         self._placed = False
         self._asked: Pose | None = None
         """The pose that a call of this step has set, if its time is known."""
@@ -110,7 +114,6 @@ class PoseWitness:
         self._anchor = self._expected = None
         if not mute:
             self._before = None
-            self._corrects = self._gyro
 
     def mended(self, fault: str, at_ns: int) -> None:
         """Note that a fault of the board ended."""
@@ -126,7 +129,7 @@ class PoseWitness:
     def begin(self) -> None:
         """Note that a new daemon or a new pose begins: nothing before it counts."""
         self.doubt()
-        self._last, self._corrects = None, False
+        self._last = self._unproved = None
 
     def placed(self, asked: Pose | None = None) -> None:
         """The pose was set: the estimates of this step are still the old ones.
@@ -149,6 +152,10 @@ class PoseWitness:
         self._speed = self._present_speed()
         lies = not LIARS.isdisjoint(faults) or now_ns < self._known_ns
         silent_only = not lies or faults & LIARS == {"mute"}
+        if self._gyro and not silent_only:
+            self._unproved = 0.0
+        elif self._unproved is not None and len(self._true) > 1:
+            self._unproved += abs(math.remainder(yaw - self._true[-2][1][2], math.tau))
         if lies:
             self.doubt(silent_only)
         before = self._before
@@ -224,8 +231,8 @@ class PoseWitness:
                 f"{off:.3f} m off, allowed {allowed:.3f} m",
             )  # fmt: skip
         if abs(dyaw) > SIGMAS * math.sqrt(yawyaw) + room_yaw:
-            if self._corrects:
-                self._corrects, self._anchor = False, None
+            if self._unproved is not None and self._unproved < PROVED_RAD:
+                self._unproved = self._anchor = None
                 return
             raise BrokenError(
                 "the pose stays within its covariance", now_ns,

@@ -813,19 +813,23 @@ class Witness:
 
     def _leads(self, wish: Wish, wheels: tuple[float, ...], before: tuple[float, ...]) -> bool:
         """Return whether the way from `before` to `wheels` leads towards the wish."""
-        goal_v, goal_w = self.clamped(wish.v, wish.w)
-        if self.away:
-            # Away from a bumper the robot does not turn, which may allow a higher speed or a lower.
-            goal_v = max(goal_v, self.clamped(wish.v, 0.0)[0], key=abs)
-        for new, old, goal, room in zip(
+        if self.away and self._approaches(self.clamped(wish.v, 0.0), wheels, before):
+            return True  # away from a bumper the robot does not turn
+        return self._approaches(self.clamped(wish.v, wish.w), wheels, before)
+
+    def _approaches(
+        self, goal: tuple[float, float], wheels: tuple[float, ...], before: tuple[float, ...]
+    ) -> bool:
+        """Return whether neither speed grows beyond the goal, or away from it."""
+        for new, old, wished, room in zip(
             self.twist(wheels),
             self.twist(before),
-            (goal_v, goal_w),
+            goal,
             (self.radius * 0.022, self.radius * 0.022 / self.half),
             strict=True,
         ):
             grew = abs(new) > abs(old) + room or (new * old < 0 and abs(new) > room)
-            if grew and (goal * new <= 0 or abs(new) > abs(goal) + room):
+            if grew and (wished * new <= 0 or abs(new) > abs(wished) + room):
                 return False
         return True
 

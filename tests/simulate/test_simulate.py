@@ -663,26 +663,35 @@ def test_a_pose_may_not_jump_although_the_encoders_missed_a_part_of_the_drive() 
     pose.see(NS // 5, [(NS // 5, 1.0, 1.0, 0.0, sure, ())], truth, 0, set())
 
 
-def test_only_a_gyro_may_correct_the_heading_once_behind_a_lie_of_the_wheels() -> None:
+@pytest.mark.parametrize(
+    ("gyro", "lied", "swings", "corrected"),
+    [
+        (True, True, 3, True),
+        (False, True, 3, False),
+        (True, False, 3, False),
+        (True, True, 200, False),
+    ],
+)
+def test_only_a_gyro_may_correct_the_heading_once_and_soon_after_a_wheel_fault(
+    gyro: bool, lied: bool, swings: int, corrected: bool
+) -> None:
     sure, promise = (0.0001, 0.0, 0.0, 0.0001, 0.0, 0.0001), "the pose stays within its covariance"
-    for gyro in (True, False):
-        pose, at_ns = PoseWitness({"odometry": {"gyro": gyro}}), 0
+    pose, at_ns = PoseWitness({"odometry": {"gyro": gyro}}), 0
 
-        def turned(yaw: float, pose: PoseWitness = pose) -> None:
-            nonlocal at_ns
-            at_ns += NS // 100
-            pose.see(
-                at_ns, [(at_ns, 0.0, 0.0, yaw, sure, ())], (at_ns, 0.0, 0.0, 2.0, 0.0), 0, set()
-            )
+    def turned(yaw: float, off: float, faults: set[str]) -> None:
+        nonlocal at_ns
+        at_ns += NS // 100
+        truth = at_ns, 0.0, 0.0, yaw, 0.0
+        pose.see(at_ns, [(at_ns, 0.0, 0.0, yaw + off, sure, ())], truth, 0, faults)
 
-        turned(0.0)
-        pose.doubt()
-        turned(0.0)
-        if gyro:
-            for yaw in (2.0, 2.0):
-                turned(yaw)
-        with pytest.raises(BrokenError, match=promise):
-            turned(1.0)
+    turned(0.0, 0.0, {"dead_motor"} if lied else set())
+    for swing in range(swings):
+        turned(0.02 * (swing % 2), 0.0, set())
+    if corrected:
+        turned(0.0, 2.0, set())
+        turned(0.0, 2.0, set())
+    with pytest.raises(BrokenError, match=promise):
+        turned(0.0, 1.0, set())
 
 
 CLEARED = "cleared; each sender must send a zero"

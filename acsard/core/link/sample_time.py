@@ -72,11 +72,12 @@ one."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 """Largest lateness of a line, in slots, in the window from which a clock is found. `LATE_ALONE` is
-for lines that are read one by one, `LATE_BATCHED` for batches."""
+for lines that are read one by one, `LATE_BATCHED` for batches; `HELD_NS` limits both."""
 
 HELD_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
-16 ms. A later line of a slow board answers a command that was sent between two periods."""
+16 ms. At 20 Hz and less, a later line answers a command that was sent between two periods. If the
+lines of a slow board really vary by more, no clock is found: the times of the reads are used."""
 
 EARLY_ALONE, ALONE = 0.55, 12
 """At most one line, and one more for each `ALONE` lines, may be earlier than all others by more

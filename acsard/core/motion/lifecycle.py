@@ -74,7 +74,7 @@ class Lifecycle:
         are "" if the reports of the board forbid no clear."""
         self._freed_ns = LONG_AGO_NS
         """Monotonic time of the step in which the reports of the board last began to permit a
-        clear, ns."""
+        clear, or in which the cause of a fault came again, ns. No earlier clear is obeyed."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, ns; None before that step."""
         self._derive()
@@ -117,6 +117,13 @@ class Lifecycle:
         if self._held and not why:
             self._freed_ns = now_ns
         self._held, self._mend = why, mend
+
+    def caused_again(self, now_ns: int) -> None:
+        """Record that the cause of a fault that is latched already came again in this step.
+
+        No clear that arrived before that releases the fault. `now_ns` is monotonic.
+        """
+        self._freed_ns = now_ns
 
     def leave(self) -> None:
         """Record that the daemon is going down."""

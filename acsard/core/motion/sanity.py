@@ -43,9 +43,10 @@ class Sanity:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._since = 0.0
-        self._covers = 0.0
-        """Longest time that one of the last lines may cover, s. Behind a pause, a line has the mean
-        of the whole pause, and its time is uncertain. It counts for as long as it lasted."""
+        self._longest = 0.0
+        """Longest time that one of the recent lines covers, s. After a pause, a line has the mean
+        of the whole pause, and its time is uncertain. A pause counts until its length has passed.
+        """
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
@@ -55,7 +56,7 @@ class Sanity:
 
     def forget(self) -> None:
         """Start over, because the link was lost or a fault has been cleared."""
-        self._last, self._since, self._covers, self._impossible = None, 0.0, 0.0, 0
+        self._last, self._since, self._longest, self._impossible = None, 0.0, 0.0, 0
 
     @property
     def doubtful(self) -> bool:
@@ -66,20 +67,21 @@ class Sanity:
         """Return why this line is impossible for any robot, "" if it is possible.
 
         A change of speed is compared with the last possible line and the time since then. Therefore
-        a real jump of the speed is accepted as soon as it could have happened. The speeds are means
-        over the time of a line, so the change takes at least the time between the two middles.
+        a real jump of the speed is accepted as soon as it could have happened. Each speed is a mean
+        over the time of its line, so the change may have taken the time from the middle of one line
+        to the middle of the next.
         """
         since = max(feedback.dt, feedback.since)
         self._since += since
-        self._covers = max(0.0, self._covers - since)
+        longest = max(0.0, self._longest - since)
+        self._longest = max(longest, since)
         if feedback.gap:
             self._last = None
-        why = self._objection(feedback)
+        why = self._objection(feedback, longest)
         self._count(why)
         if why:
             self._impossible += 1
             return why
-        self._covers = max(self._covers, self._since)
         self._last, self._since, self._impossible = feedback.speeds, 0.0, 0
         return ""
 
@@ -105,10 +107,10 @@ class Sanity:
             'mcu.link_check = "auto" protects each line with a checksum'
         )
 
-    def _objection(self, line: Feedback) -> str:
+    def _objection(self, line: Feedback, longest: float) -> str:
         speeds, fastest = line.speeds, self._settings.wheel_speed
         before = speeds if self._last is None else self._last
-        seconds = max(self._since, (self._since + self._covers) / 2)
+        seconds = max(self._since, (self._since + longest) / 2)
         most = self._settings.wheel_acceleration * seconds + SLACK
         wheels, then_wheels = speeds.as_tuple(), before.as_tuple()
         changes = map(abs, map(sub, wheels, then_wheels))

@@ -579,6 +579,16 @@ def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_it() ->
     assert bench.status(DRIVER_OK).answer("clear").success
 
 
+def test_a_clear_in_the_step_of_a_repeated_guard_trip_does_not_release_the_fault() -> None:
+    bench = Bench()
+    bench.driving()
+    bench.step(guard_trip="it is not a whole line of four wheels")
+    (answer,) = bench.step(guard_trip="it is not a whole line of four wheels", ask="clear").answers
+    assert not answer.success
+    assert bench.mode() == "fault"
+    assert bench.answer("clear").success
+
+
 def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
     bench = Button(PRESSED_LINE + DRIVER_FAULT)
     bench.linked()

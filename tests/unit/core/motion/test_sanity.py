@@ -62,7 +62,7 @@ def test_a_real_step_is_believed_as_soon_as_it_could_have_happened() -> None:
     assert verdicts == [False, True, True]
 
 
-def test_behind_a_pause_a_mean_may_leap_for_as_long_as_the_pause_lasted_and_no_longer() -> None:
+def test_after_a_pause_a_larger_change_is_possible_for_as_long_as_the_pause_lasted() -> None:
     sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
     for seconds in (0.01, 0.25, 0.01, 0.01):  # the board repeats the mean of the pause
         assert sanity.impossible(line(TEN, dt=seconds)) == ""
