@@ -334,6 +334,7 @@ COMMANDS: dict[str, How] = {
     ),
     "acsard mcu check --port sim --yes": Run("PASS +watchdog"),
     "acsard sim --link ./mcu --fault comma_latched --fault reversed_motor=b": BROKEN,
+    "acsard sim --link ./mcu --fault reversed_motor=b": BROKEN._replace(but="and needs a comma"),
     "acsard mcu check --port ./mcu --yes": BROKEN,
     "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
     "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(

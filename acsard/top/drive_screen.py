@@ -59,8 +59,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
             first.stylize(MODES.get(state.mode, "reverse"), 0, len(mode))
         shown += told
         if seen.objection:
-            words = f"your keys do not drive: {printable(seen.objection)}"
-            shown += _wrapped(words, width, "bold red")
+            shown += _wrapped(refused(seen.objection), width, "bold red")
         shown += flow(measured(state), width)
     shown.append(Text(f"keys ask {asked(seen)}"))
     below = [Text(line, "dim") for line in HELP]
@@ -79,7 +78,7 @@ def news(seen: Teleop, width: int) -> list[str]:
     if seen.state is None or seen.silent:
         return _words([silence(seen), *told], width)
     if seen.objection:
-        told.insert(0, f"your keys do not drive: {printable(seen.objection)}")
+        told.insert(0, refused(seen.objection))
     why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
     return _words([why, *told], width, measured(seen.state))
 
@@ -110,6 +109,12 @@ def silence(seen: Teleop) -> str:
 def reason(state: RobotState) -> str:
     """Return the reason of the mode, without the name of the mode."""
     return printable(state.reason.removeprefix(f"{state.mode}: "))
+
+
+def refused(objection: str) -> str:
+    """Return why the robot does not follow the keys, and how to send a zero with keys."""
+    release = " (let go of the key, and press it again)" if "must send a zero" in objection else ""
+    return f"your keys do not drive: {printable(objection)}{release}"
 
 
 def asked(seen: Teleop) -> str:

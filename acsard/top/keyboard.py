@@ -1,7 +1,8 @@
 """Drives the robot from the keyboard with the keys of teleop_twist_keyboard.
 
-A terminal reports a key press but never its release. Each press therefore drives for `HOLD_S`, and
-key repeats extend it. After that the tool sends three zeros and then nothing.
+A terminal reports a key press but never its release. Each press therefore drives for `HOLD_S`. Once
+the keyboard repeats a held key, each repeat drives for `REPEAT_S` only. After that the tool sends
+three zeros and then nothing.
 """
 
 from __future__ import annotations
@@ -19,6 +20,13 @@ HOLD_S = 0.6
 
 It is longer than a keyboard's delay before the first repeat (0.25 to 0.5 s); otherwise the robot
 would stutter.
+"""
+
+REPEAT_S, REPEATS = 0.25, 3
+"""Time for which a repeat of a held key drives the robot, s, and the number of presses after which
+the key counts as held, each within `REPEAT_S` of the press before.
+
+Keyboards repeat a held key 10 to 30 times a second.
 """
 
 BURST = 8
@@ -50,6 +58,8 @@ class Keyboard:
     def __init__(self, linear: float, angular: float) -> None:
         self.linear, self.angular = linear, angular
         self._move = (0, 0)
+        self._pressed, self._repeats = 0.0, 0
+        """Monotonic time of the last press of a move, s, and the number of repeats until then."""
         self._until = 0.0
         self._old_until = 0.0
         """Monotonic time until which all keys belong to the last burst, s."""
@@ -72,7 +82,11 @@ class Keyboard:
             self.linear *= _SPEEDS[key][0]
             self.angular *= _SPEEDS[key][1]
         elif key in _MOVES:
-            self._move, self._until, self._zeros = _MOVES[key], now + HOLD_S, ZEROS
+            repeated = self._move == _MOVES[key] and now - self._pressed < REPEAT_S
+            self._repeats = self._repeats + 1 if repeated else 0
+            hold = REPEAT_S if self._repeats >= REPEATS else HOLD_S
+            self._move, self._pressed = _MOVES[key], now
+            self._until, self._zeros = now + hold, ZEROS
         else:
             # Any other key stops the robot, as in teleop_twist_keyboard.
             self._move, self._until, self._zeros = (0, 0), now, ZEROS

@@ -66,6 +66,13 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
     assert shown[-len(HELP) :] == list(HELP)
 
 
+def test_a_refused_key_that_is_held_is_to_be_let_go() -> None:
+    why = "send a zero first: teleop must send a zero before it can drive"
+    told = " ".join(news(replace(SEEN, objection=why), 200))
+    assert f"your keys do not drive: {why} (let go of the key, and press it again)" in told
+    assert "let go" not in " ".join(news(replace(SEEN, objection="stopped by anna"), 200))
+
+
 def test_keys_that_do_not_drive_are_reported() -> None:
     why = "app has the same priority and came first: wait until it is silent"
     seen = replace(SEEN, objection=why)

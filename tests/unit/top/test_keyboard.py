@@ -17,7 +17,7 @@ from acsard.core.messages.schema import RobotState
 from acsard.core.values import REST, Twist
 from acsard.daemon.bus.address import Address
 from acsard.top import keyboard
-from acsard.top.keyboard import HOLD_S, Keyboard, Ride, split
+from acsard.top.keyboard import HOLD_S, REPEAT_S, Keyboard, Ride, split
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
@@ -79,6 +79,25 @@ def test_a_repeated_press_extends_the_hold() -> None:
         keys.press("i", 10.0 + n * 0.5)
         assert keys.wish(10.0 + n * 0.5 + 0.499) == Twist(0.5, 0.0)
     assert keys.wish(19.5 + HOLD_S) == REST
+
+
+@each(("delay", "hz"), [(0.25, 30.0), (0.5, 30.0), (0.5, 10.9), (0.25, 5.0)])
+def test_a_held_key_drives_without_a_break_and_stops_soon_after_its_release(
+    delay: float, hz: float
+) -> None:
+    keys, last = pressed("i", 10.0), 10.0
+    for at in [10.0 + delay + n / hz for n in range(30)]:
+        assert keys.wish(at - 0.001) == Twist(0.5, 0.0)
+        keys.press("i", at)
+        last = at
+    assert keys.wish(last + REPEAT_S - 0.001) == Twist(0.5, 0.0)
+    assert keys.wish(last + REPEAT_S) == REST
+
+
+def test_two_taps_are_no_held_key() -> None:
+    keys = pressed("i", 10.0)
+    keys.press("i", 10.15)
+    assert keys.wish(10.15 + HOLD_S - 0.001) == Twist(0.5, 0.0)
 
 
 def test_another_key_changes_the_way_at_once() -> None:
