@@ -104,7 +104,7 @@ def test_two_minutes_end_as_they_always_did() -> None:
     ends_as_it_always_did(SHORT)
 
 
-@pytest.mark.soak
+@pytest.mark.slow
 def test_ten_minutes_end_as_they_always_did() -> None:
     ends_as_it_always_did(SLOW)
 

@@ -64,13 +64,17 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
 @each_way
 def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
     z = []
-    for robot, found, _, _ in robots(way, count):
+    for robot, found, player, _ in robots(way, count):
         values, std = found.multipliers.values, found.multipliers.std
-        z += [(values[0] - robot.chi * (1 + robot.rate * w)) / std[0] for w in (0, 0.5, 1)]
+        # The track is the best constant one, at the mean rate of all turns.
+        turned = np.concatenate([np.diff(made.yaw) for made in player.drives])
+        seconds = np.concatenate([np.diff(made.t) for made in player.drives])
+        rate = float(np.sum(turned**2 / seconds) / np.sum(np.abs(turned)))
+        z += [(values[0] - robot.chi * (1 + robot.rate * rate)) / std[0]]
         z += [(values[1] - robot.left) / std[1], (values[2] - robot.right) / std[2]]
     rms = np.sqrt(np.mean(np.square(z)))
     print(f"{way}: {np.mean(np.abs(z) < 2):.1%} of z within 2, rms {rms:.2f}")
-    assert np.mean(np.abs(z) < 2) >= (0.95 if count == MANY else 0.85)
+    assert np.mean(np.abs(z) < 2) >= (0.9 if count == MANY else 0.85)
     # Very large standard deviations would cover the truth as well, but they would be useless.
     assert count == FEW or rms > 0.3
 
