@@ -342,7 +342,7 @@ def _known(
 ) -> tuple[Floats, Floats]:
     """Return the normal equations of the prior information at these parameters.
 
-    `held` has the constraints, and `usual` the prior standard deviations.
+    `held` contains the constraints, and `usual` the prior standard deviations.
     """
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():

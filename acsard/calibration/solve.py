@@ -372,7 +372,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
     if not found:
         shares = " and ".join(f"{name} only to {share:.1%}" for name, share in deviations.items())
         raise RefusedError(
-            f"this log determines {shares}, which is too inaccurate: {DRIVE}"
+            f"this log determines {shares}. That is too inaccurate: {DRIVE}"
             if shares
             else f"the search for the parameters does not converge: {DRIVE}"
         )

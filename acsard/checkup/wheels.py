@@ -236,7 +236,7 @@ def run_up(board: Board, motors: Motors) -> Motors:
 
 
 def _patience_s(board: Board, told: list[int]) -> float:
-    """Return how long the commanded motors `told` are held, s: longer while one still speeds up."""
+    """Return how long to command the motors `told`, s: longer while one of them still speeds up."""
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
     return motion.PATIENCE_S if rises else motion.MOTOR_S

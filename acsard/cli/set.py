@@ -116,7 +116,8 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
         raise UsageError("name one robot in --id to list its settings")
     if args.write:
         raise UsageError(
-            f"--write changes the file of this machine, but --id '{args.id}' names several robots: "
+            f"--write changes only the file of this machine, but --id '{args.id}' names several "
+            "robots: "
             "with --keep each robot writes its own file"
         )
 

@@ -49,7 +49,7 @@ def robot_description(path: str) -> str:
             data = opened.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise _error(
-            path, 'there is no such file; write its whole path, or ros.urdf = "" for no description'
+            path, 'there is no such file; give its full path, or ros.urdf = "" for no description'
         ) from None
     except PermissionError:
         raise _error(
@@ -68,7 +68,7 @@ def robot_description(path: str) -> str:
             raise _error(path, f"it has a document type, {DOCUMENT_TYPE} ...>; take it out")
         root = ET.fromstring(text)
     except UnicodeDecodeError:
-        raise _error(path, "it is not a text in UTF-8; save it as UTF-8") from None
+        raise _error(path, "it is not UTF-8 text; save it as UTF-8") from None
     except (ET.ParseError, ValueError) as error:
         raise _error(path, f"it is not XML ({error}); name the robot's URDF") from None
     if root.tag != "robot":

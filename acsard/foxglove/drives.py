@@ -41,7 +41,7 @@ def encoding_of(encoding: str, schema_name: str) -> str:
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
     if full not in (TWISTS[0], STAMPED_TWISTS[0]):
-        raise DecodeError("wrong_type", f"{schema_name or 'no type'}, but {TWISTS[0]} is needed")
+        raise DecodeError("wrong_type", f"the type is {schema_name or 'missing'}: send {TWISTS[0]}")
     if encoding == "cdr":
         return f"{encoding_name('cdr')};{full}"
     if encoding == "json":

@@ -63,7 +63,7 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return the shown topics, and the topics with a new viewer since the last call."""
+        """Return the viewed topics, and those that have gained a viewer since the last call."""
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh

@@ -33,7 +33,8 @@ def find(path: str | None) -> tuple[str, bytes]:
             return named, Path(named).read_bytes()
         except OSError as error:
             raise ExitError(
-                Exit.BAD_CONFIG, f"cannot read {named}: {error.strerror}; correct --config"
+                Exit.BAD_CONFIG,
+                f"cannot read {named}: {error.strerror}; correct --config, or its permissions",
             ) from None
     for place in PLACES:
         try:

@@ -130,7 +130,7 @@ def _hardware(name: str) -> Iterator[Finding]:
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))
         text = f"{usb[0].usb_id} is not one of the common boards ({known})"
-        yield Finding("port", "warning", text, "add it to 70-acsar.rules if it is your MCU")
+        yield Finding("port", "warning", text, "if it is your MCU, add its ids to 70-acsar.rules")
     timer = Path(f"/sys/class/tty/{name}/device/latency_timer")
     if timer.is_file() and timer.read_text().strip() != "1":
         text = f"its FTDI chip delays bytes by {timer.read_text().strip()} ms"
@@ -139,7 +139,7 @@ def _hardware(name: str) -> Iterator[Finding]:
 
 def _permission(path: str) -> Finding:
     if os.access(path, os.R_OK | os.W_OK):
-        return Finding("port", "ok", f"{path} may be read and written")
+        return Finding("port", "ok", f"{path} is readable and writable")
     try:
         group = Path(path).group()
     except KeyError:

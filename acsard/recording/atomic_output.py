@@ -104,7 +104,7 @@ def _require_bag(directory: Path) -> None:
         if path.is_symlink() or not path.is_file() or not of_bag:
             raise FileExistsError(
                 EEXIST,
-                f"it is a directory that also contains {path.name}, which is not a part of a ROS "
+                f"it is a directory that contains {path.name}, which is not a part of a ROS "
                 "bag; name another directory",
             )
         if path.suffix == ".mcap" and _recording(path):

@@ -158,7 +158,7 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Return the CRC-32 `before`, continued with all bits of poses, twists and wheel angles.
+    """Extend the CRC-32 `before` over all bits of the poses, twists and wheel angles; return it.
 
     `before` is the CRC-32 of the earlier estimates of the batch, or 0 if there is none.
     """

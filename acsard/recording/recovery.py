@@ -81,7 +81,7 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
 
 
 def _has_configuration(part: Path) -> bool:
-    """Return whether the file has its configuration. `Recording` refuses a file without it."""
+    """Return whether the file contains the configuration. Otherwise `Recording` refuses it."""
     return any(isinstance(place.record, Attachment) for place in walk(part.read_bytes()))
 
 

@@ -300,9 +300,7 @@ class _Machine:
         """Make an object without attributes, and without a call of its constructor."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
-            raise TypeError(
-                "it constructs an object that is not a class, or a class that needs values"
-            )
+            raise TypeError("it calls something that is not a class, or a class that needs values")
         if not _is_part(kind.value):
             raise ValueError(f"{kind.value.__name__} cannot be constructed without values")
         self._push(object.__new__(kind.value))

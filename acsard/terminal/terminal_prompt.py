@@ -93,7 +93,7 @@ class NoPrompt(Screen):
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Return the only answer as a confirmation, or None if the question needs an observer."""
+        """Return the answer if there is only one, or None if a person must look and answer."""
         return answers[0] if len(answers) == 1 else None
 
     def start(self, text: str, by_key: bool = False) -> None:

@@ -82,7 +82,8 @@ def drive(ride: Ride) -> None:
 def part(ride: Ride) -> None:
     """Wait until the robot has stopped, at most 2 s, and print a last report.
 
-    Without the wait, this report would say that the robot drives although it stops a moment later.
+    Without the wait, this report would say that the robot is driving, although it stops a moment
+    later.
     """
     left = time.monotonic()
     while os.isatty(0) and os.isatty(1):

@@ -1,4 +1,4 @@
-"""The parts of a wide screen below the mode. Each is a list of lines that starts with a rule.
+"""Builds the parts of a wide screen below the line of the mode, each below a rule.
 
 This module is pure.
 """

@@ -177,7 +177,7 @@ class Page:
         """Exchange a posted token for an `HttpOnly` cookie, which scripts cannot read."""
         form = await _token_posted(request)
         if not request.secure:
-            raise RefusedError("plain", "no token is needed here")
+            raise RefusedError("plain", "this robot uses no tokens: connect without one")
         who = await self._admission.owner(peer_of(request), [form.token])
         cookie = cookie_name(self._robots.id, own_port(request))
         shown = "" if form.replace else request.cookies.get(cookie, "")
@@ -202,7 +202,9 @@ class Page:
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
             # aiohttp would log the names of all protocols if it knew none of them.
-            raise RefusedError("malformed", f"offer the subprotocol {PROTOCOL} beside the token")
+            raise RefusedError(
+                "malformed", f"offer the subprotocol {PROTOCOL} as well as the token"
+            )
         if full := self._seats.enter(peer, who.token):
             raise RefusedError("too_many", full)
         try:

@@ -45,7 +45,7 @@ tokens."""
 
 
 class RefusedError(AcsardError):
-    """A refusal of a request or a message; the text has the reason and the remedy."""
+    """A refusal of a request or a message; the text gives the reason and the remedy."""
 
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(text)

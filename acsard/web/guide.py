@@ -4,7 +4,7 @@ Only one runs at a time. The child's lines (`--json-lines`, see terminal/json_pr
 connection that started it, and only that connection may send answers and key presses. If the
 connection ends, the child is interrupted as by Ctrl-C, so it still sends zero speeds to the board.
 The child also watches its standard input, so it does not outlive this server. Replies are not
-queued: a reply goes to the open question once, or is refused.
+queued: each question takes one reply, and any other reply is refused.
 """
 
 from __future__ import annotations

@@ -159,7 +159,7 @@ def decode(text: str) -> Frame:
     try:
         meant = [name for name in _heads.decode(text) if name in KINDS]
         if len(meant) != 1:
-            raise FrameError(about, f"needs one of {', '.join(KINDS)}")
+            raise FrameError(about, f"a message needs one of the fields {', '.join(KINDS)}")
         about = meant[0]
         frame = _decoders[about].decode(text)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -172,7 +172,7 @@ def _require(frame: Frame) -> None:
     """Raise `FrameError` for numbers that are out of range."""
     # JSON has no NaN, and msgspec refuses a number that is too large to be finite.
     if isinstance(frame, Command) and not 0.0 < frame.stamp < LATEST_STAMP_MS:
-        raise FrameError("cmd", "stamp must be ms since 1970 by your own clock")
+        raise FrameError("cmd", "stamp must be the time of the sender's clock in ms since 1970")
     if isinstance(frame, Subscribe) and not 0.0 < frame.rate <= MAX_RATE:
         raise FrameError("subscribe", f"rate must be above 0 and at most {MAX_RATE:g} a second")
 

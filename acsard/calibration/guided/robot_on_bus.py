@@ -288,5 +288,5 @@ class RobotOnBus:
         self._watch.look(time.monotonic())
 
     def _full(self, key: str) -> str:
-        """Return the full key. A key that `acsard topics` lists gets this robot's id in front."""
+        """Return the full key: one that `acsard topics` lists gets this robot's id in front."""
         return self._client.key(key) if by_key(key) is not None else key

@@ -222,8 +222,8 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         if float(np.abs(step).max()) < SMALL:
             return parameters, normal
     raise RefusedError(
-        "the measurements contradict each other: is each number in its unit, and was it measured "
-        "at the end that the question names? Start again"
+        "the measurements contradict each other: is each number in the unit that was asked for, "
+        "and was it measured at the end that the question names? Start again"
     )
 
 
@@ -256,9 +256,9 @@ The leg is "" for the questions before the first leg.
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
-    """Return the reading of a measurement after the leg `leg`, by the person's answers.
+    """Return the measurement that a person took after the leg `leg`, from their answers.
 
-    `rides` has the recordings by the names of their legs. Raises `RefusedError` if the answers are
+    `rides` maps the name of each leg to its recording. Raises `RefusedError` if the answers are
     impossible.
     """
     driven = tuple(rides[name] for name in measure.over or (leg,))

@@ -115,7 +115,7 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 class Difference(Struct, frozen=True):
-    """The values of a key in force and in the configuration file."""
+    """The value of a key that is in force, and its value in the configuration file."""
 
     its: object
     """Value in force."""

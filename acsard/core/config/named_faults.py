@@ -1,6 +1,6 @@
 """Reads the names of the simulator's faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
 
-The module has the tables of the names, and finds mistakes in `[sim] faults`. Methods with the same
+It holds the tables of the names, and finds mistakes in `[sim] faults`. Methods with the same
 names in `core/simulator/faults.py` produce the faults.
 """
 
@@ -105,7 +105,7 @@ def named(text: str) -> NamedFault:
             "give the charge at the start, 0 to 100 %, then the minutes that a full one lasts"
         )
     if name == "wrong_baud" and fault.values[0] not in get_args(Baud):
-        raise ValueError(f"rates are {', '.join(map(str, get_args(Baud)))}")
+        raise ValueError(f"the rate must be one of {', '.join(map(str, get_args(Baud)))}")
     return fault
 
 

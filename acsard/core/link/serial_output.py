@@ -83,7 +83,7 @@ class SerialOutput:
         return (b"\r\n" if self._torn else b"") + goes
 
     def took(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
-        """Record how many bytes the kernel accepted, and return whether the line was sent.
+        """Record how many bytes the kernel accepted, and return "sent" or "superseded".
 
         The result is "superseded" if the kernel did not accept all bytes, or if `prepare` had
         replaced the line by a stop. The remaining bytes are dropped.

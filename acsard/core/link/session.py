@@ -1,9 +1,9 @@
 """Follows one serial port through openings, losses and silences.
 
 The session decodes the bytes that the port received, and returns the good lines as feedback with
-their times. It also encodes the lines to the board. `negotiation.py` decides whether lines are
+their times. It also encodes the lines for the board. `negotiation.py` decides whether lines are
 plain or checked, and `link_state.py` decides whether the link may carry motion. The link does not
-come up while the session asks the board for the check.
+come up while the session asks the board whether it can send checked lines.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class ConsistencyChecks:
             self.gyro.forgive()
 
     def look(self, line: Feedback, rolled: Rolled) -> bool:
-        """Check a feedback line and `rolled`, the wheel angles since the line before it.
+        """Check a feedback line and `rolled`, the turns of the wheels since the line before it.
 
         Return whether a wheel has proved faulty. The caller must then recompute the earlier lines
         without this wheel.

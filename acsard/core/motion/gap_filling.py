@@ -157,7 +157,7 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Start a new span with the speeds `twist`, and discard the unfinished span."""
+        """Discard the unfinished span, and start a new one with the speeds `twist`."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 

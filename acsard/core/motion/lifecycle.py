@@ -107,11 +107,11 @@ class Lifecycle:
         self._latch(stop=self._made(now, "", why))
 
     def hold(self, why: str, mend: str, now_ns: int) -> None:
-        """Record whether the reports of the board forbid a clear.
+        """Record whether the reports of the board forbid the call `clear`.
 
         Args:
-            why: Why nothing may be cleared, "" if the board permits a clear.
-            mend: What the operator must do about it, "" if the board permits a clear.
+            why: Why `clear` may release nothing, "" if the board permits it.
+            mend: What the operator must do first, "" if the board permits it.
             now_ns: Monotonic time of this step, ns.
         """
         if self._held and not why:

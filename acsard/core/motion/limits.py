@@ -2,7 +2,7 @@
 
 There are two ways to move. `follow` obeys a commander and limits each axis by itself. `coast`
 brings the robot to rest without a commander. It reduces both axes in the same proportion, so that
-no wheel becomes faster meanwhile (invariant 2 of the package `acsard`). The jerk limit applies only
+no wheel speeds up in the process (invariant 2 of the package `acsard`). The jerk limit applies only
 to speeding up, because comfort must not delay braking.
 """
 

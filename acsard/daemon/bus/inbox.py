@@ -234,7 +234,7 @@ class Inbox:
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample on a ROS key.
+        """Queue a sample that arrived on a ROS key.
 
         It is treated like a sample on the native key for which the ROS key stands. A ROS sample has
         no encoding, so `endpoint` supplies the encoding.

@@ -60,7 +60,7 @@ def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequ
     if twice:
         raise UsageError(
             f"{', '.join(twice)}: named twice; name each certificate once, as a robot or in the "
-            f"list of one role, and do not name {', '.join(ROLES)}, which have their roles already"
+            f"list of one role. {', '.join(ROLES)} have their roles already: leave them out"
         )
     text = _BLOCK.sub(
         lambda block: "".join(_with(_NAME, robot, block[1]) for robot in robots), template

@@ -98,7 +98,7 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Return the data that is received until monotonic `until_ns`.
+        """Return the data that is received before the monotonic time `until_ns`.
 
         Each piece comes with the monotonic time of its read, ns. Raises `WireLostError` if the port
         is lost.

@@ -68,7 +68,7 @@ def test_the_help_and_the_ros_page_say_what_write_does_not_write(
     ("words", "why"),
     [
         ([], "name one robot in --id to list its settings"),
-        (["rates.state", "5", "--write"], "--write changes the file of this machine"),
+        (["rates.state", "5", "--write"], "--write changes only the file of this machine"),
     ],
 )
 def test_several_robots_are_refused_for_a_list_and_for_the_local_file(

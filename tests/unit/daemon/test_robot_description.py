@@ -63,7 +63,7 @@ def test_what_is_not_a_file_is_not_read(tmp_path: Path) -> None:
         ("", "not XML"),
         ("robot: acsar\n", "not XML"),
         ("<robot><link></robot>", "not XML"),
-        (b"<robot>\xff</robot>", "not a text in UTF-8"),
+        (b"<robot>\xff</robot>", "not UTF-8 text"),
         ("<sdf version='1.7'/>", "its outermost element is <sdf>"),
         (
             '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="a"/>'
