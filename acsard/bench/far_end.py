@@ -39,7 +39,7 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class NumberedMcu(FakeMcu):
-    """A simulated board with the usual timing. It reports another speed in each line."""
+    """A simulated board with the usual timing. It reports a different speed in each line."""
 
     def __init__(self, config: Config, now_ns: int) -> None:
         super().__init__(config, now_ns)
@@ -56,7 +56,7 @@ class NumberedMcu(FakeMcu):
 
 
 class FarEnd:
-    """The pty and the simulated board behind it, in one blocking loop."""
+    """The pty and the simulated board at its other end, in one blocking loop."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.seen = Seen()

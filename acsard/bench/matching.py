@@ -1,4 +1,4 @@
-"""The record of a benchmark, and the figures that are computed from it; pure.
+"""The record of a benchmark, and the figures that are computed from it. This module is pure.
 
 Successive commands and feedback lines of a benchmark have different speeds. So each output of the
 measured daemon is matched with its input by the speed, and not by the time. Times are monotonic, in
@@ -82,8 +82,8 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
     """Return the time from each command to its first line, ns. Lost commands are left out.
 
-    `sent` has the time of each command and the line that the daemon must make of it. `lines` has
-    the lines on the wire.
+    `sent` gives the time of each command and the line that the daemon must make of it. `lines`
+    gives the time and the content of each line on the wire.
     """
     times: dict[bytes, list[int]] = {}
     for at_ns, line in lines:
@@ -128,7 +128,7 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return the percentiles of durations; None for an empty sequence.
+    """Return the number, the percentiles and the maximum of durations; None if there are none.
 
     Each percentile is one of the measured durations, not an interpolation.
     """
@@ -162,7 +162,7 @@ class Sample(Struct, frozen=True):
 
     at: Instant
     stamp_ns: int
-    """Stamp by the wall clock, ns."""
+    """Stamp on the wall clock, ns since 1970."""
     speed: float
     """Linear speed, m/s."""
 
@@ -173,7 +173,7 @@ class Record(Struct, frozen=True):
     began_ns: int
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """The time that is evaluated, ns: from the end of the start-up to the begin of the shutdown."""
+    """The time that is evaluated, ns: from the end of the start-up to the start of the shutdown."""
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]

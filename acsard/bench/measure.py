@@ -1,7 +1,7 @@
 """Runs one benchmark and computes the figures from its record.
 
-The measured daemon uses the user's configuration with some changes, which is written to a temporary
-file.
+The measured daemon reads a temporary file with the user's configuration, in which some settings are
+changed.
 """
 
 from __future__ import annotations

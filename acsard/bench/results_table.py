@@ -32,7 +32,7 @@ OWN = {
 }
 """The figures that the daemon measures itself, and between which points.
 
-`latencies.Name` has their names.
+Their names are those of `latencies.Name`.
 """
 
 
@@ -115,7 +115,7 @@ def _cpu_model() -> str:
 
 
 def parts(result: Result) -> Iterator[RenderableType]:
-    """Yield the tables of the figures for people."""
+    """Yield tables of the figures, for people to read."""
     outside = _figures("measured from outside", POINTS, result.outside)
     own = _figures("measured by the daemon itself", OWN, result.own)
     yield table(_about(result))

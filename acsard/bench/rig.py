@@ -1,4 +1,4 @@
-"""A daemon under measurement: started as a user starts it, with both of its ends under control.
+"""Starts a daemon as a user starts it, and measures it from both ends: the bus and the serial port.
 
     bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  far_end.py (simulated MCU)
 
@@ -58,7 +58,8 @@ def ended(who: str, code: int, said: str = "") -> MendableError:
 def daemon_ended(code: int, log: Path) -> MendableError:
     """Return an error that says why the daemon ended by itself.
 
-    It has the daemon's own message from the file `log`, and its exit code, if they are known.
+    The error has the daemon's own message from the file `log`, and its exit code, if these are
+    known.
     """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
@@ -281,7 +282,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zeros until the daemon accepts them. It first checks the delay of a new sender."""
+        """Send zeros until the daemon accepts one. It first checks the delays of a new sender."""
         before = self._counted()
 
         def look() -> bool | None:

@@ -24,7 +24,7 @@ NAMES = (
 """Settings of `[drive]` in the order of `Multipliers.values`."""
 
 DIGITS = 5
-"""Number of decimals of the settings that are written."""
+"""Number of decimals of the multipliers, and of significant digits of `[odometry]`, as written."""
 
 
 class Refusal(Struct, frozen=True):
@@ -40,16 +40,16 @@ class Refusal(Struct, frozen=True):
 class Report(Struct, frozen=True):
     """The object that `--json` prints.
 
-    A field `..._error_before` has the error with the configured multipliers, and
+    A field `..._error_before` gives the error with the configured multipliers, and
     `..._error_after` the error with the new multipliers. Both are measured on parts of the log that
     the fit did not use. They are None if no sensor measures the error.
     """
 
     log: str
     reference: str
-    """Sensors or tool that the wheels were compared with, in words."""
+    """Sensors or measuring tool with which the wheels were compared, in words."""
     scale: str
-    """Sources of the wheels' size, in words. "" means that the mean radius stays as configured."""
+    """Sources of the size of the wheels, in words; "" if the mean radius stays as configured."""
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
@@ -64,12 +64,12 @@ class Report(Struct, frozen=True):
     odometry: dict[str, float]
     """New settings of `[odometry]` by name.
 
-    They are the standard deviations of the geometry and, if the noise is better, the noise.
+    They are the standard deviations of the geometry and, if `Noise.better` is true, the noise.
     """
     feedback: dict[str, float]
     """New settings of `[feedback]` by name.
 
-    It is empty unless the daemon takes healthy wheels for faulty with the present settings.
+    It is empty unless the configured settings make healthy wheels look faulty to the daemon.
     """
     effective_track: float
     """Effective track, m."""
@@ -94,27 +94,29 @@ class Report(Struct, frozen=True):
     """RMS position error over whole drives, m."""
     position_error_after: float | None
     heading_noise_before: float | None
-    """Standard deviation of the heading, deg, after 10 m of such driving, by the configured noise.
+    """Standard deviation of the heading, deg, after 10 m with the configured noise.
 
-    It is None if the noise settings of `[odometry]` stay as configured.
+    The drive turns as much per metre as the log. The value is None if the noise settings of
+    `[odometry]` stay as configured.
     """
     heading_noise_after: float | None
-    """Standard deviation of the heading, deg, after 10 m of such driving, by the new noise.
+    """Standard deviation of the heading, deg, after 10 m with the new noise.
 
-    It is None if the noise settings of `[odometry]` stay as configured.
+    The drive turns as much per metre as the log. The value is None if the noise settings of
+    `[odometry]` stay as configured.
     """
     distance_noise_before: float | None
-    """Standard deviation of the distance, m, after 10 m of such driving, by the configured noise.
+    """Standard deviation of the distance, m, after 10 m with the configured noise.
 
     It is None if the noise settings stay as configured, or if the log has no positions.
     """
     distance_noise_after: float | None
-    """Standard deviation of the distance, m, after 10 m of such driving, by the new noise.
+    """Standard deviation of the distance, m, after 10 m with the new noise.
 
     It is None if the noise settings stay as configured, or if the log has no positions.
     """
     time_offsets: dict[str, float]
-    """Delay of each sensor behind the wheels, s, by the name of the sensor."""
+    """Delay of each sensor's times relative to those of the wheels, s, by the sensor's name."""
     gyro_bias: float
     """Gyro bias, rad/s."""
     runs: int
@@ -174,7 +176,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the standard deviations of heading (deg) and distance (m) by noise.
+    """Return the standard deviations of heading (deg) and distance (m) that noise causes.
 
     They are `NOTHING` if the noise settings stay as configured.
     """

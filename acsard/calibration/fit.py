@@ -1,10 +1,11 @@
 """Fits the parameters of the calibration to the evidence of all sensors.
 
 The evidence of a sensor is the normal equations that it contributes. The fit is a Gauss-Newton fit
-on sums over blocks. The standard deviations come from a jackknife over the blocks (Quenouille and
-Tukey): each block is left out in turn, and the changes of the parameters show the effect of chance.
-This is right even if the errors within a block are correlated. The change is computed by one linear
-step. If there are few blocks, the standard deviation is widened to that of Student's t.
+on sums over blocks (a block is a few seconds of driving). The standard deviations come from a
+jackknife over the blocks (Quenouille and Tukey): each block is left out in turn, and the changes of
+the parameters show the effect of chance. These deviations are right even if the errors within a
+block are correlated. Each change is computed by one linear step from the whole fit. If there are
+few blocks, the standard deviation is widened to that of Student's t.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from acsard.core.config.settings import DriveConfig
 
 
 class P(IntEnum):
-    """Indices of the parameters, which are an array of `COUNT` numbers."""
+    """Indices into the array of parameters, which contains `COUNT` numbers."""
 
     LEFT = 0
     """Ratio of the left wheels' radius to the configured wheel radius."""
@@ -33,11 +34,11 @@ class P(IntEnum):
     TRACK_GROWTH = 3
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     DELAY = 4
-    """Delay of the positions behind the wheels, s."""
+    """Delay of the times of the positions relative to those of the wheels, s."""
     SENSOR_X = 5
-    """Distance of the sensor of positions ahead of the robot's middle, m."""
+    """Distance by which the position sensor is ahead of the robot's middle, m."""
     SENSOR_Y = 6
-    """Distance of the sensor of positions to the left of the robot's middle, m."""
+    """Distance by which the position sensor is to the left of the robot's middle, m."""
     BIAS_ERROR = 7
     """Error of the gyro's bias, rad/s."""
     SCALE_ERROR = 8
@@ -47,7 +48,7 @@ class P(IntEnum):
 COUNT = len(P)
 
 HUBER = 2.0
-"""Ratio of a residual to the usual size above which the weight of the residual falls (Huber)."""
+"""Huber's threshold: the weight of a residual falls above this multiple of the usual size."""
 
 
 class Base(Struct, frozen=True):
@@ -105,10 +106,11 @@ class Evidence(Struct, frozen=True):
 def of_rows(
     jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
 ) -> Evidence:
-    """Return the evidence of rows, summed by block.
+    """Return the evidence of one sensor from its rows, summed by block.
 
-    Each row has the derivatives of its prediction (`jacobian`, shape (rows, COUNT)), its measured
-    minus its predicted value (`residual`), its weight and the number of its block.
+    Each row gives the derivatives of its prediction (`jacobian`, shape (rows, COUNT)), its measured
+    minus its predicted value (`residual`), its weight and the number of its block. `blocks` is the
+    number of blocks.
     """
     normal = np.zeros((blocks, COUNT, COUNT))
     score = np.zeros((blocks, COUNT))
@@ -132,9 +134,9 @@ def condition(normal: Floats) -> float:
 
 
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
-    """Return Huber's weight of each residual: 1 for a usual one, and less for an outlier.
+    """Return Huber's weight of each residual: 1 up to `HUBER` usual sizes, less for an outlier.
 
-    The usual size is the standard deviation estimated from the median, but at least `least`.
+    The usual size is the standard deviation, estimated from the median, and at least `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
@@ -146,13 +148,13 @@ Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Limits for the change of radii and track in a step.
+"""Limits for the change of the radii and the track in one step of the fit.
 
 A step below `SMALL` ends the fit. The fit has converged if its last step is below `SETTLED`.
 """
 
 USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
-"""Prior standard deviations of parameters that a log may not determine, in their own units."""
+"""Prior standard deviations of parameters that some logs do not determine, in their own units."""
 
 GYRO_SCALE = 0.005
 """Prior standard deviation of a MEMS gyro's scale, as a fraction.
@@ -161,22 +163,22 @@ Only a comparison with positions shows the error of the scale.
 """
 
 HELD = 1e9
-"""Weight in the normal equations of a constraint (`Held`), large enough to hold it.
+"""Weight of a constraint (`Held`) in the normal equations, large enough to enforce it.
 
-For example, a constraint holds the mean radius if no sensor measures it.
+For example, a constraint fixes the mean radius if no sensor measures it.
 """
 
 Held = tuple[Floats, float]
-"""Constraint of a fit: it holds a weighted sum of the parameters at a value.
+"""Constraint of a fit that fixes a weighted sum of the parameters at a value.
 
-The weights of the parameters, shape (COUNT,), come first, and then the value.
+The tuple contains the weights of the parameters, shape (COUNT,), and the value.
 """
 
 MANY = 16
 """Minimum number of blocks for a jackknife that also leaves out pairs of neighbouring blocks."""
 
 LEAST_BLOCKS = 5
-"""Minimum number of blocks. Fewer blocks do not show how much blocks differ."""
+"""Minimum number of blocks, or of runs, that a jackknife needs to show how much they differ."""
 
 
 def student_factor(free: Floats | float) -> Floats:
@@ -189,7 +191,7 @@ def student_factor(free: Floats | float) -> Floats:
 
 
 class Fit(Struct, frozen=True):
-    """The result of a fit: the parameters, and the normal equations of each block at this point."""
+    """The result of a fit: the parameters, and each block's normal equations at them."""
 
     parameters: Floats
     normal: Floats
@@ -205,7 +207,7 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters without the evidence of the blocks in this mask.
+        """Return the parameters without the evidence of the blocks in the mask `blocks`.
 
         They are computed from the fit to all blocks by one linear step.
         """
@@ -217,8 +219,8 @@ class Fit(Struct, frozen=True):
     def marginal(self) -> Floats:
         """Return the normal equations of both radii and the inverse track.
 
-        All other parameters are eliminated. If no sensor measures the mean radius, the result has
-        only two parameters: the difference of the radii, and the inverse track.
+        All other parameters are eliminated. If no sensor measures the mean radius, the equations
+        have only two unknowns: the difference of the radii, and the inverse track.
         """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > P.INVERSE_TRACK]
@@ -229,10 +231,10 @@ class Fit(Struct, frozen=True):
         return np.asarray(free @ three @ free.T)
 
     def covariance(self, runs: Sequence[int] = ()) -> Floats:
-        """Return the covariance of the parameters by the jackknife and the prior assumptions.
+        """Return the covariance of the parameters, from the jackknife and the prior information.
 
-        `runs` has the number of the run of each block. With at least `LEAST_BLOCKS` runs, the
-        jackknife also leaves out whole runs. () means that it does not.
+        `runs` gives the number of the run of each block. If there are at least `LEAST_BLOCKS` runs,
+        the jackknife also leaves out whole runs. With () it does not.
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
@@ -251,12 +253,12 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return the changes of the parameters without each group of blocks, and their variances.
+        """Return how the parameters change without each group of blocks, and their variances.
 
-        `group` has the number of the group of each block. The variances are those of the jackknife,
-        widened to those of Student's t. If a few groups cause most of a variance, it has only that
-        many degrees of freedom. Satterthwaite's estimate gives their number (An approximate
-        distribution of estimates of variance components, 1946).
+        `group` gives the number of the group of each block. The variances are those of the
+        jackknife, widened to those of Student's t. A variance that a few groups cause has few
+        degrees of freedom. Their number is Satterthwaite's estimate (An approximate distribution of
+        estimates of variance components, 1946).
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
@@ -279,7 +281,7 @@ def fit(
         places, gyro: whether positions and a gyro are among the sources.
         bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not change
             the bias.
-        held: combinations of parameters that the fit does not change.
+        held: constraints that the fit keeps.
     """
     active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
     usual = dict(USUAL)

@@ -23,12 +23,15 @@ from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
-"""Shortest rest for the bias, and the margin at both ends in which the robot may shake, s."""
+"""Shortest rest that shows the bias of a gyro, and the margin cut off its ends, s.
+
+In the margin, the robot may still shake.
+"""
 
 TURNED_BY_HAND = 0.05
-"""Difference between a rest's bias and the usual one, rad/s, that shows a turn by hand.
+"""Largest difference between the bias in a rest and the median bias, rad/s.
 
-A rest with a larger difference is not used.
+A larger difference shows that a person turned the robot, so the rest is not used.
 """
 
 LEAST_SAMPLES = 5
@@ -38,10 +41,10 @@ OUTLIER = 6.0
 """Multiple of the median deviation above which a gyro sample at rest is left out."""
 
 WALK = 5e-5
-"""Smallest random walk of the gyro bias that is assumed, rad/s per square root of a second."""
+"""Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
 
 UNSEEN_WALK = 2e-4
-"""Random walk of the gyro bias that is assumed if no run has two rests.
+"""Random walk assumed for the gyro bias if no run has two rests.
 
 It is in rad/s per square root of a second.
 """
@@ -53,24 +56,25 @@ GRID_S, FURTHEST_S = 0.02, 2.0
 """Step and range of the search for the sensor's delay, s."""
 
 DEGREES = 10.0
-"""Ratio of the turn by a yaw to that by the wheels above which the yaw must be in degrees."""
+"""Ratio of the turns of a yaw to those of the wheels above which the yaw must be in degrees."""
 
 
 class Heading(Struct, frozen=True):
-    """The heading of a run as a sensor measures it, rad, at the sensor's own times."""
+    """The heading of a run as a sensor measured it, at the sensor's own times."""
 
     t: Floats
     """Times of the sensor's samples, s."""
     angle: Floats
+    """Heading at these times, rad."""
     gaps: Floats
     """Gaps between the samples, one row (begin, end) each, in s."""
 
 
 class Headings(Struct, frozen=True):
-    """The headings of all runs by one sensor, and the sensor's delay and bias."""
+    """The headings of all runs, measured by one sensor, and the sensor's delay and bias."""
 
     source: str
-    """Column of the log that the headings come from."""
+    """Column of the log from which the headings come: "yaw_rate" or "yaw"."""
     of: tuple[Heading, ...]
     """The heading of each run."""
     delay: float
@@ -78,10 +82,10 @@ class Headings(Struct, frozen=True):
     bias: float
     """Median of the gyro's bias in all rests, rad/s; 0 without a gyro.
 
-    The bias that was subtracted from the turn rates is interpolated between the rests instead.
+    The correction of the turn rates does not use this median, but interpolates between the rests.
     """
     bias_unknown: bool
-    """Whether the robot never rested. A comparison with the wheels then has to show the bias."""
+    """Whether the robot never rested, so that only a comparison with the wheels shows the bias."""
     bias_std: float = 0.0
     """Standard deviation of the bias while the robot moves, rad/s.
 
@@ -93,7 +97,7 @@ TURNING = 0.05
 """Turn rate up to which the robot is considered to drive straight, rad/s."""
 
 FASTEST = 0.95
-"""Fraction of the turned angle that the robot turned more slowly than `Rates.fastest`."""
+"""Fraction of the whole turned angle that the robot turned at a rate below `Rates.fastest`."""
 
 
 class Rows(Struct, frozen=True):
@@ -102,14 +106,14 @@ class Rows(Struct, frozen=True):
     block: npt.NDArray[np.int64]
     """Number of the block of each interval."""
     turned: Floats
-    """Turn by the heading sensor, rad; 0 without one."""
+    """Turn according to the heading sensor, rad; 0 without one."""
     left: Floats
     """Angle by which the left wheels rolled, rad."""
     right: Floats
     fast: Floats
     """Integral of |w| w, rad2/s, where w is the speed of the right minus the left wheels, rad/s.
 
-    It shows a track that grows with the turn rate.
+    If the track grows with the turn rate, the turn changes in proportion to this integral.
     """
     seconds: Floats
     """Length of each interval, s."""
@@ -125,7 +129,7 @@ class Rates(Struct, frozen=True):
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
-    """Return the headings by the column yaw_rate, or None if no run has it.
+    """Return the headings integrated from the column yaw_rate, or None if no run has this column.
 
     Raises `LogError` if the turn rate never changes.
     """
@@ -154,7 +158,7 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
 
 
 def of_yaw(driven: Sequence[Run], gain: float) -> Headings | None:
-    """Return the headings by the column yaw, or None if no run has it.
+    """Return the headings in the column yaw, or None if no run has this column.
 
     Raises `LogError` if the yaw is in degrees, because jumps of 360 would not be recognized as
     whole turns. `gain` is the configured wheel radius divided by the wheel separation.
@@ -197,11 +201,11 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return the mean of the samples of a rest without outliers, and the variance of this mean.
+    """Return the mean of a rest's gyro samples without outliers, and the variance of this mean.
 
     The variance comes from the means of five parts, so it is right for correlated noise as well.
-    The median of a coarse gyro would be wrong, because it is always one of the discrete values that
-    the gyro reports.
+    The function does not use the median, because the median of a coarse gyro is always one of the
+    discrete values that the gyro reports.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
@@ -216,8 +220,8 @@ def _mean(samples: Floats) -> tuple[float, float]:
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     """Return the standard deviation of the mean bias over all runs, rad/s.
 
-    It is caused by the noise in the rests and by the random walk of the bias outside of them.
-    `seconds` has the length of each run, s.
+    The mean is uncertain because of the noise in the rests, and because the bias walks at random
+    outside of them. `seconds` contains the length of each run, s.
     """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
@@ -244,8 +248,8 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    `found` has the heading of each run by the sensor. The turns of the wheels are the differences
-    of both sides. If the sign of one side is wrong, they are the sums, so both are tried.
+    `found` contains the sensor's heading of each run. A turn of the wheels is the difference of
+    both sides. If the sign of one side is wrong, it is the sum, so the function tries both.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -312,7 +316,7 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of a log. `by_wheels` has the turn of each row by the wheels, rad."""
+    """Return the turn rates of a log. `by_wheels` is the turn of the wheels in each row, rad."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -326,7 +330,7 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def level(rows: Rows) -> Rows:
-    """Subtract from the motion in the rows the part that is proportional to time.
+    """Return the rows without the part of the motion that is proportional to time.
 
     An unknown constant gyro bias then has no effect on a comparison with the wheels.
     """
@@ -345,7 +349,7 @@ def _fast(run: Run) -> Floats:
 
 
 NOISE, SHARE = 0.01, 0.03
-"""Usual residual of a row: `NOISE` rad per second, and the fraction `SHARE` of the turn.
+"""The two parts of a row's usual residual: `NOISE` rad/s, and the fraction `SHARE` of its turn.
 
 The usual residual is the root of the sum of their squares. A row with a much larger residual is an
 outlier.
@@ -367,7 +371,7 @@ def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence of the rows at these parameters, for `blocks` blocks."""
+    """Return the evidence of the rows at these parameters. `blocks` is the number of blocks."""
     turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), COUNT))
@@ -385,14 +389,14 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
 
 
 def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
-    """Return Huber's weight of each row. `by_wheels` has the turns according to the wheels, rad."""
+    """Return Huber's weight of each row. `by_wheels` contains the turns of the wheels, rad."""
     return huber(residual / np.hypot(NOISE * rows.seconds, SHARE * by_wheels), 1.0)
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
     """Return the bias of the heading sensor, rad/s: its turn rate minus that of the wheels.
 
-    `by_wheels` has the turn of each row according to the wheels, rad.
+    `by_wheels` contains the turn of the wheels in each row, rad.
     """
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
@@ -421,5 +425,5 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the turn of each row by the wheels, rad. `sides` has the two factors from `first`."""
+    """Return the turn of the wheels in each row, rad. `sides` contains the factors from `first`."""
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

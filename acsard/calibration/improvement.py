@@ -1,9 +1,9 @@
 """The improvement that a calibration brings, measured on whole drives that the fit did not use.
 
-Each run is left out in turn, and the parameters that were found without it are tested on it. If the
-log has fewer than three runs, each fifth of the log is left out instead. The tool chooses between
-several fits by the error in these tests. It gives no values that are worse than the configured
-ones.
+Each run is left out in turn: the parameters are fitted without it, and then tested on it. If the
+log has fewer than three runs, each fifth of the log is left out instead. The errors in these tests
+decide between several fits. A calibration never proposes values that are worse in these tests than
+the configured ones.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from acsard.calibration.runs import Block, Mask, Run, cumulative
 
 FOLDS = 5
 LEAST_RUNS = 3
-"""Minimum number of runs of a log. With fewer runs, parts of the log are left out, not runs."""
+"""Minimum number of runs for leaving out whole runs. With fewer, fifths of the log are left out."""
 
 STRAIGHT = 0.1
-"""Largest curvature of a straight drive according to the wheels, rad/m."""
+"""Largest curvature, according to the wheels, at which a drive counts as straight, rad/m."""
 
 STRAIGHT_M = 1.0
-"""Minimum total length of the straight drives for which their error is given, m.
+"""Minimum total length of the straight drives, m. If they are shorter, their error is not given.
 
-An error after 10 m that is extrapolated from a few millimetres would be noise.
+The error is given per 10 m, and an extrapolation from a few millimetres would be noise.
 """
 
 
 class BeforeAfter(Struct, frozen=True):
-    """An error with the configured and with the new multipliers; None if no sensor measures it."""
+    """An error with the configured and the new multipliers. Both are None if no sensor shows it."""
 
     before: float | None
     """The error with the configured multipliers."""
@@ -47,10 +47,10 @@ class BeforeAfter(Struct, frozen=True):
 NOTHING = BeforeAfter(None, None)
 
 SURE = 2.0
-"""Number of standard deviations by which a sure gain exceeds 0, as for a confidence of 95 %."""
+"""Number of standard deviations by which a gain must exceed 0 to be sure (95 % confidence)."""
 
 HALVED = float(np.log(2.0))
-"""Gain that is always sure, whatever its standard deviation is: the error is halved.
+"""Gain at which the error is halved. It is sure even if its standard deviation is large.
 
 In a guided drive, a single leg may show nearly all of the error, so the deviation is large.
 """
@@ -59,8 +59,8 @@ NEAR, FAR = 2.0, 3.0
 """Distances of the new multipliers from the configured ones, in standard deviations.
 
 Up to `NEAR`, the log does not contradict the configured multipliers. Chance causes a distance
-above `FAR` in one log of thirty. Above `FAR`, the necessary gain falls with the distance: at twice
-`FAR` it is half as large.
+above `FAR` in one log of thirty. Above `FAR`, the smallest gain that is sure falls with the
+distance: at twice `FAR` it is half as large.
 """
 
 LEAST_SQUARE = 1e-9
@@ -73,7 +73,7 @@ class Improvement(Struct, frozen=True):
     turn: BeforeAfter
     """Heading error after a turn of 360 deg, deg."""
     straight: BeforeAfter
-    """Heading error after 10 m straight ahead, deg, by turns that the wheels do not show.
+    """Heading error after 10 m straight ahead, deg: the turn that the wheels do not show.
 
     It is None if the straight drives together are shorter than `STRAIGHT_M`.
     """
@@ -87,13 +87,16 @@ class Improvement(Struct, frozen=True):
     If the log has headings and positions, it is the sum of both logarithms.
     """
     chance: float = 0.0
-    """Standard deviation of `gain` by the differences between drives, widened as Student's t."""
+    """Standard deviation of `gain`, from the differences between drives.
+
+    If there are few drives, it is widened to that of Student's t.
+    """
     apart: float = FAR
     """Distance of the new multipliers from the configured ones, in standard deviations."""
 
     @property
     def sure(self) -> bool:
-        """Whether the new multipliers are better by more than chance explains."""
+        """Whether the new multipliers are better by more than chance can explain."""
         least = SURE * self.chance * min(1.0, FAR / max(NEAR, self.apart))
         return self.apart > NEAR and self.gain > min(least, HALVED)
 
@@ -111,7 +114,7 @@ class Fold(Struct, frozen=True):
 
 
 def drives(driven: Sequence[Run]) -> list[Block]:
-    """Return the drives that are left out in turn: the whole runs, or fifths of the log."""
+    """Return the drives that are left out in turn: whole runs, or fifths of the log."""
     longest = np.inf
     if len(driven) < LEAST_RUNS:
         longest = sum(float(run.t[-1]) for run in driven) / FOLDS
@@ -123,7 +126,7 @@ def drives(driven: Sequence[Run]) -> list[Block]:
 
 
 def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
-    """Return the positions of a drive, split at jumps and at gaps of the wheels."""
+    """Return the positions of a drive, split at jumps and at gaps between the wheel samples."""
     gaps = driven[drive.run].gaps
     edges = np.concatenate(([drive.begin], gaps.ravel(), [drive.end])).clip(drive.begin, drive.end)
     pieces = [Block(drive.run, float(a), float(b)) for a, b in edges.reshape(-1, 2)]
@@ -131,9 +134,11 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 
 
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
-    """Return a fold for each drive of `left_out`, without the blocks `parts` that overlap it.
+    """Return a fold for each drive of `left_out`.
 
-    A drive that overlaps no block, or all of them, has no fold.
+    Its parameters are those of `fit` without the blocks that overlap the drive. Their track is
+    constant, and fits the mean of the turn rates `rate`. `parts` contains all blocks of the fit. A
+    drive that overlaps no block, or all of them, has no fold.
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
@@ -147,7 +152,7 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
-    """Return the parameters with one track for all turn rates: that at the mean turn rate.
+    """Return the parameters with the track at the mean turn rate, constant for all turn rates.
 
     The odometry also uses one track for all turn rates.
     """
@@ -167,7 +172,7 @@ def improvement(
         held: the folds of the fit.
         configured: the parameters with the configured multipliers.
         base: the configured geometry.
-        rows: the log's rows, with the turns by the heading sensor. Without a sensor they are 0.
+        rows: the log's rows, with the turns of the heading sensor. Without a sensor they are 0.
         places: for each fold, the measured positions of the drive that it left out.
         steps: the wheel steps of each run.
     """
@@ -202,7 +207,7 @@ def improvement(
 def rms(sums: Floats) -> BeforeAfter:
     """Return the RMS errors before and after.
 
-    `sums` has the sum of squares before, the sum of squares after, and the number of samples.
+    `sums` contains the sum of squares before, the sum of squares after, and the number of samples.
     """
     before, after, count = sums.tolist()
     if not count:
@@ -211,10 +216,10 @@ def rms(sums: Floats) -> BeforeAfter:
 
 
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
-    """Return the errors before and after for a drive of the amount `unit`.
+    """Return the errors before and after, scaled to a drive over the angle or distance `unit`.
 
-    `sums` has the sum of errors before, the sum of errors after, and the amount that was driven.
-    The amount is an angle or a distance.
+    `sums` contains the sum of errors before, the sum of errors after, and the angle or distance
+    that was driven.
     """
     before, after, amount = sums.tolist()
     if not amount:
@@ -225,8 +230,8 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     """Return `Improvement.gain` and `Improvement.chance`.
 
-    `kinds` has one array for each kind of error, with a row for each drive: the sum of squares
-    before, the sum of squares after, and the number of samples.
+    `kinds` contains one array for each kind of error. Its row for each drive gives the sum of
+    squares before, the sum of squares after, and the number of samples.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -240,10 +245,10 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 
 
 def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
-    """Return the gain of the drives in a mask, and its standard deviation.
+    """Return the gain of the drives in the mask `drives`, and its standard deviation.
 
-    `gain` computes the gain of the drives in a mask. The standard deviation is that of the
-    jackknife over the drives. It is infinite for a single drive.
+    `gain` is the function that computes the gain of the drives in a mask. The standard deviation is
+    that of the jackknife over the drives. It is infinite for a single drive.
     """
     count = int(drives.sum())
     if count == 1:
@@ -256,9 +261,10 @@ def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, flo
 def _by_group(
     before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
 ) -> Floats:
-    """Return the sum of the groups' absolute errors before, that after, and `amount`.
+    """Return the sum of the groups' absolute errors before, the same sum after, and `amount`.
 
-    The error of a group is the sum over its rows. Only the rows in the mask `among` are used.
+    `before` and `after` contain the error of each row, and `group` the number of its group. The
+    error of a group is the sum over its rows. Only the rows in the mask `among` are used.
     """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
@@ -267,7 +273,8 @@ def _by_group(
 def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
     """Return the sums of squared heading errors before and after, deg2, and their number.
 
-    The result has a row for each fold. `before` and `after` have the error of each row's turn, rad.
+    The result has a row for each fold. `before` and `after` contain the error of the turn in each
+    of the `rows`, rad.
     """
     found = np.zeros((len(held), 3))
     for number, fold in enumerate(held):
@@ -299,7 +306,7 @@ def _of_positions(
 
 
 def no_better(found: Improvement) -> str:
-    """Return the message that the new multipliers are not surely better, with both errors."""
+    """Return the message that the new multipliers are not surely better. It states both errors."""
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} then"
         for name, error, unit, factor in (

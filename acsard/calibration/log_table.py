@@ -73,7 +73,7 @@ BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
 """Absolute values above which a value is impossible, in the SI unit of its column.
 
-`BOUNDS` has them by column, and `PLACE_BOUND` is for all other columns. Values in degrees and
+`BOUNDS` lists them by column, and `PLACE_BOUND` is for all other columns. Values in degrees and
 nanoseconds stay below these bounds, so that later checks can name the wrong unit.
 """
 
@@ -84,7 +84,7 @@ SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
 A spike is more than `SPIKE` times as large as each of its neighbours and as the usual rate. Only
-the fraction `FEW_VALUES` of the rates above `SLOW` rad/s exceeds the usual rate. A robot that
+the fraction `FEW_VALUES` of the rates above `SLOW` rad/s exceeds this usual rate. A robot that
 rarely moves can also exceed the usual rate by this factor, but not in a single sample.
 """
 
@@ -92,7 +92,7 @@ rarely moves can also exceed the usual rate by this factor, but not in a single 
 def bounded(columns: dict[str, Floats]) -> Iterator[str]:
     """Replace impossible values by NaN in place, and yield a sentence for each changed column.
 
-    `columns` has the columns of the log by name, in SI units.
+    `columns` contains the columns of the log by name, in SI units.
     """
     order = np.argsort(columns["t"], kind="stable")
     for name, values in columns.items():
@@ -109,7 +109,7 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 
 
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Return a mask of the rows that are spikes; `order` sorts the rows by time.
+    """Return a mask of the rows that are spikes. `order` contains their indices, sorted by time.
 
     A spike stands out from its neighbours both in the order of the file and in the order of time.
     If rows are shuffled or come from several drives, a true turn may stand out in one of these
@@ -149,7 +149,7 @@ MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a"
 """Contents of a cell without a value, in lower case."""
 
 COUNTS = re.compile(r"tick|count|(?:^|_)enc")
-"""Pattern for names of columns with encoder counts. To rename such a column is no remedy."""
+"""Pattern for names of columns with encoder counts. Renaming such a column does not help."""
 
 COMMENTS = ("#", "%")
 """First characters of the comment lines above the table."""
@@ -198,8 +198,8 @@ class Table(Struct, frozen=True):
     def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
         """Return the table of one run. Each sample of each sensor is a row.
 
-        The rows are sorted by time. Each of `sensors` has its columns by name: "t", and columns
-        that no other sensor has.
+        The rows are sorted by time. Each element of `sensors` maps names to columns: "t", and
+        columns that no other sensor has.
         """
         ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
         columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
@@ -236,7 +236,7 @@ def _text(data: bytes) -> str:
 def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
     """Return the number of lines above the data, the names with their units, and the separator.
 
-    If the first line of the table has numbers, the last comment line above it is the header,
+    If the first line of the table contains numbers, the last comment line above it is the header,
     because numpy and some other programs write the header as a comment.
     """
     comment = ""
@@ -317,7 +317,7 @@ def _columns(header: list[str], number: int) -> list[str]:
 
 
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
-    """Return a hint to a column of `header` that may be meant by one of `names`, or ""."""
+    """Return a hint at a column of `header` that is probably one of the missing `names`, or ""."""
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (is {times[0][:40]} it? rename it t, in s)"

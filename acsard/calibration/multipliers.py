@@ -1,7 +1,8 @@
 """The multipliers that the parameters of a fit give, and their correction by a tape measure.
 
-A log of turn rates alone shows the ratios of the multipliers. A distance that was measured by tape
-shows how large the wheels are.
+The multipliers scale the configured wheel separation and wheel radii. A log of turn rates alone
+shows the ratios of the multipliers. A distance that was measured by tape shows how large the wheels
+are.
 """
 
 from __future__ import annotations
@@ -68,13 +69,14 @@ class Multipliers(Struct, frozen=True):
     def apart(self, base: Base) -> float:
         """Return how far these multipliers are from the configured ones, in standard deviations.
 
-        A combination of multipliers that no sensor measures is equal in both, and adds nothing.
+        A combination of multipliers that no sensor measures is equal in both sets, and adds
+        nothing.
         """
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
 
     def own(self) -> Deviations:
-        """Return the standard deviations of these multipliers as `[odometry]` declares them.
+        """Return the standard deviations of these multipliers in the form that `[odometry]` uses.
 
         The odometry treats the three deviations as independent.
         """
@@ -84,16 +86,17 @@ class Multipliers(Struct, frozen=True):
 
 
 def configured(base: Base) -> Multipliers:
-    """Return the configured multipliers. Their covariance is unknown, and is given as zero."""
+    """Return the configured multipliers. Their covariance is unknown and set to zero."""
     return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
 
 
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that fit best at the turn rates of the log.
 
-    `parameters` and `covariance` are those of a fit, and `rate` has the turn rates of the log. The
-    variance of the track is that of the constant track that is best at these rates. It does not
-    include that some turns skid more than others: this belongs to the noise of the odometry.
+    `parameters` and `covariance` are those of a fit, and `rate` gives the turn rates of the log.
+    The variance of the track is that of the constant track that fits best at these rates. It does
+    not cover the differences in skidding from turn to turn: these belong to the noise of the
+    odometry.
     """
     inverse, growth = parameters[P.INVERSE_TRACK], parameters[P.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -112,7 +115,7 @@ It includes the error with which a person chooses the point on the robot.
 """
 
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
-"""Limits for the difference between a distance by tape and by positions.
+"""Limits for the difference between a distance by tape and the same distance by positions.
 
 They are a fraction of the distance, and a number of standard deviations. If the difference exceeds
 both, one of the distances is wrong.
@@ -125,7 +128,7 @@ LEAST_M = 0.5
 """Shortest distance between start and end of a run, m, that a tape may measure."""
 
 STRAIGHT = 0.8
-"""Minimum of `Extent.straight` for a run that a tape may measure."""
+"""Minimum of `Extent.straight` for a run whose distance a tape may measure."""
 
 
 class Tape(Struct, frozen=True):
@@ -151,7 +154,7 @@ class Extent(Struct, frozen=True):
 
 
 Follow = Callable[[Floats, int], Extent]
-"""Function that returns the extent of a run.
+"""Function that computes the extent of a run.
 
 Its arguments are multipliers, as in `Multipliers.values`, and the number of the run.
 """
@@ -160,7 +163,7 @@ Its arguments are multipliers, as in `Multipliers.values`, and the number of the
 def scaled(
     found: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
 ) -> tuple[Multipliers, str]:
-    """Correct the multipliers by a distance that was measured by tape.
+    """Correct the multipliers with a distance that was measured by tape.
 
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
 

@@ -1,20 +1,20 @@
 """Fits the noise of `[odometry]` to drives that the fit of the geometry did not use.
 
 A window is about half a minute of a drive. Its residuals are the headings or the positions of a
-sensor minus those of the wheels, at times that lie seconds apart. So an error that lasts for a
-whole turn has the same effect as over a whole drive. For example, a track that changes with the
+sensor minus those of the wheels, at times that lie seconds apart. An error that lasts for a whole
+turn therefore has the same effect as in a whole drive. For example, a track that changes with the
 turn rate causes such an error.
 
 The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
-has one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is the
-covariance that the known uncertainty of the geometry causes:
+contains one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is
+the covariance that the known uncertainty of the geometry causes:
 
     V = K + sum over i of x_i C_i
 
 The pose at the start of the window is unknown and is projected out (restricted maximum likelihood:
 Patterson & Thompson, Biometrika 58, 1971). The iteration of Zhou, Hu, Qiao, Cho & Zhou (MM
-Algorithms for Variance Components Models, 2019) finds x. Its sums are over the windows, and it
-keeps each x_i from becoming negative:
+Algorithms for Variance Components Models, 2019) finds x. Its sums run over the windows, and no x_i
+becomes negative:
 
     x_i <- x_i sqrt(sum of r' V^-1 C_i V^-1 r / sum of tr(V^-1 C_i))
 """
@@ -41,7 +41,7 @@ from acsard.core.config.settings import OdometryConfig
 
 
 class Source(IntEnum):
-    """Indices of the sources of noise. The robot causes those up to `TRACK`, sensors the others."""
+    """Indices of the sources of noise. Up to `TRACK` the source is the robot, after it a sensor."""
 
     DISTANCE = 0
     """Variance of the distance per metre, m."""
@@ -67,7 +67,7 @@ COUNT = len(Source)
 SENSORS = np.arange(COUNT) > Source.TRACK
 RATES = np.arange(COUNT) < Source.SLIP
 START = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
-"""Noise, by `Source`, from which the search starts. The numbers only have to be positive."""
+"""Noise by `Source`, from which the search starts. The numbers only have to be positive."""
 
 WINDOW_S, APART_S = 32.0, 4.0
 """Length of a window and time between its residuals, s. A shorter drive is one window."""
@@ -104,24 +104,24 @@ covariance of the pose would then claim that some directions have no error at al
 """
 
 CHANGES = 0.1
-"""Minimum of each variance rate, as a fraction of a rate with the effect of lasting noise.
+"""Minimum of each variance rate, as a fraction of the rate to which lasting noise corresponds.
 
-`Windows.lasting` has the factor from lasting noise (`SLIP`, `RATIO` and `TRACK`) to that rate. A
-window does not show how long an error lasts beyond the window's end. Without this minimum, the pose
-covariance of one robot in eight had no width in some direction.
+Lasting noise is `SLIP`, `RATIO` or `TRACK`. `Windows.lasting` gives the factor from it to the rate
+with the same effect. A window does not show how long an error lasts beyond the window's end.
+Without this minimum, the pose covariance of one robot in eight had no width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
-"""Gain of log likelihood per residual that is significant whatever its standard deviation is.
+"""Gain of log likelihood per residual that is significant even if its deviation is large.
 
-A residual whose stated standard deviation is twice the true one loses this much.
+A residual whose stated standard deviation is twice the true one loses this much likelihood.
 """
 
 MOST = 1.0
-"""Largest value of a setting in the result. The configuration accepts it for each setting."""
+"""Largest value of a setting in the result. The configuration accepts it for every setting."""
 
 METRES = 10.0
-"""Distance for which the uncertainty by noise is reported, m."""
+"""Distance for which the uncertainty that noise causes is reported, m."""
 
 
 class Windows(Struct, frozen=True):
@@ -134,9 +134,9 @@ class Windows(Struct, frozen=True):
     residual: Floats
     """Residuals after the unknown start pose was projected out, shape (windows, n)."""
     effects: Floats
-    """Covariance of the residuals by noise of 1 of each source, shape (windows, COUNT, n, n)."""
+    """Covariance of the residuals if the noise of a source is 1, shape (windows, COUNT, n, n)."""
     known: Floats
-    """Covariance of the residuals by the known uncertainties, shape (windows, n, n)."""
+    """Covariance of the residuals from the known uncertainties, shape (windows, n, n)."""
     lasting: Floats
     """Factors from lasting noise to a variance rate with the same effect over a mean window.
 
@@ -172,7 +172,7 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return the noise for other drives, with rates of at least the minimum.
+        """Return the noise to state for other drives, with each variance rate at least its minimum.
 
         `FLOOR` and `CHANGES` define the minimum. If only a few residuals show a rate, the rate is
         widened like the variance of Student's t. Windows overlap by half, so each residual counts
@@ -210,7 +210,10 @@ class Noise(Struct, frozen=True):
     It is measured on drives that the fit did not use.
     """
     chance: float
-    """Standard deviation of `gain` by the differences between drives, widened as Student's t."""
+    """Standard deviation of `gain`, from the differences between drives.
+
+    If there are few groups of drives, it is widened to that of Student's t.
+    """
     places: bool
     """Whether the log has positions. Without them, it does not show the noise of the distance."""
     turning: float
@@ -220,20 +223,20 @@ class Noise(Struct, frozen=True):
 
     @property
     def better(self) -> bool:
-        """Whether the found noise describes other drives better by more than chance explains."""
+        """Whether the found noise describes other drives better by more than chance can explain."""
         return self.gain > min(SURE * self.chance, TWICE)
 
     def heading(self) -> tuple[float, float]:
-        """Return the heading's standard deviation by noise after `METRES`, rad.
+        """Return two standard deviations of the heading after `METRES`, rad.
 
-        The first one is by the configured noise, and the second one by the found noise.
+        The configured noise causes the first one, and the found noise the second one.
         """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the distance's standard deviation by noise after `METRES`, m.
+        """Return two standard deviations of the distance after `METRES`, m.
 
-        The first one is by the configured noise, and the second one by the found noise.
+        The configured noise causes the first one, and the found noise the second one.
         """
         return self._after(Source.DISTANCE, Source.SLIP, None)
 
@@ -258,7 +261,7 @@ def settings(
         known: the standard deviations of the new geometry.
         track: the new multiplier of the wheel separation.
         kept: the quantities that stay as configured, `TRACK` or `RATIO` of `plausibility`.
-        odometry: the present settings.
+        odometry: the configured settings.
         shown: the noise that the log shows, or None if the noise stays as configured.
         scaled: whether the size of the wheels was measured.
     """
@@ -288,7 +291,7 @@ class Reference(Struct, frozen=True):
 
     runs: Sequence[Run]
     headings: Headings | None
-    """The headings by a sensor; None if the log has none."""
+    """The headings that a sensor measured, or None if the log has none."""
     places: bool
     """Whether the log has positions."""
     steps: Sequence[WheelSteps]
@@ -304,10 +307,10 @@ def noise(
     """Return the noise that a log shows, or None if fewer than two drives have windows.
 
     Args:
-        held: the drives, each with the parameters that were found without it.
-        seen: the sensors.
+        held: the drives, each with the parameters that were fitted without it.
+        seen: the sensors of the log.
         known: the standard deviations of the geometry in these parameters.
-        odometry: the present settings.
+        odometry: the configured settings.
     """
     motions: list[_Motion] = []
     windows = _windows(held, seen, known, motions)
@@ -342,7 +345,7 @@ def noise(
 
 
 class _Motion(Struct, frozen=True):
-    """The motion of a window by the wheels, in short steps."""
+    """The motion of a window according to the wheels, in short steps."""
 
     middle: Floats
     """Times in the middle of the steps, s."""
@@ -386,9 +389,9 @@ class _Window(Struct, frozen=True):
     yaw: Floats
     """Effect of an error of each step's turn, shape (residuals, steps)."""
     sensor: dict[Source, Floats]
-    """Covariance of the residuals by sensor noise of 1, by the source of the noise."""
+    """Covariance of the residuals if the noise of a sensor is 1, by source."""
     bias: Floats | float = 0.0
-    """Covariance of the residuals by the uncertainty of the gyro's bias; 0 without a gyro."""
+    """Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
         """Return the residuals, their covariance by source and their known covariance.
@@ -420,7 +423,7 @@ class _Window(Struct, frozen=True):
 def _windows(
     held: Sequence[Fold], seen: Reference, known: Deviations, motions: list[_Motion]
 ) -> Windows | None:
-    """Return the windows of all drives, or None without windows. Add their motions to `motions`."""
+    """Return the windows of all drives, or None if none exist. Add their motions to `motions`."""
     rows = []
     for number, fold in enumerate(held):
         for window in _of_drive(fold, seen):
@@ -484,9 +487,10 @@ def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
-    """Return the window of the residuals of the heading at the wheels' times `t`, s.
+    """Return the window with the residuals of the heading at the times `t` of the wheels, s.
 
-    `at` has the same moments as times of the heading sensor, s. `way` is the path of the wheels.
+    `at` contains the same moments on the clock of the heading sensor, s. `way` is the path of the
+    wheels.
     """
     motion, since = _Motion.of(t, way, track), t - t[0]
     turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since

@@ -1,7 +1,7 @@
 """Checks whether a log and its calibration are plausible, and whether the robot moved enough.
 
-A log with an error that would spoil the calibration is refused: a wrong sign, side, unit or time,
-or sensors that contradict the wheels. The message names the probable cause. If a log does not
+A log is refused if an error in it would spoil the calibration: a wrong sign, side, unit or time, or
+sensors that contradict the wheels. The message names the probable cause. If a log does not
 contain enough movement, the message says what to drive. Unusual facts that the calibration corrects
 or tolerates are reported as remarks.
 """
@@ -30,9 +30,9 @@ Both sides must roll this angle in the same direction, and this angle in opposit
 """
 
 ALIKE = 0.98
-"""Squared correlation of the mean and the difference of both sides above which a log is refused.
+"""Largest squared correlation between the mean and the difference of the motion of both sides.
 
-A robot with a higher correlation drives the same curve all the time.
+Above it, the robot drives the same curve all the time, and the log is refused.
 """
 
 WORST = 0.2, 0.03
@@ -96,10 +96,10 @@ ONE_SIDED = 0.1
 """Ratio of the turns to one side and to the other below which they are reported as one-sided."""
 
 ODD_SIZE = 1.25
-"""Factor between the measured and the configured radius from which the radius is reported."""
+"""Smallest factor between the measured and the configured radius that is reported."""
 
 ODD_RATIO = 1.1
-"""Ratio of the radii of both sides from which it is reported. Equal wheels differ far less."""
+"""Smallest ratio of the radii of both sides that is reported. Equal wheels differ far less."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 """Usual range of the ratio of effective track to wheel separation.
@@ -139,7 +139,7 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `RefusedError` if the robot hardly turns. `turned` has the turn of each row, rad."""
+    """Raise `RefusedError` if the robot hardly turns. `turned` is the turn in each row, rad."""
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
@@ -148,7 +148,7 @@ def turns_enough(turned: Floats) -> None:
 
 
 TRACK, RATIO = "the effective track", "the ratio of left to right"
-"""Names of the two quantities that a log may leave unsure."""
+"""Names of the two quantities that some logs do not determine accurately enough."""
 
 
 def unsure(
@@ -156,9 +156,9 @@ def unsure(
 ) -> dict[str, float]:
     """Return the relative standard deviations that are too large to be useful, by quantity.
 
-    The quantities are `TRACK` and `RATIO`, and `worst` has their limits in this order. `track_std`
-    is the relative standard deviation of the track. It does not include that the track itself
-    varies with the turn rate and from block to block.
+    The quantities are `TRACK` and `RATIO`, and `worst` contains their limits in this order.
+    `track_std` is the relative standard deviation of the track. It does not cover the variation of
+    the track itself, with the turn rate and from block to block.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -202,7 +202,7 @@ def positions_follow(begun: StartingPoint) -> None:
 
 
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
-    """Raise `RefusedError` if wheels and sensors turn to different sides. It names the wrong sign.
+    """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
 
     Args:
         source: the name of the heading sensor, or "" without one.
@@ -248,9 +248,10 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 
 
 def _wrong_sign(sides: Floats) -> str:
-    """Return "left" or "right" for wheels with a wrong sign, "turn" if both are wrong, or "".
+    """Return the side with a wrong sign, "turn" if both signs are wrong, or "" if both are right.
 
-    `sides` has a factor for the left and the right wheels, which is negative for a wrong sign.
+    `sides` contains a factor for the left and one for the right wheels. A negative factor means a
+    wrong sign. The side is "left" or "right".
     """
     left, right = (sides > 0.0).tolist()
     if left:
@@ -273,7 +274,7 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
 
 def turn_rates(source: str, rows: Rows) -> None:
-    """Raise `RefusedError` if the sensor's turns are too fast for a robot, so must be in degrees.
+    """Raise `RefusedError` if the sensor's turns are so fast that they must be in degrees.
 
     `source` names the sensor. The turns are not compared with those of the wheels: if the wheel
     speeds are in degrees too, both errors hide each other.
@@ -292,8 +293,9 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
-        turn: the ratio of the measured turn to the turn by the configured multipliers.
-        bare: the ratio of the measured turn to the turn by wheel radius and separation alone.
+        turn: the ratio of the measured turn to the turn that the configured multipliers predict.
+        bare: the ratio of the measured turn to the turn that wheel radius and separation alone
+            predict.
         base: the configured geometry.
     """
     if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
@@ -357,7 +359,7 @@ def remarks(
     """Yield a sentence for each unusual fact that the calibration corrects or tolerates.
 
     Args:
-        delays: the delay of each sensor behind the wheels, s.
+        delays: the delay of each sensor's times relative to those of the wheels, s.
         bias: the gyro bias, rad/s.
         turned: the turn of each row, rad, positive to the left.
         values: the multipliers, as in `Multipliers.values`.

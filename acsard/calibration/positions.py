@@ -1,4 +1,4 @@
-"""Evidence from positions of any source. The path of the wheels is compared with the positions.
+"""Evidence from positions of any source, which are compared with the path of the wheels.
 
 The path of each block is first shifted and rotated so that it fits the positions best. The
 residuals of this alignment are the evidence, so no start pose, frame or yaw is needed. Places are
@@ -10,7 +10,7 @@ turns to either side and with one side of the wheels reversed. For each of them,
 path gives the radius. A turn on the spot does not change the position. Positions therefore often
 determine such a turn only up to whole turns: the robot faces the same way after 90 deg to the left
 as after 270 deg to the right. If several starting points explain the positions about equally well,
-the search chooses the one of the more usual robot.
+the search chooses the one that describes the more usual robot.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ FINE_S = 0.02
 """Time step in which the path is summed, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Limit for the difference between two positions, beyond the distance that the wheels rolled.
+"""Largest excess of the distance between two positions over the distance that the wheels rolled.
 
-It is `JUMP` standard deviations plus `JUMP_M` m. A larger difference is a jump: the position after
+It is `JUMP` standard deviations plus `JUMP_M` m. A larger excess is a jump: the position after
 it is an outlier, or the source has relocalized.
 """
 
@@ -47,7 +47,7 @@ SPEED_S = 0.05
 
 
 def extent(places: Complexes) -> float:
-    """Return the extent of these places: the sum of both sides of the box around them, m."""
+    """Return the extent of these places: width plus height of the box around them, m."""
     return float(np.ptp(places.real) + np.ptp(places.imag))
 
 
@@ -65,7 +65,7 @@ class Segment(Struct, frozen=True):
 
 
 class WheelSteps(Struct, frozen=True):
-    """The motion of the wheels of a run, in the steps in which its path is summed."""
+    """The motion of the wheels of a run, divided into the steps from which its path is summed."""
 
     t: Floats
     """Times at which the steps begin and end, s: one more than there are steps."""
@@ -81,9 +81,10 @@ class WheelSteps(Struct, frozen=True):
 
 
 class Path(Struct, frozen=True):
-    """The path of a run according to the wheels. It is linear between the times."""
+    """The path of a run according to the wheels. It is linear between the times `t`."""
 
     t: Floats
+    """Times of the points of the path, s."""
     place: Complexes
     """Place x + iy of the robot at these times, m."""
     heading: Floats
@@ -96,8 +97,8 @@ class Path(Struct, frozen=True):
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the sensor, m, and their derivatives, at the times of positions.
 
-        `t` has the recorded times of the positions, s, which are late by the parameter `P.DELAY`.
-        The derivatives with respect to the parameters have the shape (times, COUNT).
+        `t` contains the recorded times of the positions, s, which are late by the parameter
+        `P.DELAY`. The derivatives with respect to the parameters have the shape (times, COUNT).
         """
         t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
@@ -160,7 +161,10 @@ def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
 
 
 def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
-    """Return the path of the robot from the origin with heading 0. Each step is an exact arc."""
+    """Return the path of the robot, which starts at the origin with heading 0.
+
+    Each step is an exact arc.
+    """
     left, right, turn, rate = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
     gain = base.gain * turn
     mean = gain * (left + right) / 2
@@ -183,7 +187,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the same places as `path` does, but faster, for a track that does not change."""
+    """Return the places of `path` if the track is constant. This function is faster than `path`."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
@@ -192,8 +196,8 @@ def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
     """Return the headings between the steps, rad, and the chord of each step's arc.
 
-    `turns` has the turn of each step, rad. A chord is the complex number that joins the ends of an
-    arc of length 1.
+    `turns` contains the turn of each step, rad. A chord is the complex number that joins the ends
+    of an arc of length 1.
     """
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
@@ -215,9 +219,10 @@ class Aligned(Struct, frozen=True):
     residual: Complexes
     """Position minus aligned path, m, times the root of the position's weight."""
     derivatives: Complexes
-    """Derivatives of the aligned path by the parameters, times the root of the position's weight.
+    """Derivatives of the aligned path, times the root of the position's weight.
 
-    They include the change of the alignment: its shift and rotation follow each parameter.
+    They are taken with respect to the parameters, shape (positions, COUNT), and include the change
+    of the alignment: its shift and rotation depend on each parameter.
     """
 
 
@@ -249,9 +254,9 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
 def evidence(
     segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
 ) -> Evidence:
-    """Return the evidence of the positions at these parameters, for `blocks` blocks.
+    """Return the evidence of the positions at these parameters.
 
-    `paths` must be computed with the same parameters.
+    `paths` must be computed with the same parameters. `blocks` is the number of blocks.
     """
     normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
     squares, counts = np.zeros(blocks), np.zeros(blocks)
@@ -275,13 +280,13 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
 
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
-"""Ratios of configured to true track that are tried. They are finer in the usual range."""
+"""Ratios of configured to true track that the search tries, spaced closer in the usual range."""
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
-"""Delays of the positions that are tried, s."""
+"""Delays of the positions that the search tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Numbers of segments that are used: to try starting points, and to refine the best ones.
+"""Maximum numbers of segments: to try starting points, and to refine the best of them.
 
 The segments with the largest extent are used.
 """
@@ -303,12 +308,12 @@ The lower end is that of a robot that skids much, the upper end that of a robot 
 """
 
 NEAR_HEADING = 0.8, 1.25
-"""Usual range of the robot's turn by positions, divided by its turn by a heading sensor."""
+"""Usual range of the turn according to positions, divided by that of a heading sensor."""
 
 WRONG_WAY = 4.0
 """Factor by which a starting point counts as worse if the signs of its sides are unusual.
 
-Its robot has one side reversed, or turns in the opposite direction to its wheels.
+Such a robot has one side reversed, or turns in the opposite direction to its wheels.
 """
 
 NOTHING = 1e-3
@@ -319,7 +324,7 @@ therefore hardly matter.
 """
 
 STRAYED = 1.3
-"""Factor by which the turn may change during refinement. Beyond it, the refinement is not used."""
+"""Largest factor by which refinement may change the turn. Otherwise its result is discarded."""
 
 COARSE_S = 0.1
 """Time step in which paths are summed during the search, s."""
@@ -376,7 +381,7 @@ def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
 
 
 def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
-    """Return the points of `tried` that leave no more unexplained than either neighbour."""
+    """Return the points of `tried` at which `unexplained` is not above that of either neighbour."""
     left = [np.inf, *(point.unexplained for point in tried), np.inf]
     return [p for at, p in enumerate(tried) if p.unexplained <= min(left[at], left[at + 2])]
 
@@ -404,7 +409,7 @@ def _turn(parameters: Floats) -> float:
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the starting point, with the best delay of the positions from `DELAYS`."""
+    """Return the starting point with the delay of the positions, from `DELAYS`, that fits best."""
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
@@ -419,8 +424,9 @@ def _tried(
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the size that fits best.
 
-    `shape` has the sign of the left side (1 or -1), the ratio of configured to true track (negative
-    if the robot turns in the opposite direction to its wheels), and the delay of the positions, s.
+    `shape` contains the sign of the left side (1 or -1), the ratio of configured to true track
+    (negative if the robot turns in the opposite direction to its wheels), and the delay of the
+    positions, s.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
@@ -446,7 +452,7 @@ def _refined(
 ) -> StartingPoint:
     """Return the starting point after a fit to a few segments.
 
-    The fit also finds where on the robot the positions are measured. Outliers have less weight.
+    The fit also finds where on the robot the position sensor is. Outliers have less weight.
     """
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 

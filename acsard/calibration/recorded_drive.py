@@ -1,4 +1,4 @@
-"""Reads the recorded drive of `acsard calibrate --log`, and calibrates with it.
+"""Reads the recorded drive that `acsard calibrate --log` names, and calibrates from it.
 
 The drive is a CSV file, a black-box recording of acsard, or a ROS 2 bag in MCAP: one file, or the
 directory of a bag.
@@ -28,15 +28,15 @@ from acsard.recording.file import Recording
 from acsard.recording.mcap_records import DAMAGE, MAGIC
 
 MOST_BYTES = 1 << 30
-"""Maximum size of a CSV file or of a recording of acsard, bytes. Both are read into memory."""
+"""Maximum size of a CSV file or of a recording of acsard, bytes. They are read into memory."""
 
 MOST_RECORD_BYTES = 1 << 28
-"""Maximum size of a record in a bag, bytes. A chunk of rosbag2 has less than 1 MiB."""
+"""Maximum size of a record in a bag, bytes. rosbag2 writes chunks of less than 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
-"""Exceptions for a damaged bag.
+"""Exceptions that reading a damaged bag raises.
 
-MCAP and LZ4 raise them, and a channel whose schema is missing causes a `KeyError`.
+They come from the MCAP reader and from LZ4. A channel whose schema is missing causes a `KeyError`.
 """
 
 OTHER_BAGS = {
@@ -44,9 +44,10 @@ OTHER_BAGS = {
     ".bag": (b"#ROSBAG V", "of ROS 1: convert it to ROS 2 in MCAP with `rosbags-convert`"),
     ".zstd": (b"\x28\xb5\x2f\xfd", "compressed as a whole file: unpack it with `zstd -d`"),
 }
-"""Kinds of bags that this module cannot read, by their suffix.
+"""Kinds of bags that this module cannot read, by the suffix of their files.
 
-Each has its first bytes, and a phrase that names the kind and says how to convert it.
+The value gives the first bytes of such a file, and a phrase that names the kind and says how to
+convert it.
 """
 
 
@@ -94,7 +95,7 @@ def _table(log: Path, config: Config, choice: Choice) -> Table:
 
 
 def _files_of(directory: Path) -> list[Path]:
-    """Return the MCAP files of a bag's directory in order of their numbers."""
+    """Return the MCAP files in the directory of a bag, sorted by the numbers in their names."""
     files = [path for path in directory.iterdir() if path.suffix == ".mcap"]
     if not files:
         for suffix, (_, what) in OTHER_BAGS.items():
@@ -141,8 +142,8 @@ def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
 def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
     """Yield the messages of a bag in their order in the file.
 
-    If the bag is cut off or damaged, the messages before the damage are yielded, and a sentence is
-    added to `notes`.
+    If the file is cut off or damaged, yield the messages before the damage, and add a sentence to
+    `notes`.
     """
     with file.open("rb") as stream:
         try:

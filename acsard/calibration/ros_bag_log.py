@@ -4,9 +4,10 @@ The wheel speeds come from a `JointState`, the turn rates from an `Imu`, and the
 `PoseStamped` or an `Odometry`. This module chooses the topics by their types. If several topics
 fit, or if a topic should not be used, the user names the topics with `--topic`.
 
-An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. So an
-`Odometry` is used only if the user names its topic, or if the bag has neither turn rates nor other
-positions. In the second case the log is refused if the odometry turns exactly as the wheels do.
+An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. An
+`Odometry` is therefore used only if the user names its topic, or if the bag has neither turn rates
+nor other positions. In the second case the log is refused if the odometry turns exactly as the
+wheels do.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 LEAST_MESSAGES = 20
-"""Minimum number of messages with a value that a topic needs to be used."""
+"""Minimum number of messages with a value in a topic that is used."""
 
 CLOCKS_APART_S = 1.0
 """Largest difference between the delays of two topics whose stamps come from one clock, s.
@@ -70,11 +71,11 @@ It is a fraction of the RMS turn.
 """
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
-"""Delays of an odometry behind the wheels that the comparison of both tries, s."""
+"""Delays of an odometry relative to the wheels, s, that `_computed_from` tries."""
 
 
 class RosMessage(NamedTuple):
-    """A message of a bag as it was recorded."""
+    """A message as it was recorded in a bag."""
 
     topic: str
     type: str
@@ -103,7 +104,7 @@ class _Topic:
         self.kind = TYPES[type_]
         self.came, self.made, self.values = array("q"), array("q"), array("d")
         self.wheels: tuple[str, ...] = ()
-        """Columns of the log that the joints of a `JointState` give; () for other types."""
+        """Columns of the log that the joints of a `JointState` fill; () for other types."""
         self.joints: set[str] = set()
         self.unreadable, self.why = 0, ""
 
@@ -116,7 +117,7 @@ class _Topic:
     def take(self, message: RosMessage, joints: Sequence[str]) -> None:
         """Add the values of a message, or count the message as unreadable.
 
-        `joints` has the configured names of the wheel joints, in the order of `FOUR`.
+        `joints` contains the configured names of the wheel joints, in the order of `FOUR`.
         """
         if message.encoding != "cdr":
             self._refuse(f"it is encoded as {message.encoding or 'nothing'}, not as cdr")
@@ -154,8 +155,8 @@ class _Topic:
     def _joints(self, message: JointState, joints: Sequence[str]) -> Sequence[float]:
         """Return the angles (rad) of all columns, then the speeds (rad/s) of all columns.
 
-        Angles or speeds that the message does not contain are NaN. The result is () if the joints
-        give no columns, or other columns than the first message of the topic.
+        Angles or speeds that the message does not contain are NaN. The result is () if no column
+        belongs to the joints, or if the columns differ from those of the topic's first message.
         """
         columns = wheel_joints(tuple(message.name), tuple(joints))
         self.joints.update(message.name[:8])
@@ -194,7 +195,7 @@ _SHORT = {
     "fl": ("fl", "lf"), "fr": ("fr", "rf"), "rl": ("rl", "lr", "bl", "lb"),
     "rr": ("rr", "br", "rb"), "left": ("l",), "right": ("r",),
 }  # fmt: skip
-"""Abbreviations of a wheel or a side in the names of joints, by the column of the log."""
+"""Abbreviations of a wheel or a side in joint names, by the column of the log."""
 
 _COLUMN = {word: column for column, words in _SHORT.items() for word in words}
 
@@ -240,9 +241,9 @@ def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, l
 
 
 def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice) -> Table:
-    """Return the table that the messages of a bag give. Raises `LogError`.
+    """Build the table of a log from the messages of a bag. Raises `LogError`.
 
-    `joints` has the configured names of the wheel joints, in the order of `FOUR`.
+    `joints` contains the configured names of the wheel joints, in the order of `FOUR`.
     """
     topics: dict[str, _Topic] = {}
     others: dict[str, str] = {}
@@ -334,7 +335,7 @@ class _Log:
         return wheels, gyro, places
 
     def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
-        """Return the topic of `fit` to use, or None. Topics that the user named take precedence.
+        """Return the topic to use among `fit`, or None. Topics that the user named take precedence.
 
         `what` describes the topic in error messages. If `free` is false, only a named topic is
         used. Raises `LogError` if several topics can be used, or if the topic has too few messages.
@@ -467,10 +468,10 @@ def _too_few(topic: _Topic) -> str:
 
 
 def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
-    """Compute wheel speeds from recorded angles. Return the times, s, and the speeds, rad/s.
+    """Compute wheel speeds from recorded angles. Return their times, s, and the speeds, rad/s.
 
-    Each speed is the mean over one sample period. So the speeds add up to exactly the angle that
-    the wheel turned, even if the sample times are uneven. No speed is computed across a gap or
+    Each speed is the mean over one sample period. The speeds therefore add up to exactly the angle
+    that the wheel turned, even if the sample times are uneven. No speed is computed across a gap or
     across a jump. The angle jumps when a driver restarts at 0.
 
     Args:
@@ -500,9 +501,9 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
 
 
 def _unwrapped(angles: Floats) -> Floats:
-    """Remove the jumps of a whole turn from wheel angles, rad, that are all within one turn.
+    """Remove the jumps by a whole turn from the angles of a wheel, rad.
 
-    Angles that leave this range are returned as they are.
+    Angles that span more than one turn are returned unchanged: they do not wrap.
     """
     jumps = np.abs(np.diff(angles)).max(initial=0.0) > np.pi
     within = float(np.ptp(angles)) <= 2 * np.pi + 1e-3 if len(angles) else False
@@ -512,7 +513,7 @@ def _unwrapped(angles: Floats) -> Floats:
 def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
     """Return the times of the wheel samples, s, and the angles of the left and right wheels, rad.
 
-    `wheels` has the columns of the log by name.
+    `wheels` contains the columns of the log by name.
     """
     t = wheels["t"]
     left, right = (
@@ -536,7 +537,8 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
     """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown.
 
-    `rates` has the sensor's turn rates at the times `t`, and `sides` is the result of `_sides`.
+    `rates` contains the sensor's turn rates at the times `t`, and `sides` is the result of
+    `_sides`.
     """
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
@@ -551,9 +553,9 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether a yaw was computed from the wheels: it differs from them by at most `OWN`.
+    """Return whether a yaw was computed from the wheels: its turns differ by at most `OWN`.
 
-    `yaw` is in rad at the times `t`, and `sides` is the result of `_sides`.
+    `yaw` contains the yaw at the times `t`, rad, and `sides` is the result of `_sides`.
     """
     held = np.isfinite(yaw)
     order = np.argsort(t[held], kind="stable")

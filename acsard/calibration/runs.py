@@ -1,7 +1,8 @@
-"""Splits the table of a log into runs, and runs into blocks. A run has the samples of one drive.
+"""Splits the table of a log into runs, and runs into blocks.
 
-The times of a log may have any origin. Within a run they begin at 0. Rows that are out of order are
-sorted. A new run begins where the times jump back, or where the wheels have no sample for a minute.
+A run contains the samples of one drive. The times of a log may have any origin. Within a run they
+begin at 0. Rows that are out of order are sorted. A new run begins where the times jump back, or
+where the wheels have no sample for a minute.
 
 A block is a few seconds of driving. Every estimate of the calibration is a sum over blocks, and the
 standard deviations come from the differences between blocks. The errors within a block are
@@ -29,7 +30,7 @@ RESTART_S = 1.0
 """Backward step of the times, s, above which the times may have restarted."""
 
 FEW_RESTARTS = 100
-"""Largest number of restarts. If there are more, the rows are unsorted, and no run is split."""
+"""Largest number of restarts. If there are more, the rows are just unsorted: no run is split."""
 
 SLOWEST_S = 0.7
 """Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
@@ -43,7 +44,8 @@ PAUSE_S = 60.0
 ROUNDED_S, REPEATED = 0.2, 4.0
 """Limits for rounded times: the median interval, s, and the mean number of rows per time.
 
-If the different times of a run exceed both limits, the column t was rounded.
+The median interval is that between the different times of a run. If both limits are exceeded, the
+column t was rounded.
 """
 
 ROLLING, AGAIN = 0.2, 0.4
@@ -64,10 +66,10 @@ Streams = dict[str, tuple[Floats, ...]]
 """The times and values of each sensor, by its name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of different names in the column run. If there are more, they are not drives."""
+"""Largest number of different names in the column run. If there are more, they name no drives."""
 
 TOGETHER = 50
-"""Number of rows that are summed before the front and rear wheel of a side are compared."""
+"""Number of rows whose speeds are summed before the two wheels of a side are compared."""
 
 NOTED, APART = 0.15, 0.8
 """Limits for the difference between the front and the rear wheel of a side.
@@ -86,15 +88,16 @@ STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
 
 BLOCKS = 16
-"""Number of blocks into which a log is divided, unless they would exceed `LONGEST_S`."""
+"""Number of blocks into which a log is divided, unless they would be too short or too long."""
 
 LONGEST_S = 12.0
-"""Longest block, s, unless the caller of `blocks` asks for longer ones."""
+"""Length of the longest blocks, s, unless the caller of `blocks` asks for longer ones."""
 
 SMOOTH_S = 0.3
 """Time over which a wheel speed is averaged before it is squared, s.
 
-Without it, the speeds of a coarse encoder would be 0 in some samples and far too large in others.
+Without the average, the speeds of a coarse encoder would be 0 in some samples and far too large in
+others.
 """
 
 LEAST_TURN = 0.2
@@ -103,7 +106,7 @@ LEAST_TURN = 0.2
 MOST_JITTER_S = 5.0
 """Largest variation of the delay from stamp to arrival, s.
 
-If it varies more, the times of arrival are used instead of the stamps.
+If the delay varies more, the times of arrival are used instead of the stamps.
 """
 
 
@@ -177,7 +180,7 @@ class Notes:
         self._sentences = {sentence: [0, 0] for sentence in sentences}
 
     def add(self, sentence: str, count: int = 0) -> None:
-        """Add a sentence about one run. `count` is the number that it adds to the sum for "{}".
+        """Add a sentence about one run. `count` is added to the sum that replaces "{}".
 
         A sentence with "{}" and a count of 0 is ignored.
         """
@@ -186,7 +189,7 @@ class Notes:
             sums[0], sums[1] = sums[0] + count, sums[1] + 1
 
     def sentences(self) -> tuple[str, ...]:
-        """Return each sentence once, in the order in which they were added."""
+        """Return each sentence once, in the order in which the sentences were added."""
         return tuple(
             sentence.replace("{}", str(count)) + (f" (in {runs} runs)" if 1 < runs < count else "")
             for sentence, (count, runs) in self._sentences.items()
@@ -259,10 +262,11 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return the difference of the wheels of a side, as a fraction of the distance they rolled.
+    """Return the difference between the wheels of a side, as a fraction of the rolled distance.
 
     `front` and `rear` name the columns of the two wheels. Both wheels roll over the same floor, so
-    a large difference means an error. Raises `LogError` if the difference exceeds `APART`.
+    a large difference means an error in the log. Raises `LogError` if the difference exceeds
+    `APART`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
@@ -309,7 +313,7 @@ def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
     """Raise `LogError` if the times of a run are not in seconds or are too coarse.
 
-    `parts` has the rows of each drive of the run `name`.
+    `parts` contains the rows of each drive of the run `name`.
     """
     for rows in parts:
         times = _wheel_times(t, rows, columns)
@@ -332,7 +336,7 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     """Split `rows` where the wheels have no sample for `PAUSE_S`. Return the rows of each drive.
 
-    Without the split, a single row with a time of another day would make a drive of many hours.
+    Without this split, one row with a time of another day would make the drive many hours long.
     """
     times = _wheel_times(t, rows, columns)
     ends = np.flatnonzero(np.diff(times) > PAUSE_S)
@@ -345,7 +349,7 @@ def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | None:
-    """Return the samples of each sensor of a drive, or None if it has too few wheel samples."""
+    """Return the samples of each sensor of a drive, or None if there are too few wheel samples."""
     streams = {name: _stream(columns, rows, name.split(), notes) for name in STREAMS}
     if len(streams[WHEELS][0]) >= LEAST_ROWS:
         return streams
@@ -368,7 +372,7 @@ def _run(name: str, streams: Streams) -> Run:
 
 
 def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
-    """Remove values from `drives`, in place, that a logger repeats until the next sample arrives.
+    """Remove from `drives`, in place, the values that the logger repeated between two samples.
 
     A short drive may not show whether the logger repeats values, so all drives are evaluated
     together.
@@ -392,7 +396,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
     """Return two masks of the rows of the sensor `what`.
 
-    The first mask has the rows that repeat the value of the row before. The second mask has the
+    The first mask marks the rows that repeat the value of the row before. The second mask marks the
     rows at which the wheels turn.
     """
     t, *values = streams[what]
@@ -419,7 +423,7 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
-    """Yield the columns of a stream, sorted by time, of which the first column has the times.
+    """Yield the columns of `stream`, sorted by time. The first column contains the times.
 
     Of several samples with the same time, only the first one is kept. `what` names the sensor.
     """
@@ -442,7 +446,7 @@ class Block(Struct, frozen=True):
     run: int
     """Number of the run."""
     begin: float
-    """Begin of the block, s since the start of the run."""
+    """Start of the block, s since the start of the run."""
     end: float
     """End of the block, s since the start of the run."""
 
@@ -469,7 +473,7 @@ def cumulative(steps: Floats) -> Floats:
 
 
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
-    """Return the rests of a run, one row (begin, end) each, in s. In a rest, all wheels stand.
+    """Return the times in which all wheels stand still, one row (begin, end) for each rest, in s.
 
     A margin of `edge_s` is cut off both ends of each rest. If less than `least_s` remains, the rest
     is left out.
@@ -507,8 +511,8 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
     """Return whether the wheels of a side turned by at least `LEAST_TURN` from `begin` to `end`, s.
 
-    Turns ahead and back both add to the angle. `left` and `right` have the angles of both sides at
-    the two times, rad.
+    Turns ahead and back both add to the angle. `left` and `right` contain the angles of the two
+    sides at the two times, rad.
     """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
@@ -520,9 +524,9 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
 def on_arrival_clock(came: Floats, made: Floats) -> Floats:
     """Return the sample times of one stream, s, on the clock of their arrival.
 
-    `came` has the times of arrival, and `made` the stamps by the sender's clock, both in s. If the
-    delay from stamp to arrival varies by at most `MOST_JITTER_S`, the sample times are the stamps
-    plus the smallest delay. Otherwise they are the times of arrival.
+    `came` contains the times of arrival, and `made` the stamps of the sender's clock, both in s. If
+    the delay from stamp to arrival varies by at most `MOST_JITTER_S`, the sample times are the
+    stamps plus the smallest delay. Otherwise they are the times of arrival.
     """
     delay = came - made
     if float(np.ptp(delay)) > MOST_JITTER_S:

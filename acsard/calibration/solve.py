@@ -1,6 +1,6 @@
 """Computes the calibration from a log: prepares the log, fits, checks and evaluates the result.
 
-To prepare a log means to cut it into blocks, to check it and to find starting parameters for the
+Preparing a log means cutting it into blocks, checking it and finding starting parameters for the
 fit. If a log gives no calibration, an error says why and what to do.
 """
 
@@ -47,12 +47,12 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryCon
 from acsard.core.values import AcsardError
 
 LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Lengths of blocks, s, that are tried if the log has positions.
+"""Lengths of blocks, s, that the tool tries if the log has positions.
 
 Many short blocks are better for accurate positions. Long blocks are better for coarse positions,
-and for wheels whose errors hide the small turns of a short block. The tool chooses the length that
-is best on drives that the fit did not use. Positions without a heading sensor need more than the
-shortest length. A heading sensor without positions needs only the shortest length.
+and for wheels whose errors hide the small turns within a short block. The tool chooses the length
+that is best on drives that the fit did not use. Positions without a heading sensor need more than
+the shortest length. A heading sensor without positions needs only the shortest length.
 """
 
 ENOUGH_BLOCKS = 8
@@ -88,7 +88,7 @@ class Drives(Struct, frozen=True):
         """Return the totals of these runs.
 
         `by_wheels` is the turn of each of the `rows` according to the calibrated wheels, rad.
-        `found` has the new multipliers, and `rate` the turn rates.
+        `found` contains the new multipliers, and `rate` the turn rates of the log.
         """
         size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
@@ -102,19 +102,19 @@ class Calibration(Struct, frozen=True):
     """The result of a calibration. Each standard deviation has the unit of its quantity."""
 
     reference: str
-    """The sensors or the tool that the wheels were compared with, in words."""
+    """The sensors or the measuring tool with which the wheels were compared, in words."""
     drives: Drives
     configured: Multipliers
     multipliers: Multipliers
     """The new multipliers."""
     scale: str
-    """Sources of the wheels' size: "positions", "distance" (a tape), both, or "" for none."""
+    """Sources of the size of the wheels: "positions", "distance" (a tape), both, or "" for none."""
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
     improvement: Improvement
     delays: dict[str, float]
-    """Delay of each sensor behind the wheels, s, by the name of the sensor."""
+    """Delay of each sensor's times relative to those of the wheels, s, by the sensor's name."""
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
@@ -122,17 +122,17 @@ class Calibration(Struct, frozen=True):
     odometry: dict[str, float]
     """New settings of `[odometry]` by name.
 
-    They are the standard deviations of the geometry and, if the noise is better, the noise.
+    They are the standard deviations of the geometry and, if `Noise.better` is true, the noise.
     """
     kept: tuple[str, ...] = ()
-    """Quantities that stay as configured, `TRACK` and `RATIO` of `plausibility`."""
+    """Names of the quantities that stay as configured: `TRACK`, `RATIO` or both."""
     feedback: dict[str, float] = {}
     """New settings of `[feedback]` by name.
 
-    It is empty unless the daemon takes healthy wheels for faulty with the present settings.
+    It is empty unless the configured settings make healthy wheels look faulty to the daemon.
     """
     noise: Noise | None = None
-    """The noise of the odometry; None if the log does not show it."""
+    """The noise of the odometry, or None if the log does not show it."""
 
 
 def calibrate(
@@ -143,14 +143,14 @@ def calibrate(
 
     Args:
         log: the log.
-        drive: the geometry that the multipliers belong to, and the present multipliers.
+        drive: the configured geometry, and the configured multipliers that scale it.
         tape: a distance that was measured by tape, or None.
-        odometry: the present noise. None means the default settings.
-        feedback: the present response time. None means the default settings.
+        odometry: the configured noise. None means the default settings.
+        feedback: the configured response time. None means the default settings.
 
     Raises:
-        LogError: a sensor of the log cannot be used. The error has the notes of the log.
-        RefusedError: the log gives no calibration. The error has the notes of the log.
+        LogError: a sensor of the log cannot be used. The error includes the notes of the log.
+        RefusedError: the log gives no calibration. The error includes the notes of the log.
     """
     follows = response(log.runs, drive, feedback or FeedbackConfig())
     if follows is not None:
@@ -168,17 +168,17 @@ class Prepared(Struct, frozen=True):
 
     runs: Sequence[Run]
     headings: Headings | None
-    """The headings by a sensor; None if the log has none."""
+    """The headings that a sensor measured, or None if the log has none."""
     base: Base
     """The configured geometry."""
     parts: list[Block]
     rows: Rows
     """The motion in short intervals.
 
-    If the robot never rested, the turns by the gyro still contain the gyro's bias.
+    If the robot never rested, the turns of the gyro still contain the gyro's bias.
     """
     segments: list[Segment]
-    """The positions; empty if the log has none."""
+    """The measured positions; empty if the log has none."""
     steps: list[WheelSteps]
     """The wheel steps of each run; empty if the log has no positions."""
     sources: list[Source]
@@ -192,7 +192,8 @@ def prepared(
 ) -> Prepared:
     """Cut the runs into blocks of about `length` s, check the log, and find starting parameters.
 
-    `headings` are by a sensor, or None without one. Raises `RefusedError` if a check fails.
+    `headings` are those of a sensor, or None if the log has none. Raises `RefusedError` if a check
+    fails.
     """
     parts = blocks(driven, length)
     plausibility.drives_enough(parts)
@@ -258,16 +259,17 @@ class Candidate(Struct, frozen=True):
     covariance: Floats
     """Covariance of the parameters, shape (COUNT, COUNT)."""
     rows: Rows
-    """The motion in short intervals. The turns by a gyro are corrected for its bias and scale."""
+    """The motion in short intervals. The turns of a gyro are corrected for its bias and scale."""
     rate: Rates
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """Quantities that stay as configured, `TRACK` or `RATIO`.
+    """Relative standard deviation of each quantity that stays as configured, by its name.
 
-    Each one has the relative standard deviation with which the log determines it, inf if unknown.
+    The name is `TRACK` or `RATIO`. The deviation shows how well the log determines the quantity; it
+    is inf if unknown.
     """
 
 
@@ -340,10 +342,10 @@ def _noise(
 
 
 def _candidates(made: Prepared) -> list[Candidate]:
-    """Return the fit of all parameters if it leaves neither the track nor the ratio unsure.
+    """Return the fit of all parameters if it determines both the track and the ratio of the radii.
 
     Otherwise return up to two fits: one keeps the ratio as configured, the other one the track.
-    Raises `RefusedError` if these also leave a quantity unsure, or if no fit converges.
+    Raises `RefusedError` if these do not determine the rest either, or if no fit converges.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
@@ -380,9 +382,9 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Return the constraints of each fit to try, by the quantity that it keeps as configured.
+    """Return the constraints of each fit to try, by the quantity that the fit keeps as configured.
 
-    The quantity "" is for the fit that keeps none.
+    The key "" is for the fit without constraints.
     """
     ratio, track, growth = np.zeros((3, COUNT))
     ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
@@ -391,7 +393,7 @@ def _held(base: Base) -> dict[str, list[Held]]:
 
 
 def _candidate(made: Prepared, fitted: Fit) -> Candidate:
-    """Return a fit with its improvement. Raises `RefusedError` if the robot hardly turned."""
+    """Return the evaluation of a fit. Raises `RefusedError` if the robot hardly turned."""
     headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
     gyro_scale = 1 + float(fitted.parameters[P.SCALE_ERROR])
@@ -417,7 +419,7 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
 def _calibration(
     log: Log, tape: Tape | None, best: Candidate, odometry: OdometryConfig, shown: Noise | None
 ) -> Calibration:
-    """Return the calibration that the best fit gives, after checks of the result."""
+    """Check the result of the best fit, and return the calibration."""
     made, fitted, rows, rate = best.made, best.fitted, best.rows, best.rate
     headings, base = made.headings, made.base
     by_wheels, result = heading.turned(rows, base, fitted.parameters), best.result
@@ -495,7 +497,7 @@ def _cuts(driven: Sequence[Run]) -> Iterator[str]:
 def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
     """Yield a sentence for each sensor that agrees with the wheels better than is credible.
 
-    Its values were probably computed from the wheels.
+    The values of such a sensor were probably computed from the wheels.
     """
     rows, headings, base = made.rows, made.headings, made.base
     if headings is not None:
@@ -521,7 +523,7 @@ def _own(what: str) -> str:
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
     """Return a function that computes the extent of a run's path.
 
-    Its arguments are multipliers and the number of the run. As in the fit, the track changes with
+    The function takes multipliers and the number of the run. As in the fit, the track changes with
     the turn rate.
     """
 

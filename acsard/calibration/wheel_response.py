@@ -1,14 +1,15 @@
-"""Finds how soon the wheels of a log follow their commands, and how fast they can turn.
+"""Estimates from a log how soon the wheels follow their commands, and how fast they can turn.
 
 The daemon expects the speed y of a healthy wheel to follow the command u with the time constant
-`feedback.response_time` (T below). A wheel that contradicts this for `feedback.fault_time` is a
-fault:
+`feedback.response_time` (T below):
 
     T dy/dt = u - y
 
-This module tries several response times, and takes the one that fits best. It also checks the
-present response time with the daemon's own fault detection, `core/motion/wheel_witness.py`. This
-detection measures the time for which healthy wheels of the log look faulty.
+If a wheel contradicts this for `feedback.fault_time`, the daemon reports a fault.
+
+This module tries several response times, and takes the one that fits best. It also runs the
+daemon's own fault detection, `core/motion/wheel_witness.py`, on the log with the configured
+response time, and measures for how long the healthy wheels of the log look faulty.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from acsard.core.motion.wheel_witness import SLACK, Expected, Witness
 from acsard.core.values import Twist
 
 TRIED = np.geomspace(0.01, 5.0, 60)
-"""Response times that are tried, s. They cover the range of the setting."""
+"""Response times that the module tries, s. They cover the range of the setting."""
 
 LEAST_ROWS, MOST_ROWS = 200, 30_000
-"""Minimum number of wheel samples, and maximum number of them that are used.
+"""Minimum number of wheel samples in a log, and maximum number that the module uses.
 
 The maximum is five minutes at 100 Hz. More samples would only take memory.
 """
@@ -41,20 +42,20 @@ FOLLOWS = 0.5
 """Largest fraction of the sum of the squared speeds that the model may leave unexplained."""
 
 SPARE = 0.5
-"""Largest time for which a wheel may look faulty with the proposed response time.
+"""Longest time for which a wheel may look faulty with the proposed response time.
 
-It is a fraction of `feedback.fault_time`.
+It is given as a fraction of `feedback.fault_time`.
 """
 
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
 """Criterion for the highest speed of a wheel.
 
-For at least twice `STEADY_S` s, the speed stays below the fraction `REACHED` of its command. In the
-last `STEADY_S` s of this time, the speed changes by less than the fraction `CONSTANT`.
+A wheel has reached it if its speed stays below the fraction `REACHED` of its command for at least
+twice `STEADY_S` s, and changes by less than the fraction `CONSTANT` in the last `STEADY_S` s.
 """
 
 SAME = 1.5
-"""Ratio of two response times up to which the report calls them equal."""
+"""Largest ratio of the fitted and the configured response time that the report calls equal."""
 
 
 class WheelResponse(Struct, frozen=True):
@@ -67,9 +68,9 @@ class WheelResponse(Struct, frozen=True):
     present: float
     """Configured response time, s."""
     false_fault: bool
-    """Whether the daemon would take the healthy wheels of this log for faulty."""
+    """Whether the configured response time makes healthy wheels of this log look faulty."""
     fastest: float
-    """Highest speed that the wheels reach, rad/s; infinite if the log shows no such limit."""
+    """Highest speed that the wheels reach, rad/s, or infinity if the log shows no such limit."""
 
     def settings(self) -> dict[str, float]:
         """Return the settings of `[feedback]` that must change."""
@@ -99,9 +100,9 @@ class WheelResponse(Struct, frozen=True):
 def response(
     driven: Sequence[Run], drive: DriveConfig, feedback: FeedbackConfig
 ) -> WheelResponse | None:
-    """Return the response of the wheels, or None if the log has no commands that they follow.
+    """Return the response of the wheels, or None if they follow no commands in the log.
 
-    `driven` has the runs of the log.
+    `driven` contains the runs of the log.
     """
     parts: list[tuple[Floats, Floats, Floats]] = []
     room = MOST_ROWS
@@ -154,7 +155,8 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
     """Return the speeds, rad/s, that the model expects for each response time in `TRIED`.
 
-    The arguments are the results of `_commanded`. The shape is (samples, 2, response times).
+    The arguments are the results of `_commanded`. The result has the shape (samples, 2, response
+    times).
     """
     expected = np.empty((*wanted.shape, len(TRIED)))
     last = np.zeros((2, len(TRIED)))
@@ -170,9 +172,10 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time, s, for which a wheel looks faulty with this response time.
+    """Return the longest time, s, for which a wheel looks faulty with the time `response_time`, s.
 
-    `parts` has the results of `_commanded`. `fault_time` is the setting of this name, s.
+    `parts` contains the results of `_commanded` for each run. `fault_time` is the setting of this
+    name, s.
     """
     longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
     for steps, wanted, seen in parts:
@@ -191,9 +194,10 @@ def _evidence(
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
-    """Return the highest constant speed of a wheel whose command is higher, rad/s, or infinity.
+    """Return the highest steady speed of a wheel that stays below its command, rad/s.
 
-    `parts` has the results of `_commanded`.
+    The result is infinite if there is no such wheel. `parts` contains the results of `_commanded`
+    for each run.
     """
     found: list[float] = []
     for steps, wanted, seen in parts:

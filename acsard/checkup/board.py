@@ -70,7 +70,7 @@ class Operator(Protocol):
 
 
 LEAST_S = 0.001
-"""Shortest rest of a time span for which `drive` still sends a line, s."""
+"""Shortest remaining time for which `drive` still sends a line, s."""
 
 BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
 """Interval at which the lateness of this computer is measured while listening, ns."""
@@ -80,7 +80,7 @@ FAREWELL = 5
 
 
 KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
-"""The attributes of `Board` with results of earlier steps that later steps use."""
+"""Names of the attributes of `Board` that contain results of earlier steps for later steps."""
 
 
 class Board:
@@ -102,7 +102,7 @@ class Board:
         self.comma = mcu.trailing_comma
         """Whether lines end with a comma."""
         self.latched = False
-        """Whether the last motor kept turning after zeros whose end was the opposite of `comma`."""
+        """Whether the last motor kept turning when zeros were sent with the opposite of `comma`."""
         self.sealed = self.sampled = False
         """Whether lines carry the checksum, and whether they ask for the sample fields."""
         self.identity: dict[str, str] = {}
@@ -164,7 +164,7 @@ class Board:
         try:
             self._farewell()
         except BaseException:
-            self._farewell()  # a signal arrived in the middle of it; the zeros must still be sent
+            self._farewell()  # a signal interrupted it; the zeros must still be sent
             raise
         finally:
             self.wire.close()
@@ -281,7 +281,7 @@ class Board:
         """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies of that time.
 
         The time between two lines is `period_s`; 0 means `self.period_s`.
-        Ends the check if the MCU falls silent meanwhile, because a runaway would not be seen.
+        Ends the check if the MCU falls silent in that time, because a runaway would go unseen.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -426,7 +426,7 @@ class Board:
         """Send zeros until at least two replies show that every motor stands.
 
         `comma` says whether the lines end with a comma.
-        Returns False if a motor still turns and none of the motors slows down any more.
+        Returns False if this takes longer than `MOTOR_S`, or than `PATIENCE_S` while a motor slows.
         """
         began_s = self.now_s
         while True:

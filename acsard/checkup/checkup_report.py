@@ -1,4 +1,4 @@
-"""The result of the check as text and as an object, and the changes to `acsard.toml` from it."""
+"""The result of the check as text and as an object, and the advised changes to `acsard.toml`."""
 
 from __future__ import annotations
 
@@ -84,8 +84,8 @@ def applied(given: Changes, config: Config) -> Config | None:
 class Report(Struct, frozen=True):
     """A check that has ended.
 
-    `toml` has the changes as lines of TOML. `written` is the file to which they were written, or
-    None. `error` is a failure that does not concern the board, or None.
+    `toml` contains the changes as lines of TOML. `written` is the file to which they were written,
+    or None. `error` is a failure that does not concern the board, or None.
     """
 
     port: str
@@ -110,7 +110,7 @@ def report(
     """Return the report of a check.
 
     A check has passed only if the board answered, every step was reached and judged, and none
-    failed. The report has None for an empty `written`, `error` or `withheld`.
+    failed. An empty `written`, `error` or `withheld` is None in the report.
     """
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)

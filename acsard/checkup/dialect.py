@@ -77,9 +77,10 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Check whether the board answers lines with the configured form of the comma at their end.
+    """Check whether the board answers lines that end as configured, with or without a comma.
 
-    Returns None if it does, or if the check cannot find that out.
+    If it answers only lines with the other ending, that ending is used from then on, and the
+    finding says so. Returns None in all other cases.
     """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
@@ -122,7 +123,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Compare the form of the replies with the documented form. The host can read all of them."""
+    """Compare the replies with the documented form. The host can read all replies found here."""
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
@@ -136,7 +137,7 @@ def replies(board: Board) -> Finding:
 def check(board: Board) -> Finding:
     """Find out whether the board supports the checked link and the sample fields.
 
-    The later steps use both if the board supports them.
+    Later steps use the checked link and the sample fields if the board supports them.
     """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True

@@ -61,7 +61,7 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """Estimate the counts per turn of coarse encoders from speeds, for lines without counts.
 
     Return None if the speeds do not jump from line to line by a count of a coarse encoder, or if
-    there are too few of them.
+    there are too few speeds.
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
     # The time of a single line may be wrong if this computer is late.
@@ -84,8 +84,8 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Return the finding that compares `mcu.encoder_counts` with the board.
 
-    The board states its counts per turn in its identification, and they are measured with `motors`,
-    which turned as commanded.
+    The board may state its counts per turn in its identification. The check also measures them with
+    `motors`, which turned as commanded.
     """
     if not board.sampled:
         about = coarse(board.replies, motors)

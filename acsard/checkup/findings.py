@@ -18,7 +18,7 @@ REST = "the rest"
 
 
 class Finding(Struct, frozen=True):
-    """The result for one subject; `outcomes.py` has the words.
+    """The result for one subject. Its texts come from `outcomes.py`.
 
     `figure` is the measurement, `text` its meaning, `mend` the remedy unless the subject passed,
     and `keys` the configuration values by dotted key, whether they are configured already or not.
@@ -33,7 +33,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """Early end of the check; `finding` is the reason."""
+    """Early end of the check. `finding` is the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)

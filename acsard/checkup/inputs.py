@@ -1,4 +1,4 @@
-"""Asks the operator to press the emergency stop and each bumper, and compares the status lines.
+"""Asks the operator to press the emergency stop and each bumper, and checks the status lines.
 
 The board reports the inputs in status lines (`core/link/board_status.py`). The step comes last,
 because a pressed emergency stop cuts the motors, and some drivers must be enabled again after it.
@@ -66,7 +66,7 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
 
 
 def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
-    """Let the operator press one input; return what is wrong with it, or ""."""
+    """Let the operator press the input `asked`, and return its fault in words, or ""."""
     operator.doing(f"press the {asked.name} and release it, within {PRESS_S:g} s")
     end_s, seen = board.now_s + PRESS_S, set[int]()
     while board.now_s < end_s:

@@ -32,7 +32,7 @@ LATE = "late: not judged"
 
 
 class Lateness:
-    """How late this computer woke up: each delay in s, with the time at which it ended, s."""
+    """The delays with which this computer woke up, and the times at which they ended, both in s."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[float, float]] = []

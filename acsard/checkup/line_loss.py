@@ -27,7 +27,7 @@ MOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""
 
 FEW = 2
-"""Smallest number of lost lines that is not taken for a coincidence."""
+"""Smallest number of lost lines that does not count as a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
 """Number of lines that show a loss of 2 %, and shortest and longest duration of the count, s.
@@ -63,7 +63,7 @@ def finding(board: Board) -> Finding:
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
-    board.listen(motion.GLANCE_S)  # later replies answer the lines that are sent now
+    board.listen(motion.GLANCE_S)  # replies after this wait answer the lines that are sent now
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
@@ -119,8 +119,8 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 def _left_out(replies: Sequence[Reply]) -> int:
     """Return the number of missing replies among evenly spaced ones.
 
-    It is computed over the whole time: a reply that is received late makes one gap longer and the
-    next one shorter.
+    It is computed from the whole time, because a reply that is received late makes one gap longer
+    and the next one shorter.
     """
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
@@ -136,11 +136,13 @@ def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
 
 
 PULSE_S = 0.08
-"""Time for which a single line turns the motors, s: long enough to see, below the watchdog's."""
+"""Time for which a pulse turns the motors, s. The motors visibly move, but no watchdog acts yet."""
 
 TOLD, PULSES_S = 8, 20.0
-"""Number of unanswered pulses that shows the direction of the loss, and longest time to wait for
-them, s."""
+"""Number of unanswered pulses that show the direction of the loss.
+
+`PULSES_S` is the longest time to wait for them, s.
+"""
 
 SPREAD, STRIDE = 12, 5
 """Number of different pauses between pulses, and the stride by which they are ordered.
@@ -158,8 +160,8 @@ SEEN, GRAINS = 0.02, 4
 class Ways(Struct, frozen=True):
     """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
 
-    `sent` is the number of all pulses. `there` were lost on the way to the board. `back` were
-    obeyed, but their answers were lost.
+    `sent` counts all pulses, `there` those that were lost on the way to the board, and `back` those
+    that the motors obeyed although no answer arrived.
     """
 
     sent: int

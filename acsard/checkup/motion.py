@@ -1,7 +1,7 @@
 """Evaluates the motors' movement in a recording: pure functions of replies and their times.
 
-The module also has the speeds, rad/s, and times, s, that several steps of the check share. A limit
-that only one step uses is defined in the module of that step.
+The module also defines the speeds, rad/s, and times, s, that several steps of the check share. A
+limit that only one step uses is defined in the module of that step.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ TREND_S = 0.5
 """Shortest length of the two intervals whose mean speeds `trend` compares, s."""
 
 FALLS = 0.97
-"""Ratio of a motor's speed to its speed just before. Below it, the motor slows down.
+"""Ratio of a motor's speed to its speed just before, below which the motor slows down.
 
 Above the inverse of this ratio, the motor speeds up.
 """
@@ -62,8 +62,8 @@ Above the inverse of this ratio, the motor speeds up.
 class Reply(Struct, frozen=True):
     """A good line of the MCU with the speeds of its motors, rad/s.
 
-    `at_s` is the monotonic time at which the line was complete, s. `reading` has the sample fields,
-    or is None if the line has none.
+    `at_s` is the monotonic time at which the line was complete, s. `reading` contains the sample
+    fields, or is None if the line has none.
     """
 
     at_s: float
@@ -140,9 +140,9 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     """Return the motors that turn at `now_s`, or may still turn between two encoder counts.
 
-    A motor at the speed `STANDING` turns by the angle of its last reading above `STANDING` in the
-    time of that angle divided by `STANDING`. A motor that shows nothing for this time stands. A
-    coarse encoder shows nothing in most replies, even if its motor is faster than `STANDING`.
+    A coarse encoder shows nothing in most replies, even if its motor is faster than `STANDING`. The
+    last reading above `STANDING` is therefore taken as an angle. If nothing more shows for the time
+    that a motor at the speed `STANDING` needs for this angle, the motor stands.
     """
     found: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):

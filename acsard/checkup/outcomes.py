@@ -344,8 +344,8 @@ FAIL serial line: lost | lost
 class Unsure(Finding, frozen=True):
     """A finding that may be caused by the lateness of this computer, whatever the board does.
 
-    `margin_s` is how far the measurement is beyond its bound, s. A delay of less than half of
-    that cannot have caused the finding.
+    `margin_s` is the time by which the measurement exceeds its bound, s. A delay of less than half
+    of that time cannot have caused the finding.
     """
 
     margin_s: float = 0.0
@@ -398,5 +398,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """Return the finding as a plain `Finding`, as the report has it, without the margin."""
+    """Return the finding as a plain `Finding` for the report, without the margin."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

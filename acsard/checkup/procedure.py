@@ -55,7 +55,7 @@ SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("asking the board for the link check", dialect.check),
     ("counting lost lines, 3 s and more", line_loss.finding),
 )
-"""Steps that send only zeros and questions, with the message that the operator sees meanwhile."""
+"""Steps that send only zeros and questions, each with the message that the operator sees."""
 
 Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
@@ -67,8 +67,11 @@ The total is limited because a check must not take four minutes.
 """
 
 AGAIN, MOST = 1, 5
-"""Largest number of repetitions of a step in which the board restarts, and number of restarts in
-all that ends the check."""
+"""Limits for restarts of the board.
+
+A step in which the board restarts is repeated up to `AGAIN` times. `MOST` restarts in all end the
+check.
+"""
 
 
 def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
@@ -81,7 +84,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report a finding unless one of the same name has been reported and judged before."""
+        """Report the first finding of each name, and the first judged one after an unjudged one."""
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -173,7 +176,7 @@ class _Steps:
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Run a step, again if this computer was late, and return its finding.
+        """Run a step, repeat it if this computer was late, and return its finding.
 
         If the computer is late each time, the finding says that the step was not judged.
         """
@@ -230,8 +233,7 @@ class _Steps:
     def _tried(self, step: Step) -> Finding | None:
         """Run a step and return its finding.
 
-        After a bad finding, a board that is silent first gets time to answer, so that a restart is
-        noticed.
+        After a bad finding, wait until a silent board answers, so that a restart is noticed.
         """
         try:
             finding = step()

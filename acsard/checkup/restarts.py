@@ -1,8 +1,8 @@
 """Detects from the board's lines that it restarted during the check.
 
-A restart makes every figure of its step wrong and puts the blame elsewhere: on the cable, a motor
-or the watchdog. The step is therefore repeated (`procedure.py`), and the probable cause of the
-restarts is reported at the end.
+A restart falsifies every figure of its step, so that another part seems to be at fault: the cable,
+a motor or the watchdog. The step is therefore repeated (`procedure.py`), and the probable cause of
+the restarts is reported at the end.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Restarts:
         Text that the board prints because opening the port reset it is not a restart.
         """
         self._clock: tuple[int, float] | None = None
-        """Board's clock in the last reply that had it, ms, and the time of that arrival, s."""
+        """Clock of the board, ms, in the last reply that contained it, and that reply's time, s."""
 
     def asked(self, at_s: float) -> None:
         """Record that this host requested the identification at `at_s`."""
@@ -151,7 +151,7 @@ class Restarts:
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of a restart that the reference firmware reports in these lines, or ""."""
+    """Return the cause that the reference firmware states in these lines after a restart, or ""."""
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 

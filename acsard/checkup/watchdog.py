@@ -3,11 +3,11 @@
 It must also stop them if it receives only damaged lines: a watchdog that any byte feeds is useless
 with a half-broken cable.
 
-There is one experiment: motors at speed, then silence (or damaged lines) for some time, then zeros.
-The watchdog's time is how far the motors ran on, minus how far they run after an ordinary stop. The
-speeds and counts in the replies show these distances. Firmware that answers only when asked, with
-momentary speeds, does not show them. The check asks such firmware after silences of different
-lengths whether the motors were still turning.
+There is one experiment: this host brings the motors to speed, sends nothing (or damaged lines) for
+some time, and then sends zeros. The watchdog's time follows from the distance that the motors ran
+on, minus the distance of an ordinary stop. The speeds and counts in the replies show these
+distances. Firmware that answers only when asked, with momentary speeds, does not show them. After
+silences of different lengths, the check asks such firmware whether the motors were still turning.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ FEEDING = ("a wrong letter", "neither p nor n", "cut short")
 """Kinds of damaged lines that may feed a watchdog."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Fractions of full speed: above the first, motors have not slowed down; below the second, they
-stand."""
+"""Fractions of full speed. From `TURNING` on, a motor has not slowed down.
+
+Below `STOPPED`, it stands.
+"""
 
 UNKNOWN = math.inf
 
@@ -40,7 +42,7 @@ Between = tuple[float, float]
 
 
 class Run(Struct, frozen=True):
-    """The motors' behaviour after the last line that turned them, or after a plain stop.
+    """Behaviour of the motors after the last line that turned them, or in an ordinary stop.
 
     A distance is given as the time that the motor needs for it at full speed, s. Speeds are
     fractions of full speed. `silent_s` is the length of the silence, s.
@@ -63,7 +65,7 @@ class Run(Struct, frozen=True):
     By then a quick motor has obeyed the first zero.
     """
     grain_s: float
-    """Resolution, s: the time that a motor needs for the angle of one jump of its readings."""
+    """Resolution, s: the time in which a motor turns by the angle of one jump of its readings."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
@@ -109,7 +111,7 @@ def _judged(least_s: float, most_s: float) -> Finding:
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
-    """Return the bounds of how long these motors run on in a silence.
+    """Return the bounds of the time for which these motors run on in a silence.
 
     `stop` is their behaviour in an ordinary stop. If the motors never stop in the silence, the
     upper bound is `UNKNOWN`.
@@ -134,8 +136,8 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
     """Narrow the bounds `between` by bisection, and return the new ones.
 
-    The motors still turn at the end of a silence of the lower bound, s, and no longer at the end of
-    a silence of the upper bound. `stop` is their behaviour in an ordinary stop.
+    The motors still turn at the end of a silence as long as the lower bound, s, but not at the end
+    of one as long as the upper bound. `stop` is their behaviour in an ordinary stop.
     """
     least_s, most_s = between
     for _ in range(8):  # each question halves the interval, unless this computer pauses
@@ -157,7 +159,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     """Bring the motors to speed, send nothing for `length_s` s, and stop them.
 
     A length of 0 is an ordinary stop. If there are lines in `instead`, they are sent during the
-    silence. Ends the check if the motors together do not reach half of the speed.
+    silence. Ends the check if none of the motors, turned together, reaches half of the speed.
     """
     began_s = board.now_s
     full = run_up(board, command(motors))
@@ -195,7 +197,7 @@ def command(motors: Sequence[int]) -> Motors:
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Return the counts per turn that can be used for distances.
+    """Return the counts per turn from which distances can be computed.
 
     Returns 0 if the counts do not change, or if they can wrap round during the longest silence.
     """

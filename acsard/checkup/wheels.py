@@ -1,7 +1,7 @@
 """Turns one motor at a time forward and backward, and asks the operator which wheel turned.
 
-From both it finds out whether the motor, the encoder and the wheel of each channel belong together.
-`Channel`, `encoder_finding` and `wheel_map` compute that from the measurements, without any I/O.
+From the encoders and the answers, it finds out whether the motor, the encoder and the wheel of each
+channel belong together. `Channel`, `encoder_finding` and `wheel_map` compute that without any I/O.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ OFF = 0.05
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
 FOLLOWS: tuple[Kind, ...] = ("right", "off", "size")
-"""Results for a motor that moves only its own encoder, and not against the command."""
+"""Results for a motor that moves only its own encoder, in the commanded direction."""
 
 
 class Channel(Struct, frozen=True):
@@ -49,7 +49,7 @@ class Channel(Struct, frozen=True):
     probed: bool = False
     """Whether the motor was turned only for a short probe, which its own encoder did not follow.
 
-    Then `forth` has the speeds of the probe, and `back` is zero.
+    Then `forth` contains the speeds of the probe, and `back` is zero.
     """
     unsure: float = 0.0
     """Relative error of the speeds that a coarse encoder may cause."""
@@ -68,7 +68,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def kind(self) -> Kind:
-        """Result for this motor by the encoders alone, without the operator's observation."""
+        """Result for this motor according to the encoders, without the operator's observation."""
         if not self.judged:
             return "late"
         moved, own = self.moved, self.motor
@@ -120,7 +120,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the end of the outcome's name: the faulty part, if the operator's answer shows it."""
+    """Return the end of the outcome's name, which says what the operator's answer shows, or ""."""
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:
@@ -164,7 +164,7 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
 
 
 NEAR = 0.8
-"""Fraction of `OFF`. A speed with a larger error is measured again.
+"""Fraction of `OFF`. If the error of a speed is larger, the speed is measured again.
 
 The first measurement is too inaccurate to decide such a case.
 """
@@ -231,7 +231,7 @@ def run_up(board: Board, motors: Motors) -> Motors:
         near = [m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * TOLERANCE]
         steady = steady + 1 if len(near) >= len(told) else 0
         if looks * look_s >= motion.CUT_S and not moving(means, motion.STANDING):
-            break  # do not hold it longer: a control loop without an encoder may be winding up
+            break  # do not go on: a control loop without an encoder may be winding up
     return means
 
 
@@ -292,7 +292,7 @@ def probe(board: Board, motor: int) -> Motors | None:
     if not moving(shown, motion.PROBE_MOVES):
         return _probe(board, motor, motion.SPEED)
     again = _probe(board, motor, motion.SPEED / 2)
-    # What moved only once may have been a motor that still coasted.
+    # A movement that shows only once may be that of a motor that still coasted.
     return again if again is None or any(again) else _probe(board, motor, motion.SPEED)
 
 

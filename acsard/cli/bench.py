@@ -3,7 +3,7 @@ simulated microcontroller; a daemon that already runs is not disturbed. It comma
 new daemon from another process and prints the times. It does not judge them. A busy machine gives
 worse times.
 
-what is measured, and between which points (all by one clock):
+what is measured, and between which points (all on the same clock):
   command -> wire       from the call of put() in this process, at random times, until the first
                         byte of the line with that command can be read at the far end of the
                         port. The time on a real wire (2.9 ms a line at 115200 baud) comes on top.
@@ -11,7 +11,7 @@ what is measured, and between which points (all by one clock):
                         port until a callback in this process receives the odometry of that line.
   processor, memory     of the daemon's process alone, read from /proc.
   start-up              from before fork and exec until the first byte of the first line.
-Every command and every feedback line has a speed of its own, by which the tool finds it again.
+Successive commands and feedback lines have different speeds, by which the tool recognizes them.
 A real wire adds its own time, and an FTDI adapter adds its latency timer.
 
 With --port the tool uses the real microcontroller. It sends only zero speeds, so nothing moves.

@@ -4,16 +4,16 @@ positions show it. Without --log the tool drives the robot and guides a person a
 through the drive. The person stands near the robot on a free floor of 3 m x 3 m, starts each leg
 with Enter, stops it with any key, and types the tape measurements that the tool asks for. The robot
 drives for at most 90 s. With --log the tool uses a recorded drive: a black-box recording of a robot
-with a gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a header. A bag has the
-wheels as JointState, and an Imu, a PoseStamped or an Odometry to compare them with. Its topics are
-chosen by their types, or with --topic. The CSV file has the column t (s) and the wheel speeds in
-rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and y (m, from
-any source of positions) with or without yaw (rad), or both. The column run (any name) separates
-several drives. The columns applied_linear (m/s) and applied_angular (rad/s) have the commands, and
-show how soon the wheels follow. The columns may be in any order, and a cell is empty if its sensor
-has no value then. A good log begins with 3 s of standing still. It contains straight drives, turns
-to both sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the
-values. Otherwise it is 1, and a message says what to do instead.
+with a gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a header. A bag must
+contain the wheels as JointState, and an Imu, a PoseStamped or an Odometry to compare them with. Its
+topics are chosen by their types, or with --topic. The CSV file has the column t (s) and the wheel
+speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and
+y (m, from any source of positions) with or without yaw (rad), or both. The column run (any name)
+separates several drives. The columns applied_linear (m/s) and applied_angular (rad/s) contain the
+commands, and show how soon the wheels follow. The columns may be in any order, and a cell is empty
+if its sensor has no value at that time. A good log begins with 3 s of standing still. It contains
+straight drives, turns to both sides, slow and fast, and curves, for 60 s or more. The exit code is
+0 if the tool found the values. Otherwise it is 1, and a message says what to do instead.
 """
 
 from __future__ import annotations

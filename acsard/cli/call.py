@@ -69,9 +69,9 @@ def _fields(service: Verb) -> tuple[str, ...]:
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Return the text that this service cannot be called on several robots at once.
+    """Return a text which says that `service` cannot be called on several robots at once.
 
-    The text also has the commands to type instead.
+    The text also gives the commands to type instead.
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]

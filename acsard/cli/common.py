@@ -59,7 +59,7 @@ def require_asking(args: argparse.Namespace) -> None:
 
 
 def count(text: str) -> int:
-    """Return a whole number of at least 1: an argparse type."""
+    """Parse a whole number of at least 1. This function is an argparse type."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
@@ -67,7 +67,7 @@ def count(text: str) -> int:
 
 
 def seconds(text: str) -> float:
-    """Return a duration from 1 to 600 s: an argparse type.
+    """Parse a duration from 1 to 600 s. This function is an argparse type.
 
     All measured values stay in memory until the end. At 100 Hz that is 60 MB in 600 s.
     """
@@ -104,9 +104,9 @@ def by_environment() -> dict[str, dict[str, object]]:
 def tables(
     options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
 ) -> dict[str, dict[str, object]]:
-    """Return the tables of `before` with the values in `options`, which are by dotted key.
+    """Return the tables `before` with the values in `options`, which maps dotted keys to values.
 
-    A value of None leaves the key as it is.
+    A value of None leaves its key as it is.
     """
     given = {table: dict(values) for table, values in before.items()}
     for key, value in options.items():
@@ -119,8 +119,8 @@ def tables(
 def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
     """Return the path of the configuration and the configuration itself.
 
-    `options` are values by dotted key, such as "mcu.port"; None leaves a key as it is. Prints every
-    problem in the configuration and raises `MendableError` if there are any.
+    `options` maps dotted keys, such as "mcu.port", to values; None leaves a key as it is. Prints
+    every problem in the configuration and raises `MendableError` if there are any.
     """
     where, text = find(path)
     given = tables(options or {}, by_environment())
@@ -134,7 +134,7 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 
 
 def recorded(config: Config) -> Config:
-    """Fill in the recording directory from the environment if the configuration names none.
+    """Return `config` with the recording directory from the environment if `config` names none.
 
     The units of the service set the environment variable `RECORD`. The path is made absolute,
     because a client that reads it on the bus may run in another directory.

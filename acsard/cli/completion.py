@@ -69,7 +69,7 @@ def main(args: argparse.Namespace) -> int:
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
         elif (verb, action.dest) in known:
-            # The shell only offers these words; this parser does not parse any.
+            # Only the shell uses these words, because this parser parses no arguments.
             action.choices = known[verb, action.dest]
     script = shtab.complete(whole, args.shell)
     if args.shell == "zsh":
@@ -81,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _words() -> Mapping[tuple[str, str], list[str]]:
-    """Return the words for each (subcommand, argument), with the default sources."""
+    """Return the words that complete each (subcommand, argument). Sources are the default ones."""
     config = Config()
     sources = [source.name for source in config.commands.sources]
     published = [topic.key for topic in PUBLISHED]

@@ -135,15 +135,16 @@ def require_asked(key: str) -> None:
 def explained(
     look: Callable[[], str], ceased: Callable[[], str] | None = None, after_s: float = FIRST_S
 ) -> Iterator[Callable[[], None]]:
-    """Yield a function that the caller calls for each message, and explain silences.
+    """Explain silences, and yield a function that the caller must call for each message.
 
     A separate thread prints the explanations on standard error, so that the caller never waits for
     them.
 
     Args:
-        look: returns one line why nothing has arrived yet after `after_s` s, or "" for no line.
-        ceased: returns such a line for a later silence of `after_s` s. None explains only the first
-            silence.
+        look: returns a line which says why nothing has arrived in the first `after_s` s, or "" to
+            print no line.
+        ceased: returns such a line for a later silence of `after_s` s. If it is None, only the
+            first silence is explained.
         after_s: length of a silence that is explained, s.
     """
     come, end = Event(), Event()

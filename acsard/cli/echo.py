@@ -133,7 +133,7 @@ def _print(
         decoder: decodes messages for their short form; None prints JSON.
         quota: the messages that are printed. Messages beyond it are skipped.
         of_many: whether each line names its robot.
-        timeout: time in s without a printed message after which it returns, or None.
+        timeout: time, s, after which the function returns if it has printed no message, or None.
         heard: called for each message.
     """
     printed_s = time.monotonic()

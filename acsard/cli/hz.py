@@ -1,4 +1,4 @@
-"""Measure how often messages come on a key and how regular the gaps between them are. The tool
+"""Measure how often messages arrive on a key and how regular the gaps between them are. The tool
 prints one line per second over the last 10 s, until Ctrl-C.
 """
 

@@ -1,7 +1,8 @@
 """Work with the recordings that the daemon has made. Without a subcommand, list them, oldest
-first, with the main events of each. `!` marks those with a stop, a fault or a crash, and --from and
---to list those of a time. FILE is a recording, its number in that list, or `all` of them. Without
-FILE, --from and --to search all recordings, and without these too the newest is taken.
+first, with the main events of each. `!` marks those with a stop, a fault or a crash. --from and
+--to list only the recordings of that time. FILE is a recording, its number in that list, or `all`
+of them. Without FILE, --from and --to search all recordings; without any of the three, the newest
+recording is used.
 """
 
 from __future__ import annotations
@@ -149,8 +150,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         _times(action, argparse.SUPPRESS)
     for action in (shown, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
-    # These do not get --config: `replay` and `export` have an option of that name with another
-    # meaning, the configuration that they try.
+    # `replay` and `export` are left out, because their own option --config has another meaning: the
+    # configuration that they try.
     for action in (shown, recover, report):
         _own_config(action, argparse.SUPPRESS)
 
@@ -259,7 +260,7 @@ def main_show(args: argparse.Namespace) -> int:
 
 
 def _is_being_recorded(recording: Recording) -> bool:
-    """Return whether a daemon still writes to this recording. The recording must be read before."""
+    """Return whether a daemon still writes to this recording. Read the whole recording before."""
     if recording.ending != UNFINISHED:
         return False
     with suppress(OSError):  # the daemon has just renamed or removed the file

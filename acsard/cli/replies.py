@@ -43,9 +43,10 @@ Replies = Mapping[str, ServiceReply | AcsardError]
 def of_each(
     robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
 ) -> dict[str, ServiceReply | AcsardError]:
-    """Call a service of all these robots, and return their replies in the order of `ids`.
+    """Call a service of the robots `ids`, and return their replies in the order of `ids`.
 
-    "*" in `ids` stands for all robots that are present. Raises `NoAnswerError` if there are none.
+    `call` calls the service through the client of one robot. "*" in `ids` stands for all robots
+    that are present. Raises `NoAnswerError` if there are none.
     """
     wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 

@@ -91,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
     def announce(device: str, trouble: str) -> None:
         simulated = config.mcu.simulated
         if "INVOCATION_ID" not in os.environ:  # under systemd, the log line below says the same
-            # Do not use print: a full pipe that nobody reads would block the control loop.
+            # Do not use print: a full pipe that no program reads would block the control loop.
             told = banner(config, where, device, trouble, reach(args), served=served is not None)
             screen.write(told + "\n")
         log.info(

@@ -29,7 +29,7 @@ NUMBERS = {
     "bumper_pressed": "BUMPER:START:SECONDS",
     "battery": "PERCENT:MINUTES",
 }
-"""Names of the arguments of each fault with numbers. The help of `--fault` shows them."""
+"""For each fault that takes numbers: the names of its arguments, for the help of `--fault`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +58,7 @@ def _with_names() -> list[str]:
 
 
 def fault(text: str) -> NamedFault:
-    """Parse the name of a fault with its motors or numbers: an argparse type."""
+    """Parse the name of a fault with its motors or numbers. This function is an argparse type."""
     try:
         return named(text)
     except ValueError as error:
@@ -82,7 +82,7 @@ def _make_link(link: Path, device: str) -> None:
 
 
 def _remove_link(link: Path, device: str) -> None:
-    """Remove the symbolic link, unless another program has replaced it meanwhile."""
+    """Remove the symbolic link, unless another program has replaced it since."""
     if link.is_symlink() and os.readlink(link) == device:
         link.unlink()
 

@@ -29,7 +29,7 @@ async def connect_async(
     source: str = "app",
     tls: str | None = None,
 ) -> AsyncIterator[AsyncClient]:
-    """Connect to a daemon, with the arguments of `connect`, from an asyncio program.
+    """Connect to a daemon from an asyncio program. The arguments are those of `connect`.
 
     Opening and closing the connection do not block the event loop.
     """
@@ -56,7 +56,7 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive as `Client.drive` does. If it is cancelled, it sends zeros at once."""
+        """Drive as `Client.drive` does. If the drive is cancelled, send zeros at once."""
         try:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:

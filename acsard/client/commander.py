@@ -27,7 +27,7 @@ The daemon accepts 1000 commands per second.
 AGAIN_S = 0.02
 """Pause before a zero is sent a second time, s.
 
-A busy receiver handles several commands in a row, and drops those that seem to come too fast.
+A busy daemon handles several commands in a row, and drops those that seem to come too fast.
 """
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
@@ -48,11 +48,11 @@ ZEROS = 3
 """Number of zeros that a sender sends at the end, in case the network loses one."""
 
 GRACE_S = 0.5
-"""Longest time for which commands may have no effect, s. Then the operator is informed, or the
-drive ends.
+"""Longest time for which commands may have no effect, s. After that, the operator is informed, or
+the drive ends.
 
-It is longer than the first 0.25 s of a new sender, in which its commands never have an effect, and
-longer than a short delay of a known sender.
+The time is longer than the first 0.25 s of a new sender, in which its commands never have an
+effect. It is also longer than a short delay of a known sender.
 """
 
 SILENCE_NS = 3 * NS_PER_S // 10
@@ -68,16 +68,17 @@ of more than `CROWD` commands waits as well.
 
 CROWD = 5
 """Largest number of commands that a panel sends in `GATHER_NS`, at 125 Hz. If more arrive, they
-come from a queue, which may hold further ones."""
+come from a queue, which may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
-"""Age above which a speed is not sent, ns: it no longer shows the operator's intention."""
+"""Age above which a nonzero command is not sent, ns, because it no longer shows the operator's
+intention."""
 
 DRIVES_NS = NS_PER_S // 2
 """Time for which a sender counts as driving after its last nonzero command, ns."""
 
 LONGEST_S = 10.0
-"""Longest timeout that a source may have, s. The robot follows no command that is older."""
+"""Longest timeout that a source may have, s. The robot follows no command older than this."""
 
 NEVER = ("inactive", "stopped", "fault", "shutdown")
 """Modes in which no command moves the robot."""
@@ -118,8 +119,8 @@ class Commander:
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands that have arrived since the first one that waits for a burst; 0 once
-        one is sent."""
+        """Number of commands that have arrived since the wait for a burst began; 0 after `send` has
+        taken one."""
         self._crowded = False
         """Whether the last burst had more than `CROWD` commands."""
         self._moved_ns: int | None = None
@@ -130,8 +131,9 @@ class Commander:
     def take(self, wish: Wish, now_ns: int) -> int | None:
         """Store a command that has arrived, in place of one that still waits to be sent.
 
-        Returns the time since the previous command, ns, if it is longer than `SILENCE_NS`. Returns
-        None otherwise, and for the first command.
+        `now_ns` is the monotonic time, as in the other methods. Returns the time since the previous
+        command, ns, if it is longer than `SILENCE_NS`. Returns None otherwise, and for the first
+        command.
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > SILENCE_NS
@@ -150,13 +152,13 @@ class Commander:
         return silence if begins else None
 
     def due_ns(self) -> int | None:
-        """Return the monotonic time from which `send` has a command, ns, or None without one."""
+        """Return the monotonic time from which `send` returns a command, ns; None if none waits."""
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
 
     def send(self, now_ns: int) -> Wish | None:
-        """Return the command to send now, or None if there is none."""
+        """Return the command to send at monotonic `now_ns`, or None if there is none."""
         if self._lead:
             self._lead = False
             return self._zero(now_ns)
@@ -175,14 +177,14 @@ class Commander:
     def end(self, now_ns: int, timeout_s: float = LONGEST_S) -> Wish | None:
         """Discard the command that waits, and end the drive of this sender.
 
-        Returns a zero to send if the robot may still follow a speed of this sender, else None.
-        `timeout_s` is the timeout of the sender's source, s. After that time a zero would only stop
-        the next sender that drives.
+        Returns a zero to send if the robot may still follow a nonzero command of this sender, else
+        None. `timeout_s` is the timeout of the sender's source, s. After that time a zero would
+        only stop the next sender that drives.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
         self._lead = False
-        # The last command may have taken 0.1 s to the daemon. The timeout begins on its arrival.
+        # The timeout begins when the last command arrives at the daemon, which may take 0.1 s.
         if moved_ns is None or now_ns - moved_ns > timeout_s * NS_PER_S + NS_PER_S // 10:
             return None
         return self._zero(now_ns)
@@ -211,9 +213,9 @@ class Sender:
     def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
         """Return the signature of the next command.
 
-        The daemon refuses a command with an older stamp after one with a newer stamp. The commands
-        of a sender that drives as two sources may overtake each other. So a zero gets at least the
-        newest stamp of this sender.
+        The daemon refuses a command whose stamp is older than that of an earlier command. The
+        commands of a sender that drives as two sources may overtake each other. So a zero gets at
+        least the newest stamp of this sender.
 
         Args:
             stamp_ns: the time of the command on the sender's clock, ns, or None without a clock.
@@ -230,7 +232,8 @@ class Sender:
 def objection(state: RobotState, source: str, sender: str) -> str:
     """Return why the robot does not follow the commands of `sender` as `source`; "" if it does.
 
-    `state` is the newest state of the robot, and `sender` the public name of the sender.
+    `state` is the newest state of the robot, `source` is the name of a command source, and `sender`
+    is the public name of the sender.
     """
     if state.mode in NEVER:
         return state.reason

@@ -2,7 +2,7 @@
 
 The daemon does not answer commands. It reports in `state` why the robot does not follow a command.
 A drive therefore subscribes to `state`. If the robot does not follow, the drive ends with an error
-that has the daemon's reason.
+that gives the daemon's reason.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from acsard.client.follower import QUIET_S, Followed, Watch
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2
-"""Time, s. A state that arrives later than this after an action was made after the action."""
+"""Longest time that a state takes to arrive, s. A state that arrives later than this after an
+action therefore describes the robot after the action."""
 
 STANDS = 0.01, 0.02
 """Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""A share and a time, s. The robot is still slowing down if its speed falls below this share of its
-lowest speed so far within this time."""
+"""A share and a time, s. If within this time the speed of the robot falls below this share of its
+lowest speed so far, the robot is still slowing down."""
 
 
 CLOSED = "the connection was closed while the robot drove"
@@ -63,8 +64,8 @@ def drive(
 ) -> Generator[float, None, None]:
     """Drive for `seconds`, then send zeros until the robot stands.
 
-    The generator yields the time, s, that the caller must wait before the next step. `linear` is in
-    m/s and `angular` in rad/s (left is +).
+    The generator yields each pause, s, that the caller must make before the next step. `linear` is
+    in m/s and `angular` in rad/s (left is +).
 
     Raises:
         NotDrivenError: The robot does not follow; the text is the daemon's reason.
@@ -79,8 +80,8 @@ def drive(
         )
     checks = _Drive(robot)
     try:
-        # Send zeros before each drive, not only the first: since the last drive, the robot may have
-        # been stopped and cleared, or restarted.
+        # Send zeros before each drive, not only before the first one. Since the last drive, the
+        # robot may have been stopped and cleared, or its daemon restarted.
         yield from _opening(checks)
         end, grace = time.monotonic() + seconds, min(GRACE_S, seconds / 2)
         while (left := end - time.monotonic()) > 0:
@@ -89,8 +90,8 @@ def drive(
             checks.require(grace)
         yield from _stopping(checks)
     finally:
-        # Send a zero at the end, even if an exception interrupts the drive. After the end of the
-        # connection this fails, and the exception says so.
+        # Send a zero at the end, even if an exception interrupts the drive. If the connection is
+        # closed, this fails, but the exception that ends the drive says so already.
         with suppress(NoAnswerError):
             checks.send(0.0, 0.0)
         checks.watch.end()
@@ -119,7 +120,7 @@ def _opening(checks: _Drive) -> Iterator[float]:
 def _stopping(checks: _Drive) -> Iterator[float]:
     """Send zeros until the robot stands, or until it no longer slows down.
 
-    It does not slow down if something else moves it.
+    A robot that something else moves does not slow down.
     """
     begun = since = time.monotonic()
     watch, slowest = checks.watch, math.inf

@@ -56,7 +56,7 @@ class _Known:
     def begin(self) -> None:
         """Reset the times so that the robot is queried at once.
 
-        This is for a robot that has appeared, or that is followed from now on.
+        Call this when the robot has appeared, or when it is followed from now on.
         """
         self.since = self.info_due = time.monotonic()
         self.follower = Follower(self.since, FLEET_ASK_S)
@@ -167,7 +167,7 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        """Drop the robot that has been gone for the longest time, except the named robots."""
+        """Drop the robot that has been gone for the longest time. Never drop a named robot."""
         gone = [(one.since, name) for name, one in self._known.items() if not one.here]
         for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
             del self._known[name]

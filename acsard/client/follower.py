@@ -22,8 +22,8 @@ from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 ASK_S = 0.3
-"""Time without a published state, s, after which `state` is queried. A robot may publish its state
-seldom."""
+"""Time without a published state, s, after which the client queries `state`. This is needed because
+a robot may publish its state seldom."""
 
 QUIET_S = 0.5
 """Age of a state, s, above which a program must not act on it."""
@@ -61,21 +61,21 @@ class Follower:
         self.due = now + ask_s
         """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0
-        """Number of messages in succession that could not be decoded."""
+        """Number of consecutive messages that could not be decoded."""
         self._ask_s = ask_s
         self._answer: RobotState | None = None
 
     def published(self, state: RobotState, now: float) -> None:
-        """Store a state that the daemon published."""
+        """Store a state that the daemon published and that arrived at the time `now`."""
         self.state, self.last_seen, self.heard = state, now, True
         self.due, self.unreadable = now + self._ask_s, 0
 
     def answered(self, state: RobotState, now: float) -> bool:
         """Process the answer to a query, and return whether it proves that the daemon runs.
 
-        It does if its stamp is newer than that of the stored state or that of the previous answer.
-        The comparison with the previous answer is for a robot whose clock was set back after the
-        stored state.
+        It does so if its stamp is newer than the stamp of the stored state or of the previous
+        answer. The comparison with the previous answer is for a robot whose clock was set back
+        after it published the stored state.
         """
         held, before, self._answer = self.state, self._answer, state
         known = [one for one in (held, before) if one is not None]
@@ -84,7 +84,7 @@ class Follower:
             self.published(state, now)
             return True
         if held is None:
-            # A storage may have sent it. Query again at once to find out.
+            # A storage may have sent this first answer. Query again at once to find out.
             self.state, self.due = state, now
         return False
 
@@ -105,7 +105,7 @@ class Follower:
     @property
     def patience_s(self) -> float:
         """The age above which the robot counts as silent, s."""
-        # From a robot that publishes seldom only answers arrive, at intervals of `ask_s`.
+        # A robot that publishes seldom sends only answers, at intervals of `ask_s`.
         return (SILENT_S if self.heard else FIRST_S) + self._ask_s - ASK_S
 
     def silent(self, now: float) -> bool:
@@ -154,7 +154,7 @@ class Watch(Follower):
         If no state has arrived for some time, query it. Raises `ZError` if the session was closed.
         """
         news = []
-        for _ in range(QUEUED):  # bounded, so that a flood cannot hold the caller
+        for _ in range(QUEUED):  # bounded, so that a flood cannot block the caller
             sample = self._states.try_recv()
             if sample is None:
                 break
@@ -162,7 +162,8 @@ class Watch(Follower):
             if state is not None:
                 self.published(state, now)
                 news.append(state)
-        # Replies come last: `answered` compares stamps, and `published` does not.
+        # Process the replies last, so that `answered` compares their stamps with the published
+        # states. `published` compares no stamps.
         for sample in self._answers.take():
             state = self._read(sample)
             if state is not None and self.answered(state, now):
@@ -181,7 +182,8 @@ class Watch(Follower):
     def objection(self, source: str, sender: str, now: float) -> str:
         """Return why the commands of `sender` as `source` have no effect.
 
-        Returns "" if the robot follows them, and before the first state.
+        Returns "" if the robot follows them, and before the first state. `source` is the name of a
+        command source, `sender` is the public name of the sender, and `now` is the present time, s.
         """
         if self.silent(now):
             return "nothing received from the daemon: does it run?"

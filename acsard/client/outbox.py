@@ -34,7 +34,7 @@ class Outbox:
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Gets the exception that ended the thread. After it, no command is sent any more."""
+        """Future that gets the exception that ended the thread. After that, no command is sent."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
@@ -96,7 +96,7 @@ class Outbox:
         for put, zero in zeros:
             put(zero)
         for commander, put in due:
-            # The bus may have blocked the previous command, so compute the age at the present time.
+            # The bus may have blocked the previous command, so read the clock again for the age.
             with self._news:
                 stale = commander.stale
                 wish = commander.send(clock.mono_ns())

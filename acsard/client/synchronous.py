@@ -135,8 +135,8 @@ class Client:
         # it, although they may send commands under another name.
         self._secret = new_secret()
         self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
-        # Compute stamps from the steady clock. If the wall clock were set during a drive, the
-        # daemon would mistake its step for a delay.
+        # Compute stamps from the steady clock. If stamps came from the wall clock and it were set
+        # during a drive, the daemon would mistake the jump for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
 
     def _sign_as(self, name: str) -> None:
@@ -192,8 +192,8 @@ class Client:
     def end(self) -> None:
         """Close the connection, as `connect` does at the end of its block.
 
-        A zero goes first to each robot that may still follow the last command of a client of this
-        connection: the program may have failed while it drove, and a source may have a timeout of
+        First send a zero to each robot that may still follow the last command of a client of this
+        connection. The program may have failed while it drove, and a source may have a timeout of
         several seconds.
         """
         begun_s = time.monotonic()
@@ -236,9 +236,9 @@ class Client:
         """Call a service, such as "stop", with the fields of its payload.
 
         `clear` releases the stop or fault that `state` shows at the time of the call. `activate`
-        switches on a robot that `state` shows as switched off at that time. If a person decides by
-        an earlier state, pass `latch=state.latch` of that state. The daemon then refuses the call
-        if there was a stop or a `deactivate` in between.
+        switches on a robot that `state` shows as switched off at that time. If a person has decided
+        on the basis of an earlier state, pass `latch=state.latch` of that state. The daemon then
+        refuses the call if there was a stop or a `deactivate` in between.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
@@ -291,7 +291,10 @@ class Client:
             yield reader.decode(*encoded(sample))
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
-        """Yield the raw samples of any key or wildcard below the robot's id."""
+        """Yield the raw samples of any key or wildcard below the robot's id.
+
+        The iterator ends after `timeout` s of silence, and when the connection is closed.
+        """
         yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
@@ -402,7 +405,7 @@ class Client:
         return next(iter(replies), None)
 
     def _refused(self, name: str) -> MendableError:
-        """Return the error for a name with which the session refuses to work."""
+        """Return the error for a key `name` that Zenoh's session has refused."""
         if self.session.is_closed():
             return NoAnswerError(
                 "the connection of this client is closed: use a client within the `with` block of "
@@ -411,7 +414,7 @@ class Client:
         return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
-        """Return an error that says that there is no reply, with the cause if it is known."""
+        """Return the error for a query of the key `name` without a reply, with the likely cause."""
         key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
@@ -436,7 +439,7 @@ class Client:
         """Return the error to raise for a drive or a state that failed with `error`.
 
         The result is one of the errors that `acsard.client` documents. If no command arrives at the
-        daemon, its text also names the role of this client's certificate.
+        daemon, the text of the error also names the role of this client's certificate.
         """
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))

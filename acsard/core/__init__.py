@@ -1,1 +1,1 @@
-"""The robot as a pure function: no module in here does any I/O."""
+"""The robot as a pure function. No module of this package does any I/O."""

@@ -52,14 +52,14 @@ def json_line(text: str) -> str:
 def many(count: int, one: str, more: str = "") -> str:
     """Return a count with its noun: `no lines`, `1 line`, `2 lines`, `2 changes of who drives`.
 
-    `more` is the plural if it does not end in "s".
+    `one` is the noun in the singular. `more` is its plural if that does not just add an "s".
     """
     noun, of, rest = one.partition(" of ")
     return f"{count or 'no'} {one if count == 1 else more or f'{noun}s{of}{rest}'}"
 
 
 def listed(items: Sequence[str], most: int, joint: str = ", ") -> str:
-    """Join the first `most` texts with `joint`, and append how many more there are, if any."""
+    """Join the first `most` texts with `joint`. If there are more, append "and N more"."""
     more = [f"and {len(items) - most} more"] if len(items) > most else []
     return joint.join([*items[:most], *more])
 
@@ -79,7 +79,7 @@ _UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
 def lasting(seconds: float) -> str:
-    """Format a duration in its two largest units. Below a minute, it is in s with one decimal."""
+    """Format a duration in its two largest units, or below a minute in s with one decimal."""
     if seconds < 59.95:
         return f"{round(seconds, 1):g} s"
     parts: list[tuple[int, str]] = []
@@ -95,7 +95,7 @@ _ROUGH = (
     ("µs", 1e-6, 999.5e-6), ("ms", 1e-3, 0.9995), ("s", 1.0, 99.5), ("min", 60.0, 99.5 * 60),
     ("h", 3600.0, 99.5 * 3600), ("d", 86400.0, math.inf),
 )  # fmt: skip
-"""Unit, its size in s, and the duration in s from which the next unit is used."""
+"""Rows of a unit, its size in s, and the duration in s from which the next row applies."""
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:

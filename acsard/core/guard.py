@@ -1,22 +1,22 @@
 """Checks every outgoing line a second time, with code of its own.
 
-The guard shares no code with `limits.py`, `codec.py` or `checksum.py`. It reads the finished bytes
-as the MCU will, and passes a line only if all of these hold:
+The guard shares no code with `limits.py`, `codec.py` or `checksum.py`. It parses the finished bytes
+in the same way as the MCU, and passes a line only if all of these conditions hold:
 
 - The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
   correct if the line has one. With `link_check = "require"`, a line that moves a wheel must have a
   checksum.
 - No wheel is faster than in the last line sent, unless there is a fresh command, the link is up and
-  the mode is `driving` (invariant 2).
+  the mode is `driving` (rule 2 of `acsard/README.md`).
 - Without a link, all wheel speeds are zero.
 
 Otherwise the guard replaces the line with the stop line. It returns the reason, and the robot
 latches a fault.
 
-The guard also checks that the robot comes to rest. When the last fresh command is older than the
-longest ramp that the limits allow, only zero speeds pass. After a stop, a fault or a shutdown, this
-limit is the longest ramp at the stop deceleration. The guard remembers these times, so a recording
-stores the guard's `Memory` beside the state of the robot.
+The guard also checks that the robot comes to rest. Only zero speeds pass if the last fresh command
+is older than the longest ramp to rest that the limits allow. After a stop, a fault or a shutdown,
+only zero speeds pass once the longest ramp at the stop decelerations is over. The guard remembers
+these times, so a recording stores the guard's `Memory` beside the state of the robot.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from acsard.core.config.settings import Config
 from acsard.core.values import NS_PER_S, Outputs
 
 Wheels = tuple[int, int, int, int]
-"""The motors a to d in hundredths of rad/s."""
+"""Speeds of the motors a to d, in hundredths of rad/s."""
 
 _ZERO: Wheels = (0, 0, 0, 0)
 _HEX = b"0123456789ABCDEF"
@@ -40,23 +40,23 @@ HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
 MARGIN_NS = 300_000_000
-"""Time allowed beyond the longest ramp, ns. The board stops by itself if it receives no line for
-this time, so the ramp of a moving robot cannot be later than that."""
+"""Time allowed beyond the longest ramp, ns. The board stops the motors by itself if it receives no
+line for this time, so the ramp of a moving robot cannot be delayed by more than that."""
 
 
 class Memory(Struct, frozen=True):
     """Everything that a guard remembers from one line to the next."""
 
     last: bytes = b""
-    """The last line written to the port. An MCU with power follows it. Empty at the start."""
+    """The last line written to the port, which an MCU with power follows. Empty at the start."""
     commanded_ns: int | None = None
     """Monotonic time at which mode `driving` last had a fresh command, ns; None before that."""
     halted_ns: int | None = None
     """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
-    """Longest ramp to rest under all limits in force since the robot was last at rest, ns."""
+    """Longest ramp to rest, ns, under any limits in force since the robot was last at rest."""
     stop_ramp_ns: int = 0
-    """Longest ramp at the stop decelerations under all limits since the last rest, ns."""
+    """Longest ramp to rest at the stop decelerations, ns, under any of the same limits."""
 
 
 class Guard:
@@ -75,7 +75,7 @@ class Guard:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use this configuration for all later checks.
+        """Use `config` for all later checks.
 
         Until the robot is at rest, the longer of the old and the new ramps applies.
         """
@@ -96,9 +96,9 @@ class Guard:
         self._note_limits()
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """Return the line to send, and the reason if it replaces the line of `outputs`.
+        """Return the line to send, and why the guard replaced the line of `outputs`.
 
-        The line is None if `outputs` has none. The reason is "" if the line is unchanged.
+        The line is None if `outputs` contains none. The reason is "" if the line is unchanged.
         """
         if outputs.mode == "driving":
             if self._commanded(outputs):
@@ -115,7 +115,7 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _note_limits(self) -> None:
-        """Update the longest ramps. A moving robot may still brake by earlier, lower limits."""
+        """Update the longest ramps. A moving robot may still brake at earlier, lower limits."""
         if _wheels(self._last) == _ZERO:
             self._longest = self._ramps
         else:
@@ -155,7 +155,8 @@ class Guard:
         timeout, arrived = self._timeouts.get(outputs.source), outputs.command_ns
         if outputs.mode != "driving" or timeout is None or arrived is None:
             return False
-        # A command may arrive on Zenoh's thread just after this step's clock was read.
+        # Compare the absolute difference: a command may arrive on Zenoh's thread just after this
+        # step read the clock.
         return abs(outputs.now.mono_ns - arrived) <= timeout
 
     def _sealed(self, line: bytes) -> bool:
@@ -178,9 +179,9 @@ class Guard:
 def _ramp_ns(config: Config, *, stop: bool) -> int:
     """Return the time that the robot needs at its limits from the highest speed to rest, ns.
 
-    If `stop` is true, the stop decelerations apply. The highest speed of an axis is its own limit,
-    or its speed with all wheels at `limits.wheel_speed` if that is lower. Both axes reach rest
-    together, so the slower one decides. The jerk limits only affect acceleration.
+    If `stop` is true, the stop decelerations apply. Each axis, linear or angular, starts at its own
+    speed limit, or at its speed with all wheels at `limits.wheel_speed` if that is lower. Both axes
+    reach rest together, so the slower one decides. The jerk limits only affect acceleration.
     """
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
@@ -195,10 +196,10 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
     return int(max(linear / by[0], angular / by[1]) * NS_PER_S)
 
 
-# Each check also decodes the last line sent, so a cache of a few lines halves the work.
+# Each check decodes the last sent line again, so a cache of a few lines halves the work.
 @lru_cache(4)
 def _wheels(line: bytes) -> Wheels | None:
-    """Return the four speeds of a line in 0.01 rad/s, or None if a column has another form."""
+    """Return the four speeds of a line in 0.01 rad/s, or None if a column is malformed."""
     match = _COLUMNS.match(line)
     if match is None:
         return None

@@ -57,12 +57,13 @@ from acsard.core.values import (
 )
 
 MAX_DT = 0.05
-"""Longest time, s, for which one step may accelerate the robot, or 1.5 control periods if that is
-longer. The speed must not jump after a stall of the process."""
+"""Longest time for which one step accelerates the robot, s, so that the speed does not jump after a
+stall of the process. If 1.5 control periods are longer, that time applies instead."""
 
 UNHEARD_S = WATCHDOG_S - 0.05
 """If no line was written to the port for this time, s, the robot starts again from rest. The MCU
-stops by itself after `WATCHDOG_S` on its own clock, which may run a little fast."""
+stops the motors by itself after `WATCHDOG_S`, measured by its own clock. The difference of 0.05 s
+allows for a clock that runs a little fast."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -70,14 +71,15 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 NS_PER_MS = 1_000_000
 
 MAX_TEXT = 200
-"""Number of characters that are kept of a refusal's text, which may quote any client's message."""
+"""Largest number of characters that the robot keeps of a refusal's text. The text may quote a
+message from any client."""
 
 
 class Robot:
     """One robot base with its link, pose, mode and commanders."""
 
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start in the mode that `latches` require, with the limits that they keep lowered."""
+        """Start in the mode that `latches` require, with the lowered limits that they contain."""
         self._file_limits = config.limits
         config, self._first_events = with_lowered(config, latches.lowered)
         self.config = config
@@ -105,17 +107,17 @@ class Robot:
         self._choice = Choice()
         self._speeds = STILL
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
-        """Arrival time of the command and the mode from which the last line was computed.
+        """The command's arrival time and the mode that determined the last computed line.
 
-        The time is monotonic, ns, and None without a command. The whole value is None after a press
-        of the emergency stop or of a bumper, so that a new line is due at once.
+        The time is monotonic, in ns, and None without a command. After a press of the emergency
+        stop or of a bumper, the whole value is None, so that a new line is due at once.
         """
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
         self._made = self._said = (self._limiter.state, 0)
-        """State of the limiter and its time, ns.
+        """Two pairs: a state of the limiter, and the monotonic time of that state, ns.
 
-        `_made` is the state at the last line computed, and `_said` the state at the last line
+        `_made` belongs to the last line that was computed, and `_said` to the last line that was
         written to the port. If a line was not written, `_settle` resets `_made` to `_said`.
         """
         self._status = ("", "", "", "")
@@ -126,7 +128,8 @@ class Robot:
 
         `commands` counts accepted commands, and `command_<reason>` counts refused commands by
         reason. `commands_of_new_senders` counts the commands of senders whose delay is still being
-        checked. Other counters count events. The control loop adds those of the port and the bus.
+        checked. Other counters count events. The control loop adds the counters of the port and
+        of the bus.
         """
         self._refused = ""
         self._refused_ns: int | None = None
@@ -139,7 +142,7 @@ class Robot:
         self._asked: tuple[str, str, int | None] = ("", "", None)
         """Verb, client and time of the last request, so that a repetition is not logged again.
 
-        A stop arrives twice: on a key of its own, and as a query.
+        For example, each stop arrives twice: on a key of its own, and as a query.
         """
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
@@ -187,7 +190,7 @@ class Robot:
 
     @property
     def travelled(self) -> float:
-        """Distance by odometry since the start, forwards and backwards, m."""
+        """Distance driven since the start according to the odometry, forwards plus backwards, m."""
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
@@ -209,7 +212,8 @@ class Robot:
         if self._bumpers.limiting:
             self._keep_away(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
-        # After a press, a new command and a change of the mode, a line may be sent at once.
+        # A line may be sent at once after a new command, a change of the mode, or a press of the
+        # emergency stop or of a bumper.
         news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
@@ -245,10 +249,10 @@ class Robot:
             self._life.latches,
         )
 
-    # The previous line: was it written to the port?
+    # The outcome of the previous line.
 
     def _settle(self, inputs: Inputs) -> None:
-        """Keep the effect of the last line if it was written to the port, else undo it."""
+        """Undo the effect of the last line on the limiter if it was not written to the port."""
         if inputs.guard_trip:
             # The guard has replaced the line with STOP.
             self._limiter.cut()
@@ -284,7 +288,8 @@ class Robot:
         if session.statuses or self._estop.state or self._bumpers.state or self._battery.status:
             self._watch_inputs(inputs.now, events)
         if link != "up":
-            # Without a link the daemon cannot ramp, and the command before the loss is old.
+            # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
+            # link returns, a command from before the loss is too old to follow.
             self._limiter.cut()
             self._speeds = STILL
             self._made = self._said = (self._limiter.state, self._made_ns)
@@ -329,7 +334,8 @@ class Robot:
             self._limiter.cut()
             self._speeds, self._made_of = STILL, None
             self._made = self._said = (self._limiter.state, self._made_ns)
-        # A driver without power reports a fault too, and the emergency stop cuts its power.
+        # While the emergency stop is pressed, ignore the fault: the emergency stop cuts the power
+        # of the motor driver, and a driver without power reports a fault.
         if not estop.why and any(status.driver_fault for _, status in statuses):
             self._fault(DRIVER_FAULT, now, events)
             self._life.caused_again(now.mono_ns)
@@ -351,8 +357,8 @@ class Robot:
     def _keep_away(self, now_ns: int) -> None:
         """Reduce the chosen command to its motion away from the pressed bumpers.
 
-        If nothing of the command leads away, each sender must send a zero again. Otherwise the
-        robot would drive against the obstacle as soon as the bumper is released.
+        If no part of the command leads away from them, each sender must send a zero again.
+        Otherwise the robot would drive against the obstacle as soon as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:
@@ -376,7 +382,7 @@ class Robot:
     def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
         """Update the odometry with a feedback line, and return the new estimate.
 
-        Returns None if the reported values are physically impossible. Several impossible lines in a
+        Return None if the reported values are physically impossible. Several impossible lines in a
         row latch a fault.
         """
         why = self._sanity.impossible(line)
@@ -464,8 +470,8 @@ class Robot:
 
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
         """Change settings while the robot runs."""
-        # The last line computed may not have been written to the port. The wheels follow the last
-        # one that was, so both must be zero.
+        # The robot is at rest only if two lines are zero: the last one that was written to the
+        # port, which the wheels follow, and the last one that was computed.
         said, made = self._said[0].twist, self._limiter.twist
         before, at_rest = self.config, self._speeds == STILL and said == made == REST
         try:
@@ -491,8 +497,9 @@ class Robot:
         now_ns = inputs.now.mono_ns
         heard: Sequence[Command | Refusal] = inputs.commands
         if inputs.refusals:
-            # Process all in the order of arrival, because an unreadable message cancels only the
-            # zeros before it. The refusal of a lost message has no time, so it comes first.
+            # Process commands and refusals in the order of arrival, because an unreadable message
+            # cancels only the zeros that arrived before it. The refusal of a lost message has the
+            # arrival time 0, so it comes first.
             heard = sorted([*heard, *inputs.refusals], key=lambda one: one.arrived_ns)
         for one in heard:
             if isinstance(one, Refusal):
@@ -511,7 +518,8 @@ class Robot:
 
     def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
         events.append(refused(refusal))
-        # Every sender with its own clock is unproven at first, so do not show this as a refusal.
+        # Every sender that stamps its commands is unproven at first, so do not show this as a
+        # refusal.
         if refusal.reason == "unproven":
             self.counters["commands_of_new_senders"] += 1
             return
@@ -538,7 +546,7 @@ class Robot:
     # Report.
 
     def _with_bumper(self, reason: str) -> str:
-        """Return the reason with the motion that a pressed bumper allows."""
+        """Return `reason` with a note about the motion that the pressed bumpers still allow."""
         match self._life.mode:
             case Mode.DRIVING:
                 return f"{reason}; {self._bumpers.note()}"

@@ -16,8 +16,8 @@ MOST_BINS = 1500
 """Maximum number of bins of a curve: two for each pixel of a picture's width."""
 
 FIRST_WIDTH = 0.001
-"""First bin width in s. It is finer than the interval of the steps, so a short recording is not
-thinned."""
+"""Bin width of a curve at the start, s. It is shorter than the interval between the robot's steps,
+so a short recording is not thinned."""
 
 MOST_SPANS = 1500
 
@@ -164,7 +164,7 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A path, thinned so that each of its places is less than `stride` m from a kept place."""
+    """A thinned path. Every place of the path is less than `stride` m from a place that is kept."""
 
     def __init__(
         self,
@@ -175,9 +175,9 @@ class Track:
     ) -> None:
         """Create an empty path.
 
-        At most `most` places are kept: when there are more, `stride` is doubled. A place more than
-        `lasts` s older than the newest one is dropped. The path restarts at a place more than
-        `jump` m from the previous one.
+        At most `most` places are kept: when there are more, `stride` is doubled. A place that is
+        more than `lasts` s older than the newest one is dropped. The path restarts at a place that
+        is more than `jump` m away from the previous one.
         """
         self._most, self._lasts, self._jump = most, lasts, jump
         self._kept = deque[Place]()

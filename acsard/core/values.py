@@ -18,7 +18,7 @@ WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 NS_PER_S = 1_000_000_000
 
 ROOT = "acsard"
-"""The first part of every key of the native tree: `acsard/<robot.id>/...`."""
+"""The first part of every native (non-ROS) key: `acsard/<robot.id>/...`."""
 
 Role = Literal["viewer", "operator", "maintainer"]
 """Permission of a client on the bus. Each role includes those before it."""
@@ -121,7 +121,7 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """Whether the requested speeds are not zero, but cancel out to a zero twist.
+    """Whether speeds that are not zero were requested, but result in a zero twist.
 
     Such a command does not count as the zero that a sender must send first.
     """
@@ -131,9 +131,9 @@ class Command(Struct, frozen=True):
     A gap in the numbers means that commands were lost.
     """
     shared: bool = False
-    """Whether several programs may have the same `sender`.
+    """Whether several programs may share this `sender`.
 
-    This is so for commands through a bridge, and for a sender of which only the key is known.
+    This is true for commands through a bridge, and for a sender of which only the key is known.
     """
     ros: bool = False
     """Whether the command came from ROS, whose tools send no zero by themselves."""
@@ -161,9 +161,9 @@ class Request(Struct, frozen=True):
     It is needed because a `clear` must not undo a stop that arrived after it.
     """
     by: str = ""
-    """Name of the client that sent the request, as in `core/incoming/commands.py`."""
+    """Name of the client that sent the request, as `core/incoming/commands.py` forms it."""
     settings: dict[str, Plain] = {}
-    """The settings that `set` changes, by key as in `core/config/live.py`."""
+    """The new values of the settings that `set` changes, by the keys of `core/config/live.py`."""
     latch: int | None = None
     """Number of the latch that `clear` or `activate` releases; None if the client names none."""
 
@@ -179,8 +179,8 @@ class Answer(Struct, frozen=True):
 class Refusal(Struct, frozen=True):
     """A command that the daemon refuses.
 
-    `reason` is the end of the name of its counter, `command_<reason>`. `text` is for people.
-    `source` and `sender` are "" if they are unknown.
+    `reason` is a short name; `command_<reason>` is the counter of such refusals. `text` is for
+    people. `source` and `sender` are "" if they are unknown.
     """
 
     reason: str
@@ -225,7 +225,7 @@ class Event(Struct, frozen=True):
     by: str = ""
     """Name of the client that caused the event, "" if no client did."""
     kind: str = ""
-    """A detail such as a reason or a change. Repeated events are counted separately for each."""
+    """A detail such as a reason or a change. Repeated events are counted separately by kind."""
     count: int = 1
     """Number of occurrences since the last log line with this name."""
     news: bool = True
@@ -233,7 +233,7 @@ class Event(Struct, frozen=True):
 
 
 class Estimate(Struct, frozen=True, gc=False):
-    """The estimate that the odometry makes of one feedback line. `at` is the time of all parts."""
+    """The estimate that the odometry computes from one feedback line, valid at the time `at`."""
 
     at: Instant
     pose: Pose
@@ -244,9 +244,9 @@ class Estimate(Struct, frozen=True, gc=False):
     """Wheel angles since the start, rad, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time, ns, at which the line that the feedback answers was written to the port.
+    """Monotonic time, ns, at which the daemon wrote the command line that the feedback answers.
 
-    None if it is unknown which line the feedback answers.
+    None if it is unknown which command line the feedback answers.
     """
     heard_ns: int = 0
     """Monotonic time, ns, at which the daemon had received the complete feedback line."""
@@ -264,8 +264,8 @@ class Wait(Struct, frozen=True):
     source: str = ""
     """The source that `what` is about.
 
-    It must send a zero (`neutral`), must show that its delays are steady (`proof`), sends late
-    commands (`late`), sends only zeros (`zeros`), or holds the robot (`higher`, `equal`).
+    This source must send a zero (`neutral`), must show that its delays are steady (`proof`), sends
+    late commands (`late`), sends only zeros (`zeros`), or holds the robot (`higher`, `equal`).
     """
     seconds: float = 0.0
     """A duration, s, whose meaning depends on `what`.
@@ -276,9 +276,9 @@ class Wait(Struct, frozen=True):
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """Time, s, for which the wait has lasted at least.
+    """Least time for which the wait has lasted, s.
 
-    It is rounded down to one of a few values, so that it does not change with each step.
+    The time is rounded down to one of a few values, so that it does not change with each step.
     """
     kept: str = ""
     """The source that sends speeds but must wait for `source`, which sends only zeros."""
@@ -289,7 +289,7 @@ class Wait(Struct, frozen=True):
 
 
 class SourceStatus(Struct, frozen=True):
-    """The state of one source.
+    """The state of one command source.
 
     `age_s` is the time since its last accepted command, s, or None before the first one.
     """
@@ -301,7 +301,7 @@ class SourceStatus(Struct, frozen=True):
 
 
 class WheelsStatus(Struct, frozen=True):
-    """Wheel faults, slip and slow wheels. Empty while the wheels agree and obey."""
+    """Wheel faults, slip and slow wheels. Without any of these, only `differ` has a value."""
 
     text: str = ""
     """Description of the faults and the slip, "" if there are none."""
@@ -310,7 +310,7 @@ class WheelsStatus(Struct, frozen=True):
     slipping: tuple[str, ...] = ()
     """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """How much more the front wheel turns than the rear wheel, as a learned share: left, right."""
+    """Learned fraction by which the front wheel turns more than the rear wheel: left, right."""
     slow: tuple[str, ...] = ()
     """The wheels that turn too slowly in the commanded direction, each with its share of the
     expected speed."""
@@ -329,7 +329,7 @@ class GyroSample(Struct, frozen=True, omit_defaults=True):
     """A turn rate about base_link's z axis, measured by a gyro.
 
     `rate` is in rad/s and positive to the left. `variance` is in rad2/s2, or 0 if the gyro does not
-    report it. `anew` is true for the first sample of another gyro than before.
+    report it. `anew` is true for the first sample of a gyro other than the previous one.
     """
 
     at_ns: int
@@ -359,7 +359,7 @@ With any value except `used`, the odometry uses the configured track.
 
 
 class GyroStatus(Struct, frozen=True):
-    """The state of the gyro and the values learned with it. A value not known yet is None."""
+    """The state of the gyro and the values learned from it. A value not known yet is None."""
 
     does: GyroDoes = "off"
     bias: float | None = None
@@ -404,8 +404,8 @@ class Latch(Struct, frozen=True):
     number: int
     """Number that identifies the latch: the time in milliseconds since 1970.
 
-    It is larger if the previous latch already has that number. The number stays unique across
-    restarts, and JavaScript represents it exactly.
+    If the previous latch already has that number, a larger one is used. The number stays unique
+    across restarts, and JavaScript represents it exactly.
     """
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
@@ -418,7 +418,7 @@ class Latch(Struct, frozen=True):
 
 
 class Latches(Struct, frozen=True):
-    """The latches and lowered limits, which must survive every end of the process.
+    """The latches and the lowered limits, which must survive every end of the daemon's process.
 
     They do not depend on the link.
     """
@@ -451,9 +451,10 @@ class Latches(Struct, frozen=True):
 class Inputs(Struct, frozen=True):
     """The complete input of one step.
 
-    If `tick` is true, the step makes the line of its control period. If `at_once` is true, it may
-    make a line at once for a new command or mode. If both are false, it makes no line. `opened`
-    counts how often the port was opened: a new number means a new session with the board.
+    If `tick` is true, the step computes the line of its control period. If `at_once` is true, the
+    step may compute an extra line for a new command or mode. If both are false, it computes no
+    line. `opened` counts how often the port was opened: a new number means a new session with the
+    board.
     """
 
     now: Instant
@@ -480,8 +481,8 @@ class Inputs(Struct, frozen=True):
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """Time from the previous step to the writing of its line, ns; 0 if the process did not stall
-    in between."""
+    """Time between the previous step and the writing of its line, ns; 0 if the process did not
+    stall in between."""
 
 
 class Outputs(Struct, frozen=True):
@@ -489,9 +490,9 @@ class Outputs(Struct, frozen=True):
 
     now: Instant
     due: bool
-    """Whether the step was to make a line, for its period or at once."""
+    """Whether the step had to compute a line, for its control period or at once."""
     line: bytes | None
-    """The line for the board, None if none is due."""
+    """The line for the board; None if no line was due."""
     speeds: WheelSpeeds
     applied: Twist
     linked: bool
@@ -510,8 +511,8 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Whether the command, the mode, or a press of the emergency stop or of a bumper is newer than
-    the last line that was computed."""
+    """Whether something has changed since the last computed line: the command, the mode, or a press
+    of the emergency stop or of a bumper."""
     latches: Latches = Latches()
     """The latches in force after the step; the same object until one of them changes."""
 
@@ -578,18 +579,18 @@ class Snapshot(Struct, frozen=True):
     board: dict[str, str] = {}
     """The fields of the board's last status line, by name, as text."""
     check: str = "plain"
-    """The checksum that the serial lines have, in words; "plain" without one."""
+    """The checksum that the serial lines carry, in words; "plain" without one."""
     encoders: tuple[int, ...] = ()
     """Encoder counts per wheel turn, in `WHEELS` order.
 
-    0 means that they are unknown, or that the reported speeds are not whole counts of them.
+    0 means that the number is unknown, or that the reported speeds do not fit whole counts.
     """
     sender: str = ""
     """The sender whose command the robot follows, "" without one."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
-    """Why the latches would not survive a restart, in words; "" if they would.
+    """Why the latches would not survive a restart, in words; "" if they would survive it.
 
     None if the daemon does not store its latches.
     """

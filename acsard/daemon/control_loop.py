@@ -64,13 +64,13 @@ QUERIES_PER_STEP = 8
 a flood of queries does not cost a period."""
 
 LATE_NS = 1_000_000
-"""Shortest delay from the start of a step to the write of its line, ns, that is passed to the
-robot. Most delays are shorter and are passed as 0, because the sample times are not that accurate.
-"""
+"""Shortest delay that is passed to the robot, ns. A delay runs from the start of a step to the
+write of its line. Most delays are shorter and are passed as 0, because the sample times are not
+that accurate."""
 
 NOT_STORED = "the disk has not stored this yet, and a restart may lose a stop until it has"
-"""Addition to an answer that does not wait any longer for the latch file, because the disk is slow.
-"""
+"""Text that is added to an answer if the disk is slow and the answer no longer waits for the latch
+file."""
 
 BUS_STUCK = Event("bus_stuck", "the bus accepts no messages; driving goes on", "warning")
 
@@ -110,7 +110,8 @@ class ControlLoop:
             certificate_ends: wall-clock time at which each certificate expires, ns since 1970, by
                 the name of the certificate. None or empty without TLS.
             others: events of the daemon's other parts. Each step takes them and empties the list.
-            beside: returns the present value of a key that another part publishes, else None.
+            beside: returns the present value of a key that another part of the daemon publishes,
+                or None for any other key.
             adopted: called with each configuration that comes into force after the start.
             recorder: the black box, or None.
             latches: the latches with which the robot starts.
@@ -135,9 +136,9 @@ class ControlLoop:
         """Cache of `_to_keep`: the latches and the two sets of limits of its last computation, and
         the latches that it returned."""
         self._step_answers: tuple[Answer, ...] = ()
-        """The answers to requests from the present step."""
+        """The answers of the present step to requests."""
         self._answers: deque[tuple[int, Answer]] = deque()
-        """Answers that wait until the latch file has the latches. Each comes with the monotonic
+        """Answers that wait until the latches are in the latch file. Each comes with the monotonic
         time at which it was queued, ns."""
         self._got = NOTHING
         """The input that the present step has taken from the bus."""
@@ -154,9 +155,9 @@ class ControlLoop:
         """Gyro samples that have arrived since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._trip, self._late_ns = False, "", 0
-        """Result of the last line, for the inputs of the next step. The values are: whether the
-        line was superseded, why the guard replaced it ("" if it did not), and how much later than
-        the start of its step it was written, ns (0 below `LATE_NS`)."""
+        """Three facts about the last line, for the inputs of the next step: whether the line was
+        superseded, why the guard replaced it ("" if it did not), and the delay from the start of
+        its step to its write, ns (0 below `LATE_NS`)."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -169,14 +170,17 @@ class ControlLoop:
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
     def totals(self, now_ns: int) -> dict[str, float]:
-        """Return run time in s, distance in m and all counters, by name, for the last log line."""
+        """Return the values of the last log line by name: run time in s, distance in m, counters.
+
+        `now_ns` is the monotonic time.
+        """
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
         shot = self.robot.snapshot(now_ns)
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time of the next step for a command that came too soon after a line, ns.
+        """Monotonic time at which a command that came too soon after a line gets its step, ns.
 
         None if no command waits.
         """
@@ -190,8 +194,8 @@ class ControlLoop:
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
         """Run one control step at the time `now`.
 
-        `period` has the periods that have ended since the last step. It is `NO_PERIOD` for a step
-        between two periods.
+        `period` says how many periods have ended since the last step, and when the first was due.
+        It is `NO_PERIOD` for a step between two periods.
         """
         self._got = NOTHING
         try:
@@ -209,8 +213,9 @@ class ControlLoop:
             self._stopwatch.period(now.mono_ns, late_ns, missed)
             if self._late_watch is not None:
                 self._late_watch.period(now.mono_ns, late_ns, missed)
-                # The log joins events of one name to one line, with the text of the last event. In
-                # a late step that event has the number of periods and would hide the cause.
+                # The log joins events of one name into one line, which shows the text of the last
+                # event. After missed periods that is the robot's own event. It would hide the
+                # cause, because it states only the number of periods.
                 if not missed:
                     self._others += self._late_watch.news()
         commands, refusals, requests = self._from_bus(now)
@@ -252,7 +257,7 @@ class ControlLoop:
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
-        # `adopted` may change the log, so call it after the log has this step's events.
+        # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
             self._adopted(self._config)
         self._stopwatch.step(now.mono_ns, self._mono_ns())
@@ -300,7 +305,8 @@ class ControlLoop:
                 kept = self._kept = latches, now, limits, without
             latches = kept[3]
         last = self._handover.latches
-        # The keeper writes its file again if it gets another object, even with equal content.
+        # Return the last object if nothing has changed, because the keeper writes its file again
+        # for each new object, even for one with equal content.
         return last if latches == last else latches
 
     def finish(self, now: Instant) -> None:
@@ -326,7 +332,7 @@ class ControlLoop:
     def _from_bus(
         self, now: Instant
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
-        # Ask for no queries before the first step, because there are no outputs to answer them.
+        # Take no queries before the first step, because there are no outputs yet to answer them.
         got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if got is NOTHING:
             return (), (), ()
@@ -393,11 +399,11 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Return the request of a query that the robot must decide, or answer the query.
+        """Answer a query, or return the request in it if the robot must decide about that request.
 
-        A query without a request is answered. A `set` with `keep` goes to the configuration file
-        first. In these two cases the method returns None. A refusal of the query is added to
-        `refusals`.
+        A query that contains no request is answered at once. A `set` with `keep` goes to the
+        configuration file first. In both cases the method returns None. If the query is refused,
+        the refusal is added to `refusals`.
         """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
@@ -417,9 +423,9 @@ class ControlLoop:
         return None
 
     def _keep(self, request: Request, now: Instant) -> None:
-        """Pass a `set` with `keep` to the configuration file, which checks that it can be changed.
+        """Queue a `set` with `keep` for a check that the configuration file can be changed.
 
-        Without a configuration file, refuse the request.
+        Refuse `request` if there is no configuration file.
         """
         if self._settings_file is None:
             text = "nothing is set: this daemon has no configuration file"
@@ -430,7 +436,7 @@ class ControlLoop:
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
         """Return each `set` with `keep` that the configuration file can store.
 
-        The answers to requests that were refused or have been written are queued.
+        Queue the answers to the requests that were refused or that have been written to the file.
         """
         if self._settings_file is None:
             return ()
@@ -520,7 +526,7 @@ class ControlLoop:
 
 
 def _stops(got: BusInput) -> list[str]:
-    """Return the names of the clients that stop the robot with this input."""
+    """Return the name of the client for each stop in this input."""
     puts = [one for one in got.arrivals if one.key == "stop" and one.put]
     calls = [query for query in got.queries if query.topic == "srv/stop"]
     names = [caller_name(put.via, put.attachment, put.sender) for put in puts]

@@ -3,7 +3,8 @@
 The daemon enters the contexts of the simulator, the bus, the port and the control loop, in this
 order. The shutdown leaves these contexts in reverse order: the robot ramps to zero, the port writes
 STOP and closes, and the bus closes. The first signal begins the shutdown, and a second one cuts the
-ramp short. An exception in any task leaves the contexts in the same order, but without the ramp.
+ramp short. After an exception in any task, the daemon leaves the contexts in the same order, but
+without the ramp.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class Departure:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
-        """Suppress the exception of a start that a signal has cancelled, which is not an error."""
+        """Suppress the exception if a signal has cancelled the start, which is not an error."""
         return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
@@ -88,7 +89,7 @@ class Departure:
         self._wake()
 
     def over(self, now_ns: int, at_rest: bool) -> bool:
-        """Return whether the ramp has ended, was cut short or has taken too long.
+        """Return whether the shutdown's ramp has ended, was cut short or has taken too long.
 
         `now_ns` is the monotonic time. `at_rest` is true if the last step commanded zero speed.
         """
@@ -98,16 +99,16 @@ class Departure:
 
 
 SWITCH_INTERVAL_S = 0.0005
-"""Longest time that another Python thread may hold the interpreter lock, s. The default of Python
-is half a control period (5 ms)."""
+"""Longest time that another Python thread may hold the interpreter lock, s. Python's default of
+5 ms is half a control period."""
 
 LATCHED_PERIOD_S = 5.0
 """Interval at which the latched topic `tf_static` is published again, s. Some subscribers cannot
 query the last sample of a latched topic."""
 
 Announce = Callable[[str, str], None]
-"""Callback for the end of the start. Its arguments are the path of the serial device, and the
-reason why the device is not open. The reason is "" for an open device."""
+"""Callback that runs when the start is complete. Its arguments are the path of the serial device,
+and the reason why the device is not open. The reason is "" for an open device."""
 
 
 async def run(
@@ -124,11 +125,11 @@ async def run(
         config: The configuration.
         log: The log.
         announce: Called once when everything runs.
-        gateway: Arguments of the `acsard gateway` process, which runs if `bus.outside` has
-            endpoints. None if the gateway is a service of its own.
-        page: Arguments of the `acsard web` process to run, None for no page.
-        settings_file: The configuration file, to compare it with the settings in force and to
-            change it. None for neither.
+        gateway: Arguments of the `acsard gateway` process, which this daemon starts if
+            `bus.outside` names endpoints. None if the gateway is a service of its own.
+        page: Arguments of the `acsard web` process, or None for no page.
+        settings_file: The configuration file, which the daemon compares with the settings in force
+            and changes. None to do neither.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -138,8 +139,8 @@ async def run(
         stack.enter_context(departure)
         log_from_environment()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        # Ask for real-time priority before the first thread starts, because the threads of the bus
-        # must not have it.
+        # Ask for real-time priority before the first thread starts. Only this thread then has it:
+        # the threads of the bus do not inherit it.
         refused = real_time.ask() if config.control.real_time else ""
         if refused:
             log.info("real_time", text=refused)
@@ -154,7 +155,8 @@ async def run(
         after = stack.enter_context(ExitStack())
         bus, port = ZenohBus(config, wake), _port(config, path, wake, events.append)
         ends = _certificates(config, gateway is not None)
-        # The bus comes first: an id or address in use must end the daemon before the port opens.
+        # Open the bus before the port. If another program uses the robot's id or the address, the
+        # daemon must end without touching the port.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
         if simulated is not None:
@@ -208,9 +210,10 @@ async def run(
 def _recorder(
     config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
 ) -> Recorder | None:
-    """Return the black box, or None if the configuration has none. The stack closes it.
+    """Return the black box, which records every step, or None if `[record] directory` is empty.
 
-    `log` queues an event. `wall_ns` is the wall-clock time of the start, ns since 1970.
+    `stack` closes it. `log` queues an event. `wall_ns` is the wall-clock time of the daemon's
+    start, ns since 1970.
     """
     if not config.record.directory:
         return None
@@ -222,7 +225,7 @@ def _recorder(
 def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
     """Return the latch file, or None for the built-in simulator, whose latches are not kept.
 
-    The stack closes the file after the port, because a slow disk must not delay the last STOP.
+    `stack` closes the file after the port, because a slow disk must not delay the last STOP.
     """
     if config.mcu.simulated:
         return None
@@ -248,10 +251,10 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 
 
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
-    """Return when each certificate that this process uses expires, ns since 1970, by name.
+    """Return the expiry time of each certificate that the daemon uses, ns since 1970, by its name.
 
-    Returns {} if the process uses no certificate. `ours` is true if this daemon runs the TLS
-    gateway. Raises a `MendableError` if the certificates cannot be used.
+    Returns {} if the daemon uses no certificate. `ours` is true if the daemon runs the TLS gateway.
+    Raises a `MendableError` if the certificates cannot be used.
     """
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
@@ -269,11 +272,11 @@ async def _control(
 ) -> None:
     """Run control steps until the shutdown is over.
 
-    Each period gets a step. The other events of `wakeup.py`, such as feedback, get steps of their
-    own.
+    Each period gets a step. Other events, such as received bytes, get steps of their own
+    (`wakeup.py`).
     """
-    # Let the other tasks run first. Their first round is slow, and must end before the first
-    # period.
+    # Let each of the other tasks run once first. This first round is slow, and must end before the
+    # first period.
     await asyncio.sleep(0)
     gc.collect()
     gc.freeze()  # the present objects live to the end, so later collections skip them

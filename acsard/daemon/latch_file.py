@@ -1,11 +1,11 @@
-"""The file that stores stop, fault, `inactive` and lowered limits for the next start of the daemon.
+"""The file that keeps the latches for the next start of the daemon.
 
-A thread writes the file, and another thread syncs it. The control loop only hands the newest
-latches to the first thread, and never waits for the disk. After that thread has renamed the new
-file, a kill of the process loses nothing. After the other thread has synced it, a power cut loses
-nothing. A sync takes up to seconds on an SD card, and a stop must not wait for the sync of the
-latches before it. The file is read once, before the robot exists. `latch_rules.py` decides with
-which latches the robot starts.
+The latches are stop, fault and `inactive`, and the lowered limits. A thread writes the file, and
+another thread syncs it. The control loop only hands the newest latches to the first thread, and
+never waits for the disk. Once that thread has renamed the new file, a kill of the process loses
+nothing. Once the other thread has synced it, a power cut loses nothing. A sync takes up to seconds
+on an SD card, and a stop must not wait for the sync of earlier latches. The file is read once,
+before the robot exists. `latch_rules.py` decides with which latches the robot starts.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
-"""Time limit of one write, and of reading and writing at the start, s. The daemon reports that a
-slower disk hangs."""
+"""Time limit of one write, of one sync, and of the read and write at the start together, s. If a
+disk takes longer, the daemon reports that it hangs."""
 
 PACE_S = 0.05
 """Pause after each successful write, s. A flood of stops, each of which is a new latch, must not
@@ -116,7 +116,7 @@ class LatchFile:
         self._abandoned = False
         """True if `start` has given up waiting for the first read of the file."""
         self._found: Latches | None = None
-        """The latches that the file had at the start; None until the file has been read."""
+        """The latches that the file contained at the start; None until the file has been read."""
         self._blind = False
         """True if the robot has started without the content of the file. The writing thread reads
         the file before its first write, and then sets this to False."""
@@ -127,7 +127,7 @@ class LatchFile:
         """The newest latches that `keep` was given, until the thread takes them."""
         self._news = Mailbox[Event](EVENTS)
         self._held: Latches | None = None
-        """The latches that the file has now. None before the first write."""
+        """The latches that the file contains now. None before the first write."""
         self._failed = ""
         self._handed: Latches | None = None
         """The latches that the last call of `keep` was given."""
@@ -136,10 +136,9 @@ class LatchFile:
         self._syncing_ns: int | None = None
         """Monotonic time at which the present sync began, ns; None between two syncs."""
         self._hung = False
-        """True if the last event about the speed of the disk said that it hangs. False if the event
-        said that it works again."""
+        """True while the last report about the disk says that it hangs. `news` sets it."""
         self._renamed = Mailbox[Latches](1)
-        """The newest latches that the file has, until the syncing thread has seen them."""
+        """The newest latches in the file, until the syncing thread takes them."""
         self._threads: tuple[threading.Thread, ...] = ()
         """The threads that write and sync the file, in this order. Empty until both run."""
 
@@ -147,6 +146,8 @@ class LatchFile:
 
     async def start(self, now: Instant) -> Latches:
         """Read the file, try to write it, and return the latches with which the robot starts.
+
+        `now` is the time of the start.
 
         Raises:
             InUseError: another daemon uses this file for a robot with the same id.
@@ -172,7 +173,8 @@ class LatchFile:
             for thread in threads:
                 thread.start()
         except RuntimeError as error:
-            # One of the threads may run. Without the other one it must not report a recovery.
+            # The first thread may run already. `_barred` keeps it from writing, and from reporting
+            # a recovery, without the other thread.
             self._barred = f"this process cannot start another thread ({error})"
             self._fail(self._barred)
             return doubted(latches, at_start(unwritable(self.where, self._failed)), now)
@@ -250,7 +252,7 @@ class LatchFile:
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether the file has these latches, so that they survive a kill of the process."""
+        """Return whether the file contains these latches: a kill of the process then loses none."""
         return self._held is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
@@ -280,7 +282,7 @@ class LatchFile:
 
     @property
     def _hangs(self) -> bool:
-        """Return whether a sync takes too long, or a write for which the newest latches wait."""
+        """True if a sync, or a write while the newest latches wait, takes longer than `START_S`."""
         if self._failed:
             return False
         busy_ns = None if self._held is self._handed else self._busy_ns
@@ -378,7 +380,7 @@ class LatchFile:
                 if failed:
                     self._fail(trouble)
                 elif self._handed is None or self._held is self._handed:
-                    # Otherwise the newest latches are not written yet.
+                    # If the newest latches are not written yet, the recovery is reported later.
                     self._recover()
             if over:
                 return

@@ -20,7 +20,7 @@ FORMAT = 1
 """Version of the format. A file with another version counts as unreadable."""
 
 MAX_BYTES = 65_536
-"""Largest size of a file that is read. Three latches and all limits take about 1 kB."""
+"""Largest size of a file that is read, bytes. Three latches and all limits take about 1 kB."""
 
 MAX_TEXT = 500
 """Largest number of characters of a name or a reason, which any client may choose."""
@@ -173,17 +173,18 @@ class Handover:
         self._keeper = keeper
 
     def take(self, latches: Latches) -> None:
-        """Hand these latches to the keeper if they are another object than the last ones."""
+        """Hand these latches to the keeper if they are not the same object as the last ones."""
         if latches is not self.latches:
             self.latches = latches
             if self._keeper is not None:
                 self._keeper.keep(latches)
 
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
-        """Hand these latches to the keeper, with the stops that no control step has processed.
+        """Hand these latches to the keeper, with a stop if some stops came after the last step.
 
-        `by` names the clients that asked for these stops; if it is empty, there was no such stop.
-        The stop has a new number, so that a `clear` of the stop before it does not release it.
+        `by` names the clients of the stops that no control step has processed. If it is empty, no
+        stop is added. The added stop has a new number, so that a `clear` of an earlier stop does
+        not release it.
         """
         if by:
             before = -1 if latches.stop is None else latches.stop.number

@@ -1,4 +1,4 @@
-"""Names the cause of a late control period from the kernel's counters; pure.
+"""Names the cause of a late control period from the kernel's counters. This module is pure.
 
 `CAUSES` is the table of causes, and each cause has a rule. The rule compares the counters from
 before the lateness with those after it. It returns a clause for a sentence, or "" if its cause does
@@ -22,16 +22,17 @@ from acsard.core.values import NS_PER_S, Event
 from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
 
 SHARE = 0.5
-"""Smallest share of a lateness that a cause must explain, unless it has a share of its own."""
+"""Smallest share of a lateness that a cause must explain, unless the cause has its own constant."""
 
 SLEPT_SHARE = 0.3
-"""Smallest share of a lateness for which the loop's thread must have slept if a disk is the cause.
-It is low, because reading pages from a fast virtual disk took as much processor time as sleep."""
+"""Smallest share of a lateness for which the loop's thread must have slept before a disk counts as
+the cause. It is low, because a thread that read pages from a fast virtual disk used the processor
+for as long as it slept."""
 
 DISK_SHARE = 0.25
-"""Smallest share of a lateness for which programs must have waited for a disk if a disk is the
-cause. It is low, because the kernel counted only 0.28 to 0.45 of the time as waiting while a thread
-wrote to a disk all the time."""
+"""Smallest share of a lateness for which programs must have waited for a disk before a disk counts
+as the cause. It is low, because the kernel counted only 0.28 to 0.45 of the time as waiting while a
+thread wrote to a disk all the time."""
 
 LEAST_STOLEN_NS = 3 * NS_PER_S // 100
 """Shortest steal time that counts as a cause, ns: three of the kernel's ticks. In a test on a
@@ -39,8 +40,8 @@ virtual machine, 24 of 607 comparisons had one tick of steal time and one had tw
 lateness had another cause."""
 
 SUSPENDED_NS = NS_PER_S // 10
-"""Shortest time that counts as a suspend, ns. The difference of the two clocks can show a little
-time without a suspend, because they are not read at the same moment."""
+"""Shortest time that counts as a suspend, ns. A suspend shows as a difference between two clocks
+(`suspended`). They are not read at the same moment, so they differ a little without a suspend."""
 
 
 class Lateness(Struct, frozen=True, omit_defaults=True):
@@ -82,7 +83,7 @@ class Cause(Struct, frozen=True):
 
 
 def suspended(late: Lateness) -> str:
-    """Return the part of the message that says that the computer was suspended, "" if it was not.
+    """Return the clause for a computer that was suspended, or "".
 
     Two clocks show it: CLOCK_BOOTTIME runs on during a suspend, and CLOCK_MONOTONIC does not.
     """
@@ -129,8 +130,9 @@ def hot(now: Conditions, hotter: bool = False) -> str:
 def governor(late: Lateness) -> str:
     """Return the clause for a processor whose clock is limited, or "".
 
-    The limit of the clock (scaling_max_freq) is compared with the full clock (cpuinfo_max_freq).
-    For a governor that keeps the lowest clock, the limit is scaling_min_freq.
+    The limit of the clock frequency (scaling_max_freq) is compared with the full frequency
+    (cpuinfo_max_freq). For a governor that keeps the lowest frequency, the limit is
+    scaling_min_freq.
     """
     return slow(late.after.conditions) if late.computed and not heat(late) else ""
 
@@ -188,11 +190,11 @@ def memory(late: Lateness) -> str:
 def disk(late: Lateness) -> str:
     """Return the clause for a wait for a disk, or "".
 
-    The kernel reports two times. The first is that of the loop's own thread, in /proc/self/stat
-    (delayacct_blkio_ticks), if the kernel measures it. The second is that of all programs, in
-    /proc/pressure/io, or else iowait in /proc/stat. The second counts only if the loop's thread
-    itself read from a disk or wrote to one (/proc/self/task/TID/io), because other programs may
-    wait for a disk at any time.
+    The kernel reports two waiting times. The first is that of the loop's own thread, in
+    /proc/self/stat (delayacct_blkio_ticks), if the kernel measures it. The second is that of all
+    programs, in /proc/pressure/io, or else iowait in /proc/stat. The second counts only if the
+    loop's thread itself read from a disk or wrote to one (/proc/self/task/TID/io), because other
+    programs may wait for a disk at any time.
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
@@ -263,10 +265,10 @@ def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
 
 
 def cause_in(text: str) -> str:
-    """Return the part with the duration and the causes of a text.
+    """Return the part of a text that gives the duration and the causes of a lateness.
 
-    The text comes from an event or from a line of the log, which may begin with the number of
-    missed periods. Return "" if the text has no cause.
+    The text comes from an event or from a line of the log, and may begin with the number of missed
+    periods. Return "" if the text names no cause.
     """
     begin, because, clause = text.partition(BECAUSE)
     return begin.rpartition(": ")[2] + because + clause if because else ""

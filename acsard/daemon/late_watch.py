@@ -1,12 +1,13 @@
 """Watches for late control periods, and reports their cause if the kernel shows one.
 
 In each period the control loop reads one small file, `schedstat`, with the processor times of its
-thread. It hands a late period to a thread of this module. Only that thread reads the kernel's other
-files, which takes longer. It reads them four times a second, so that it has a reading from before
-each lateness, and once more after a lateness. `late_causes.py` compares the two readings.
+thread. It hands a late period to this module's thread. Only this thread reads the kernel's other
+files, because reading them takes longer. It reads them four times a second, so that it has a
+reading from before each lateness, and once more after a lateness. `late_causes.py` compares the two
+readings.
 
 This module's event has the name `missed_periods`, like the robot's own event. The robot's event
-comes first and has the number of missed periods. It cannot name the cause, because the cause is
+comes first and states the number of missed periods. It cannot name the cause, because the cause is
 known only later.
 """
 
@@ -44,12 +45,13 @@ SETTLE_S = 0.03
 next tick, and ticks are at most 10 ms apart."""
 
 PAUSE_NS = NS_PER_S
-"""Shortest time between two reports, ns. The log has at most one line a second for events of one
+"""Shortest time between two reports, ns. The log shows at most one line a second for events of one
 name."""
 
 CONDITIONS_NS = 10 * NS_PER_S
-"""Age at which the conditions of the processor, such as its voltage, are read again, ns. On some
-computers the firmware must answer. After a lateness they are read in any case."""
+"""Age at which the conditions of the processor, such as its voltage, are read again, ns. They are
+not read more often, because on some computers the firmware must answer. After a lateness they are
+read in any case."""
 
 LOOK_S = 0.2
 """Time between the two readings of all processes in one search for the busiest process, s."""
@@ -59,8 +61,8 @@ LOOK_AGAIN_NS = 10 * NS_PER_S
 """
 
 NEWS_NS = 60 * NS_PER_S
-"""Time after which the same cause is logged at once again, ns. An earlier repetition waits for the
-next line about missed periods (`Event.news`)."""
+"""Time after which a repetition of the same causes is logged immediately, ns. An earlier repetition
+waits for the next log line about missed periods (`Event.news`)."""
 
 MOST = 16
 """Largest number of late periods that wait for the thread, and of events that wait for the control

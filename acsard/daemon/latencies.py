@@ -72,16 +72,16 @@ Name = Literal[
 """The figures, in the order in which a command passes them.
 
 - period_lateness: from the time at which a period was due to the start of its step. If periods
-  were missed, the first missed period counts.
+  were missed, from the time at which the first missed period was due.
 - step_time: from the start of a step to the end of its work.
 - command_age: from a command's arrival to the write of each line that carries it.
 - command_to_wire: from a command's arrival to the write of the first line that carries it. A
   command that had to wait until its source was chosen is not counted.
 - feedback_to_bus: from the read of a feedback line's end to the moment at which the line's messages
-  are in the queue of the bus. Time that the line waited in the kernel before the read, because the
-  loop stood still, is not included.
-- mcu_round_trip: from the write of a line to the read of the end of its reply. Only checked replies
-  are measured, because only these tell which of several lines they reply to.
+  are in the queue of the bus. If the loop stood still, the line waited in the kernel before the
+  read. That time is not included.
+- mcu_round_trip: from the write of a line to the read of the end of its reply. Only the replies of
+  a checked link are measured, because only these name the line that they reply to.
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)
@@ -92,7 +92,8 @@ SLOT_NS = 10 * NS_PER_S
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""Longest age of the cached values, ns. Adding up a minute takes longer than a control step."""
+"""Longest age of the cached values, ns. Adding up the slots of a minute takes longer than a control
+step."""
 
 
 class Figure:
@@ -182,7 +183,7 @@ class Stopwatch:
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
         """Record the age of the command in a line that was written at `sent_ns`.
 
-        `before_ns` is the time at which the line before was written. Both are monotonic, ns.
+        `before_ns` is the time at which the previous line was written. Both are monotonic, ns.
         """
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":

@@ -2,8 +2,8 @@
 a press of the emergency stop or of a bumper.
 
 A line that is written early, between two periods, replaces the line of the next period. So a flood
-of commands does not cause more lines. After the line before it there must be a gap of the wire time
-of a line plus `BREATH_NS`. Each period allows one attempt to write an early line.
+of commands does not cause more lines. An early line must come at least the wire time of a line plus
+`BREATH_NS` after the previous line. Each period allows one attempt to write an early line.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from msgspec import Struct
 class Period(Struct, frozen=True):
     """The number of periods that have ended since the last step, and when the first was due.
 
-    `due_ns` is a monotonic time.
+    `due_ns` is a monotonic time, ns.
     """
 
     expired: int
@@ -30,13 +30,13 @@ BREATH_NS = 1_000_000
 ns."""
 
 IDLE_WAKES = 3
-"""Largest number of steps without a new line that input from the bus may cause per period. If the
-number is exceeded, input waits for the next period. This bounds the cost of a flood from a
-stranger."""
+"""Largest number of steps per period that input from the bus may cause without a new command or
+mode. If the number is exceeded, input waits for the next period. This bounds the cost of a flood
+from a stranger."""
 
 
 class Pace:
-    """The record of the lines of one period, which decides when a line may be written.
+    """The decision when a line may be written, and the record of this period that it needs.
 
     The port knows when it wrote the last line, so the methods get that time as `sent_ns`.
     """
@@ -57,8 +57,8 @@ class Pace:
     def period_ended(self, missed: int) -> bool:
         """Record the end of a period. Return whether its line must be written (`Inputs.tick`).
 
-        If an early line was written in its place, it is not written. After `missed` > 0 periods
-        without a step it is written in any case, because the line before was written long ago.
+        The line is left out if an early line was written in its place. After `missed` > 0 periods
+        without a step it is written in any case, because the previous line was written long ago.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
@@ -94,7 +94,7 @@ class Pace:
 
     @property
     def waits(self) -> bool:
-        """Whether a new command waits because the last line has only just been written."""
+        """Whether a new command waits because the last line was written too short a time ago."""
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:

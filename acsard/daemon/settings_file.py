@@ -47,7 +47,7 @@ PATIENCE_NS = 5 * NS_PER_S // 2
 """Longest time from a `set` with `keep` to its answer, ns. A client waits for 3 s."""
 
 JOBS = 32
-"""Largest number of `set` requests with `keep` that have no answer yet. Further requests are
+"""Largest number of `set` requests with `keep` that may wait for an answer. Further requests are
 refused at once."""
 
 Signature = tuple[int, int, int]
@@ -73,8 +73,8 @@ class _Pending(Struct):
 
     request: Request
     due_ns: int
-    """Monotonic time after which the request is answered as overdue, ns. While the robot decides
-    about it, the request waits for the robot's answer."""
+    """Monotonic time after which the request is answered as overdue, ns. A request that the robot
+    is deciding about does not become overdue."""
     edit: Edit | None = None
     """The change of the file, once the thread has checked it; None before."""
     answer: Answer | None = None
@@ -91,7 +91,8 @@ class SettingsFile:
 
         Args:
             file: the file that the daemon has read, or None for the built-in defaults.
-            parse: returns the configuration of a daemon that starts with this text.
+            parse: turns the content of the file into the configuration that a daemon would have if
+                it started with that content.
             started: the configuration with which the daemon has started.
         """
         self.differ = ""
@@ -128,7 +129,7 @@ class SettingsFile:
     def use(self, config: Config) -> None:
         """Compare the file with this configuration from now on.
 
-        `config` is the configuration in force, without a speed limit.
+        `config` is the configuration in force, without the limit from the key `speed_limit`.
         """
         self._in_force = config
         self._look()
@@ -136,11 +137,11 @@ class SettingsFile:
     def keep(self, request: Request, now_ns: int) -> None:
         """Queue a `set` with `keep` for the check of the file. `now_ns` is the monotonic time.
 
-        If the file can be changed, `results` returns the request later, else an answer that refuses
+        Later, `results` returns the request if the file can be changed, or an answer that refuses
         it.
         """
         full = len(self._pending) >= JOBS
-        # Make a request that is one too many overdue at once, so that `results` refuses it in this
+        # A request beyond the limit is overdue from the start, so that `results` refuses it in this
         # step.
         self._pending[request.id] = _Pending(request, now_ns - 1 if full else now_ns + PATIENCE_NS)
         if not full:
@@ -175,8 +176,8 @@ class SettingsFile:
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
         """Return the requests that the robot may obey now, and the answers for clients.
 
-        For each request that was written, an event is added to `events`. `now_ns` is the monotonic
-        time.
+        For each request whose settings were written to the file, an event is added to `events`.
+        `now_ns` is the monotonic time.
         """
         if not self._pending:
             return []
@@ -199,7 +200,7 @@ class SettingsFile:
                 # The log puts the kind in front of the text: `written: KEY to FILE`.
                 text = f"{keys} to {self._file}"
                 events.append(Event("set", text, by=pending.request.by, kind="written"))
-        # Skip a request that the robot still has, because the robot may set what it asks for. Its
+        # Skip a request that the robot is deciding about. The robot may use its settings, so the
         # answer must not say that nothing is set.
         overdue = [
             waits
@@ -212,7 +213,7 @@ class SettingsFile:
 
     @property
     def limits(self) -> LimitsConfig:
-        """The limits at the start of the daemon, with the values that it has written since."""
+        """The limits at the start of the daemon, with the values written to the file since."""
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
@@ -224,7 +225,7 @@ class SettingsFile:
 
         Args:
             latches: the latches of the robot.
-            now: the limits in force, without a speed limit.
+            now: the limits in force, without the limit from the key `speed_limit`.
         """
         file = self._limits
         if file is self._started:
@@ -316,7 +317,7 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long, or that was one too many."""
+    """Return the answer to a request that took too long, or that exceeded the limit `JOBS`."""
     why = (
         f"the disk did not answer within {PATIENCE_NS / NS_PER_S:g} s, or too many changes came at "
         "once"

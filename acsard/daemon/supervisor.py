@@ -39,16 +39,16 @@ class Kind(Struct, frozen=True):
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
-"""The TLS gateway. It is always started again, because the robot drives on and an operator may fix
-the gateway's files meanwhile."""
+"""The TLS gateway. It is always started again: the robot drives on without it, and a person may
+correct the gateway's files while the robot drives."""
 
 ROUTER = Kind(
     "the router",
     "router_ended",
     final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
 )
-"""The router of a fleet. After its first start, unusable files do not end it for good. They may
-only be incomplete at the moment of a restart, and a fleet must not lose its router for that."""
+"""The router of a fleet. Unusable files end it for good only at its first start. At a later restart
+they may only be incomplete for a moment, and a fleet must not lose its router for that reason."""
 
 PAGE = Kind(
     "the robot's page",
@@ -65,8 +65,8 @@ async def keep_running(
 ) -> int:
     """Run `acsard` with the arguments `words`, and start it again when it ends, until cancelled.
 
-    Return the exit code if it is one after which `kind` is not started again. `log` gets an event
-    for each restart.
+    Return the exit code of the process if `kind` is not started again after that code. `log` gets
+    an event for each restart.
     """
     final = kind.final | kind.final_at_first
     while True:

@@ -40,7 +40,7 @@ class _Timer:
         self._timer.close()
 
     def _expire(self) -> None:
-        # If there is no expiration, the timer was set again after it had expired.
+        # Without an expiration there is nothing to do: the timer was set again after it expired.
         if self._timer.expirations():
             self._ring()
 
@@ -140,7 +140,8 @@ class Wakeup:
     def command(self) -> None:
         """Report a sample that may be a command, from any thread.
 
-        It wakes the loop if the last step listens (`Next.listens`), but only once per such step.
+        The sample wakes the loop if the last step has asked for commands (`Next.listens`). Only the
+        first sample after such a step does so.
         """
         self._heard = True
         if self._listens:
@@ -193,6 +194,6 @@ class Wakeup:
         self._listens = then.listens
         if then.listens or then.period_ended:
             self._stop_told = False
-        # A command came during the step, perhaps too late to be part of it.
+        # A command came during the step, perhaps too late to be part of it. So run another step.
         if then.listens and self._heard:
             self._listens, self._again = False, True

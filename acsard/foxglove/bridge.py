@@ -68,7 +68,8 @@ class Bridge:
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
         self._deaf = facts.deaf
-        """Reason why this program cannot show commands; "" if it can, or once this is reported."""
+        """Reason why this program cannot show commands; "" if it can, or once it has reported this.
+        """
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
@@ -87,9 +88,9 @@ class Bridge:
             if dead.done():
                 dead.result()
             self._wake.wait(0.5)
-            # Wait, so that messages gather before a round. A screen shows 60 frames a second, and
-            # gathering for less than one frame makes the rounds a third cheaper. Commands do not
-            # wait for this loop.
+            # Wait, so that messages gather before a round. The wait is shorter than one frame of a
+            # screen that shows 60 frames a second, and makes the rounds a third cheaper. Commands
+            # do not wait for this loop.
             time.sleep(0.015)
             self._wake.clear()
             self._round()
@@ -174,7 +175,8 @@ class Bridge:
     def _object(self, driving: dict[int, Client]) -> None:
         """Report once for each viewer why the robot does not follow its commands.
 
-        `driving` has the viewers that request a speed. A report is withdrawn when its reason ends.
+        `driving` contains the viewers that request a speed. A report is withdrawn when its reason
+        ends.
         """
         now_ns = clock.mono_ns()
         for client in driving.keys() - self._objections.keys():

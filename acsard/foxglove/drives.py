@@ -98,7 +98,7 @@ class Drives:
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a viewer's channel. If it cannot drive, the reason is reported on publishing."""
+        """Register a viewer's channel. If it cannot drive, `came` reports the reason."""
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"
@@ -146,7 +146,7 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove a channel that its viewer has closed, also by disconnecting.
+        """Remove a channel that its viewer has closed, explicitly or by disconnecting.
 
         If the robot may still follow this viewer, send a zero command.
         """

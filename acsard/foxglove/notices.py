@@ -34,7 +34,7 @@ WAITING = 100
 
 
 class Notice(Struct, frozen=True):
-    """A message to the viewer.
+    """A message to the viewers.
 
     `stays` is the id of a lasting status, or "" for a single message. An empty `text` removes the
     lasting status.
@@ -75,7 +75,7 @@ class Notices:
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send the waiting notices; `log` publishes each of them on the topic `log`.
 
-        With `newcomers`, there are new viewers, so send all lasting statuses again first.
+        If `newcomers` is true, there are new viewers, so first send all lasting statuses again.
         """
         if newcomers:
             for one in self._staying.values():

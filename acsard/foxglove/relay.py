@@ -1,7 +1,7 @@
 """Forwards messages from the bus to the viewers, with a subscription only for topics that are
 shown.
 
-A topic that nobody looks at costs nothing, neither here nor in the daemon. If messages arrive
+A topic that no viewer looks at costs nothing, neither here nor in the daemon. If messages arrive
 faster than they can be forwarded, the oldest are dropped.
 """
 
@@ -96,7 +96,7 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
 
 
 class Reader:
-    """Converts commands to messages of `cmd_vel_in/<source>`, by the robot's configuration."""
+    """Converts commands to messages of `cmd_vel_in/<source>` with the robot's configuration."""
 
     def __init__(self, config: Config) -> None:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
@@ -199,7 +199,7 @@ class _Heard:
         self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """Return the commands since the last call, with their arrival times, ns, wall clock."""
+        """Return the commands since the last call, each with its wall-clock arrival time, ns."""
         return self._box.take()
 
     def undeclare(self) -> None:

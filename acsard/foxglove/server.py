@@ -89,7 +89,7 @@ class Settings:
     def learn(self, tables: object) -> dict[str, Any]:
         """Store the configuration, and return the settings that changed.
 
-        `tables` has the configuration as plain tables. It is None if this program may not read it.
+        `tables` is the configuration as plain tables, or None if this program may not read it.
         """
         now = {} if tables is None else live_settings(tables)
         with self._lock:
@@ -216,8 +216,9 @@ def start(
     *,
     acts: bool,
 ) -> WebSocketServer:
-    """Start the server at `address`, a host and a port. `acts` says whether viewers may
-    send commands and change settings.
+    """Start the server at `address`, a host and a port.
+
+    `acts` says whether viewers may send commands and change settings.
 
     Raises `InUseError` if the port is taken, and `NotPermittedError` if the port needs root.
     """

@@ -20,11 +20,12 @@ def replace(
     owner: tuple[int, int] | None = None,
     synced: bool = True,
 ) -> None:
-    """Replace the file by one with this content; raise `OSError` and leave it if that fails.
+    """Replace a file by a new one. If that fails, raise `OSError` and leave the old file unchanged.
 
     Args:
-        file: The file. Other processes find the old one or the new one, never a part of it.
-        content: The new content. Until its mode is set, only its owner can read it.
+        file: The file. Other processes find the old file or the new one, never a part of it.
+        content: The content of the new file. Only its owner can read the file until its mode is
+            set.
         mode: The mode. None keeps that of the old file, and gives a new file `NEW_MODE`.
         owner: The user and the group. None keeps those of the old file, if this process may set
             them.
@@ -46,8 +47,8 @@ def replace(
                 if kept:
                     os.fchown(new.fileno(), *kept)
             except PermissionError:
-                # This process may not keep the other user as the owner, so its own user owns the
-                # new file. The group stays if this user is a member of it.
+                # This process may not give a file to another user, so its own user owns the new
+                # file. The file keeps its group if this user is a member of the group.
                 if owner or kept is None:
                     raise
                 with suppress(PermissionError):
@@ -61,7 +62,7 @@ def replace(
 
 
 def sync(path: Path) -> None:
-    """Wait until the disk has the content of this file, or the entries of this directory."""
+    """Wait until the disk has stored the content of this file, or the entries of this directory."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)

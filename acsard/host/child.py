@@ -1,7 +1,7 @@
 """Processes that this program starts: their start, limits, signs of life and end.
 
-Each child gets a session of its own, so that a Ctrl-C at the terminal reaches the parent alone,
-which then ends its children in its own way. A child does not outlive its parent.
+Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent. The
+parent then ends its children in its own way. A child does not outlive its parent.
 
 A `Child` and a `Parent` are the two ends of one socket, the child's standard input. The child
 writes a sign of life to the socket again and again, and ends when its parent closes the other end.
@@ -31,7 +31,8 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
-"""Variables that systemd sets for the parent. A child must not notify systemd in its name."""
+"""Variables that systemd sets for the parent. A child must not notify systemd in the parent's
+name."""
 
 BEAT_S = 0.5
 """Longest time between two signs of life of a child, and between two checks by its parent, s."""
@@ -82,7 +83,7 @@ def environment(hidden: Collection[str] = ()) -> dict[str, str]:
 
 
 class Limits(Struct, frozen=True):
-    """Nice value and data memory of a child whose work is less important than the robot's."""
+    """Nice value and data memory of a child whose work is less important than the daemon's."""
 
     nice: int
     memory_bytes: int
@@ -107,7 +108,7 @@ def how_it_ended(code: int) -> str:
 
 
 def end(process: subprocess.Popen[bytes], patience_s: float) -> None:
-    """End a child by SIGTERM, and by SIGKILL if it still runs after `patience_s`."""
+    """End a child with SIGTERM, and with SIGKILL if it still runs after `patience_s` seconds."""
     process.terminate()
     try:
         process.wait(patience_s)
@@ -146,8 +147,8 @@ async def running(
     finally:
         if child.returncode is None:
             child.kill()
-            # asyncio sees the end of a child only after the end of its output, and it stops
-            # reading a pipe whose reader is behind.
+            # Read the rest of the output. asyncio sees the end of a child only after the end of
+            # its output, and asyncio stops reading a pipe while too much unread data waits.
             for output in (child.stdout, child.stderr):
                 with suppress(RuntimeError):  # another task reads this output
                     await output.read() if output else b""
@@ -155,7 +156,7 @@ async def running(
 
 
 class Child:
-    """One run of a child, which ends with its standard input. It is killed if it falls silent."""
+    """One run of a child, which ends when its input closes, and which is killed if it is silent."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -165,9 +166,9 @@ class Child:
         """Why the child was killed, or "" if it was not killed."""
 
     def run(self) -> int:
-        """Start the child, wait for its end and return its exit code; raise `OSError`.
+        """Start the child, wait for its end and return its exit code.
 
-        This blocks its thread, so the thread ends together with the child.
+        This call blocks until the child has ended. Raises `OSError` if the child cannot be started.
         """
         ours, its = socket.socketpair()
         with ours:
@@ -187,7 +188,10 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Wait for signs of life; return False when the child has ended or was released."""
+        """Return True once the child is silent, or False once it has ended or was released.
+
+        `ours` is the parent's end of the socket, on which the signs of life arrive.
+        """
         silence, before_ns, alive = Silence(START_NS), clock.mono_ns(), False
         while True:
             beat = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
@@ -219,7 +223,8 @@ class Parent:
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
-        # A person may have given a pipe or a terminal, which takes no signs of life.
+        # If a person has started this process, `fd` may be a pipe or a terminal. Neither takes
+        # signs of life.
         self._listens = stat.S_ISSOCK(os.fstat(fd).st_mode)
         if self._listens:
             os.set_blocking(fd, False)

@@ -1,7 +1,8 @@
 """The only module that reads a clock. It also detects that this computer was suspended.
 
-The monotonic clock is CLOCK_MONOTONIC_RAW. NTP slews CLOCK_MONOTONIC by up to 8 %, and with it
-every distance that is computed as speed times time, and every apparent delay of a command.
+The monotonic clock is CLOCK_MONOTONIC_RAW, because NTP slews CLOCK_MONOTONIC by up to 8 %. With the
+latter, each distance that is computed as speed times time, and each measured delay of a command,
+would be wrong by as much.
 
 An `Instant` is in whole us. Smaller digits only show how long the reading took, and storing them
 would make a recording twice as large.
@@ -18,7 +19,7 @@ from acsard.core.values import Instant
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
 """Read the monotonic clock, ns.
 
-This is not a Python function, because the loop calls it about a dozen times in each period.
+A Python function would be slower, and the loop calls this one about a dozen times in each period.
 """
 
 
@@ -50,16 +51,16 @@ def now() -> Instant:
 
 
 MOMENT_NS = 100_000_000
-"""Shortest time that counts as a suspend, ns. A suspend takes longer, and a step of the wall
-clock by NTP does not change the measured time.
+"""Shortest time that counts as a suspend, ns. Every real suspend takes longer. If NTP sets the
+wall clock, the measured time does not change.
 """
 
 
 class Asleep:
     """Detector that reports each suspend of this computer once.
 
-    The daemon's monotonic clock stands still in a suspend. Without this check, commands and wheel
-    speeds from before it would seem fresh.
+    The daemon's monotonic clock stands still during a suspend. Without this check, commands and
+    wheel speeds from before the suspend would seem fresh.
     """
 
     def __init__(self, read: Callable[[], int] = asleep_ns) -> None:

@@ -114,7 +114,7 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
 
 
 def keep(edit: Edit) -> None:
-    """Write the change. It is computed again if another program has changed the file meanwhile.
+    """Write the change. Compute it again first if another program has changed the file since.
 
     Raises `MendableError` and leaves the file unchanged if the change cannot be written.
     """
@@ -140,7 +140,8 @@ def _require_writable(place: Path) -> None:
     """Raise `ValueError` if a daemon may not replace the file at this resolved path."""
     if not place.is_file():
         raise ValueError("it is not a regular file")
-    # Root may write every file, and a new file can take the place of one that is read-only.
+    # Check the mode bits too, because root may write every file. Without these checks the daemon
+    # would replace a read-only file, because that needs no permission to write to the file itself.
     if not (os.access(place, os.W_OK) and place.stat().st_mode & 0o222):
         raise ValueError("it is read-only for the daemon")
     if not os.access(place.parent, os.W_OK):
@@ -154,8 +155,9 @@ def is_tracked(place: Path) -> bool:
     """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False
-    # git refuses to read the repository of another user, whose configuration could make git run
-    # that user's programs with the rights of the daemon. Such a file counts as not tracked.
+    # git refuses to read another user's repository, because its configuration could make git run
+    # that user's programs with the rights of the daemon. A file in such a repository counts as not
+    # tracked.
     words = ["git", "-C", str(place.parent), "ls-files", "--error-unmatch", "--", place.name]
     try:
         asked = subprocess.run(words, capture_output=True, timeout=2.0)
@@ -186,8 +188,8 @@ def require_tomlkit() -> None:
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
     """Set keys in an `acsard.toml`, and return them.
 
-    `keys` may be a function that computes them from the configuration. With `new` the file need not
-    exist. Raises `MendableError` and leaves the file unchanged if it cannot be changed.
+    `keys` may be a function that computes them from the configuration. If `new` is true, the file
+    need not exist. Raises `MendableError` and leaves the file unchanged if it cannot be changed.
     """
     try:
         place, text, given = _changed(file, keys, new)

@@ -1,8 +1,9 @@
 """Computes the changed text of an `acsard.toml` in a process of its own, for the daemon.
 
 The library tomlkit needs a tenth of a second for a file as long as the reference configuration. In
-a thread of the daemon it would hold the interpreter again and again, for half a millisecond each
-time. When this was measured, the control loop was up to 12 ms late and missed 3 of 559 periods.
+a thread of the daemon it would hold the interpreter lock again and again, for half a millisecond
+each time. In a measurement with such a thread, the control loop was up to 12 ms late and missed 3
+of 559 periods.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class Result(Struct, frozen=True):
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
     """Return the text of a file with new values. Another process computes it with `edited`.
 
-    Raises `ValueError` with the reason if the text cannot be changed, and `OSError` if no process
-    can be started.
+    `text` is the present text, and `keys` maps dotted keys to new values. Raises `ValueError` with
+    the reason if the text cannot be changed, and `OSError` if no process can be started.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.
@@ -69,7 +70,7 @@ def main() -> None:
     """Read a `Task` from standard input, and write a `Result` to standard output."""
     # The unit of the service does not permit this call.
     with suppress(OSError):
-        # All processes of the robot have priority over this one.
+        # The robot's other processes have priority over this one.
         os.nice(10)
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=Task)
     try:

@@ -1,10 +1,10 @@
 """Errors with an external cause that a person can fix, and the exit codes of acsard.
 
-Each error is an `AcsardError` and also the built-in exception that Python uses for such a case, so
-either can be caught. The text says what is wrong and how to fix it. Each class has the exit code of
-a subcommand that ends with it. `MendableError` itself is raised for problems that no other class
-describes. Bugs are not among these errors, and neither are states of the robot, such as a lost port
-or a stale command.
+Each of these errors is an `AcsardError`. Most are also the built-in exception that Python uses for
+such a case, so either can be caught. The text says what is wrong and how to fix it. The attribute
+`code` is the exit code of a subcommand that ends with the error. `MendableError` itself is raised
+for problems that no other class describes. Bugs are not among these errors, and neither are states
+of the robot, such as a lost port or a stale command.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Finds the command that installs an extra of `pyproject.toml`. No package index has acsard."""
+"""Finds the command that installs an extra, which is a group of optional libraries.
+
+`pyproject.toml` defines the extras. No package index has acsard, so the command names the directory
+from which acsard was installed, or only the libraries.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +25,22 @@ def install(extra: Extra) -> str:
     """Return the shell command that installs an extra, for an error about a missing library."""
     try:
         wanted = wanted_by(distribution("acsard"), extra)
-    # acsard runs from a directory and was never installed.
+    # acsard runs from its source directory and was never installed.
     except PackageNotFoundError:
         wanted = [f".[{extra}]"]
     return shlex.join([*_installer(), *wanted])
 
 
 def missing(library: str, extra: Extra) -> MendableError:
-    """Return the error about a missing library, with the command that installs it."""
+    """Return the error about a missing library, with the command that installs its extra."""
     return MendableError(f"needs the library {library}; run: {install(extra)}")
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
     """Return the arguments with which `pip install` installs an extra.
 
-    They name the directory from which `installed` was installed, with the extra. If that directory
-    no longer exists, they name only the libraries of the extra.
+    The arguments name the extra and the directory from which `installed` was installed. If that
+    directory no longer exists, they name only the libraries of the extra.
     """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))

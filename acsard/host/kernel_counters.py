@@ -1,8 +1,8 @@
 """Reads the kernel's counters that can explain why a program was late.
 
-`Kernel` reads the files, and the functions above it turn their text into values. A file that this
-computer does not have, or that this user may not read, counts as zeros. Reading takes up to some
-milliseconds, so the control loop never does it.
+`Kernel` reads the kernel's files, and the functions above it turn their text into values. A file
+that this computer does not have, or that this user may not read, counts as zeros. Reading the files
+can take a few milliseconds, so the control loop never does it.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ SLOWED_BITS = 0b1110
 limit is active. Each bit describes the present state, not the past."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
-"""Drivers whose governor `powersave` chooses the processor's clock by the load.
+"""Drivers whose governor `powersave` adapts the processor's clock frequency to the load.
 
-With every other driver, this governor keeps the lowest clock.
+With every other driver, this governor keeps the lowest frequency.
 """
 
 COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
@@ -33,7 +33,7 @@ COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_pow
 
 
 class SlowClock(Struct, frozen=True):
-    """A limit that keeps the processor below its full clock."""
+    """A limit that keeps the processor below its full clock frequency."""
 
     governor: str
     limit_mhz: int
@@ -52,12 +52,12 @@ class Conditions(Struct, frozen=True, omit_defaults=True):
 
 
 class Reading(Struct, frozen=True, omit_defaults=True):
-    """The kernel's counters at one time. All durations count from the start of the computer."""
+    """The kernel's counters at one moment. The durations are totals since the computer started."""
 
     asleep_ns: int = 0
     """Time in which this computer was suspended."""
     steal_ns: tuple[int, ...] = ()
-    """Time for each processor in which the host of a virtual machine ran something else."""
+    """Time in which the host of a virtual machine ran something else, for each processor."""
     disk_ns: int = 0
     """Time in which a program waited for a disk."""
     own_disk_ns: int = 0
@@ -73,7 +73,7 @@ class Reading(Struct, frozen=True, omit_defaults=True):
 
 
 class Scheduled(Struct, frozen=True, omit_defaults=True):
-    """The time that a thread ran, and the time that it was ready and had to wait, ns."""
+    """The time that a thread ran, and the time that it was ready but waited for a processor, ns."""
 
     ran_ns: int = 0
     waited_ns: int = 0
@@ -121,7 +121,10 @@ def _processors(text: str) -> list[list[str]]:
 
 
 def stalled(text: str) -> int:
-    """Decode from a file of pressure stall information the time in which a task stalled, ns."""
+    """Return the time in which at least one task stalled, ns.
+
+    `text` is a file of the kernel's pressure stall information.
+    """
     for line in text.splitlines():
         if line.startswith("some "):
             return int(line.rpartition("total=")[2]) * 1000
@@ -129,7 +132,10 @@ def stalled(text: str) -> int:
 
 
 def quota(text: str) -> int:
-    """Decode the time without quota from `cpu.stat` of a cgroup (version 1 or 2), ns."""
+    """Return the time for which a cgroup had used up its quota, ns.
+
+    `text` is the file `cpu.stat` of the cgroup, in version 1 or 2.
+    """
     for line in text.splitlines():
         name, _, value = line.partition(" ")
         if name == "throttled_usec":
@@ -167,12 +173,12 @@ def busiest(
 ) -> Program | None:
     """Return the process that ran most between two readings, with the time that it ran in between.
 
-    `before` and `after` are the two readings, `within_ns` apart. Processes that a thread of this
-    `priority` displaces are left out. Return None if no other process used a quarter of a
-    processor.
+    `before` and `after` are the two readings, `within_ns` ns apart. A process that cannot delay a
+    thread of the priority `priority` is left out. Return None if no other process used a quarter of
+    a processor.
     """
-    # A process that is 9 nicer can delay the thread noticeably. At 10 more the kernel gives it a
-    # tenth of the thread's weight.
+    # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
+    # difference of 10, the kernel gives the process only a tenth of the thread's weight.
     least = priority + 9 if priority >= 0 else priority
     ran = {(one.pid, one.name): one.ran_ns for one in before}
     grown = [
@@ -185,10 +191,11 @@ def busiest(
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
-    """Return the limit of a processor's clock from the files of its directory `cpufreq`.
+    """Return the limit of a processor's clock frequency, from the files of its directory `cpufreq`.
 
-    Return None if the limit is at least 0.6 of the full clock. The present clock does not
-    matter, because a processor at rest runs slowly and speeds up when there is work.
+    `policy` maps the name of each file to its text. Return None if the limit is at least 0.6 of the
+    full frequency. The present frequency does not matter, because a processor at rest runs slowly
+    and speeds up when there is work.
     """
     governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
     if governor == "powersave" and policy.get("scaling_driver") not in OWN_SCALING:
@@ -205,9 +212,9 @@ class Kernel:
     """The files of the kernel. Its methods are called from one thread."""
 
     def __init__(self, root: Path = Path("/")) -> None:
-        """Find the files; `root` is another directory in tests."""
+        """Find the files below `root`. Only tests use another directory than "/"."""
         self._root, self._proc = root, root / "proc"
-        # The first thread of a process has the number of the process.
+        # The first thread of a process has the same id as the process.
         self._io = root / f"proc/self/task/{os.getpid()}/io"
         self._tick_ns = NS_PER_S // os.sysconf("SC_CLK_TCK")
         cpu, hwmon = root / "sys/devices/system/cpu", root / "sys/class/hwmon"
@@ -256,7 +263,7 @@ class Kernel:
         slow = (slow_clock(_policy(path)) for path in self._policies)
         return Conditions(
             low,
-            # The firmware sets the other bits for a low voltage as well.
+            # At a low voltage the firmware also sets the other bits, so they do not prove heat.
             cooled or (bool(bits & SLOWED_BITS) and not low),
             sum(map(_number, self._throttle_counts)),
             next((one for one in slow if one is not None), None),
@@ -265,8 +272,9 @@ class Kernel:
     def busiest(self, seconds: float) -> Program | None:
         """Read the times of all processes twice, `seconds` apart, and return the busiest process.
 
-        Return None if no process uses a quarter of a processor and has enough priority to delay
-        this process. The result is None, too, if the kernel hides the processes of other users.
+        Return None if no process both uses a quarter of a processor and has enough priority to
+        delay this process. The result is also None if the kernel hides the processes of other
+        users.
         """
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)

@@ -24,8 +24,8 @@ from acsard.core.formatting import printable
 from acsard.core.values import Event, EventName
 from acsard.host.terminal_modes import coloured
 
-# structlog imports rich to draw tracebacks, and the log has none. The daemon's modules take 39 MB
-# without rich and 44 MB with it, so rich is hidden while structlog is imported.
+# structlog imports rich to draw tracebacks, but this log contains no tracebacks. The daemon's
+# modules take 39 MB without rich and 44 MB with it, so rich is hidden while structlog is imported.
 sys.modules.setdefault("rich", None)  # type: ignore[arg-type]
 import structlog  # noqa: E402
 
@@ -95,8 +95,8 @@ class Writer:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        # The daemon logs fewer lines in a minute, even with all faults at once
-        # (`event_throttle.py`).
+        # In a minute the daemon logs fewer lines than this queue holds, even with all faults at
+        # once (`event_throttle.py`).
         self._lines: queue.Queue[str | None] = queue.Queue(1000)
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
@@ -105,7 +105,7 @@ class Writer:
         try:
             self._lines.put_nowait(text)
         except queue.Full:
-            # The thread cannot write any more. Drop the line, because the robot must not wait.
+            # The thread is blocked. Drop the line, because the robot must not wait.
             pass
         return len(text)
 
@@ -132,8 +132,8 @@ class Writer:
 def write_through(stream: TextIO, text: str) -> None:
     """Write to the stream's file descriptor, past its buffer.
 
-    A thread that is stuck in a buffered write holds the buffer's lock, and then no other thread
-    could flush the buffer at the end.
+    With a buffer, a thread that is stuck in a write would hold the buffer's lock. No other thread
+    could then flush the buffer at the end of the process.
     """
     try:
         fd = stream.fileno()

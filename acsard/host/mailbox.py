@@ -1,8 +1,9 @@
 """Hands items from any threads to one reader: bounded, newest wins, with a wake-up.
 
 A writer never waits, neither for the reader nor for a lock. If the reader falls behind, each new
-item takes the place of the oldest one. A writer stores its item before it wakes the reader, and a
-woken reader looks at the items afterwards, so no wake-up is lost. A reader may be woken in vain.
+item takes the place of the oldest one. A writer stores its item before it wakes the reader, and the
+reader looks at the items after it wakes, so no wake-up is lost. The reader may be woken although no
+item waits.
 
 Two kinds of queues are not mailboxes: one whose oldest items are worth more than its newest ones
 (the log, the recording), and one in which no item may be lost (replies to queries).
@@ -59,8 +60,8 @@ class Mailbox(Generic[T]):
         self.waiting: deque[T] = deque(maxlen=most)
         """The items that wait, the oldest on the left. Only the reader may remove items from it.
 
-        It is public because the daemon checks about forty mailboxes in each step, which are too
-        many for a method call each.
+        The attribute is public because the daemon checks about forty mailboxes in each step. A
+        method call for each of them would take too long.
         """
         self.lost = 0
         """Number of items that newer ones have displaced. It is exact if there is one writer."""
@@ -80,7 +81,8 @@ class Mailbox(Generic[T]):
         items = self.waiting
         room = len(items) < items.maxlen  # type: ignore[operator]
         if not room:
-            self.lost += 1  # before the item: a reader that has the item knows of the loss
+            # Count the loss before storing the item, so that a reader of the item sees the count.
+            self.lost += 1
         items.append(item)
         return room
 
@@ -112,7 +114,7 @@ class Mailbox(Generic[T]):
         return self.waiting.popleft() if self.waiting else None
 
     def take(self) -> list[T]:
-        """Remove and return the items that wait now. Items that arrive meanwhile stay for later."""
+        """Remove and return the items that wait now. Items that arrive during the call stay."""
         items = self.waiting
         return [items.popleft() for _ in range(len(items))]
 

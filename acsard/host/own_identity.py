@@ -28,12 +28,12 @@ def own_name() -> str:
 
 
 def sender_id(name: str, secret: str = "") -> str:
-    """Return a sender id `NAME/SECRET`. If `secret` is "", it has a new secret."""
+    """Return a sender id `NAME/SECRET`. If `secret` is "", the id gets a new secret."""
     return f"{name[:MAX_NAME]}/{secret or new_secret()}"
 
 
 def new_secret() -> str:
-    """Return 128 random bits as 22 characters that hold no "/"."""
+    """Return 128 random bits as 22 characters, none of which is "/"."""
     return secrets.token_urlsafe(16)
 
 

@@ -16,7 +16,8 @@ from msgspec import Struct
 PROC = Path("/proc")
 
 PTY_MAJORS = range(136, 144)
-"""Major device numbers of ptys, with 256 minor numbers each. Serial ports have others."""
+"""Major device numbers of ptys, with 256 minor numbers each. Serial ports have other major numbers.
+"""
 
 
 class Holder(Struct, frozen=True):
@@ -85,7 +86,7 @@ def master_of(path: str) -> Holder | None:
 
 
 def name_of(pid: int) -> str:
-    """Return the program's name of a process; "" if the process does not exist or is hidden."""
+    """Return the name of a process's program; "" if the process does not exist or is hidden."""
     try:
         return _name(PROC / str(pid))
     except OSError:
@@ -131,7 +132,7 @@ def _open_devices(part: str) -> Iterator[_Open]:
             try:
                 target = os.readlink(process / "fd" / fd)
             except OSError:
-                # The descriptor has been closed meanwhile.
+                # The process has closed the descriptor since.
                 continue
             if "/dev/" in target and part in target:
                 yield _Open(process, fd)
@@ -144,7 +145,7 @@ def _having_open(path: str) -> Iterator[_Open]:
             if one.device() == wanted:
                 yield one
         except OSError:
-            # The descriptor has been closed meanwhile.
+            # The process has closed the descriptor since.
             continue
 
 
@@ -160,7 +161,10 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """Return the program's name; "acsard" also if Python runs it as a module or script."""
+    """Return the program's name. It is "acsard" even if Python runs acsard as a module or script.
+
+    `process` is the directory of the process in /proc.
+    """
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
         return "acsard"

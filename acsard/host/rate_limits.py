@@ -30,7 +30,7 @@ class Bucket:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
         self._paid_ns = 0
-        """Time until which the consumed units are paid for, ns, at `_unit_ns` each."""
+        """Time at which the bucket is full again, ns. Each consumed unit adds `_unit_ns`."""
 
     def room(self, now_ns: int) -> bool:
         """Return whether a unit is left."""
@@ -64,12 +64,13 @@ class Buckets:
     def take(self, name: str, now_ns: int) -> bool:
         """Consume one unit of this name. Return False if its bucket or the shared one is empty."""
         if name not in self._buckets:
-            # Drop the full buckets, which equal new ones: many names must not fill the memory.
+            # Drop the full buckets, which equal new ones, so that many names do not fill the
+            # memory.
             self._buckets = {k: one for k, one in self._buckets.items() if not one.full(now_ns)}
         own = self._buckets.setdefault(name, Bucket(self._of_one))
         if self._shared is None:
             return own.take(now_ns)
-        # A name without units of its own must not consume those of the others.
+        # A name without units of its own must not consume units of the shared bucket.
         return own.room(now_ns) and self._shared.take(now_ns) and own.take(now_ns)
 
 
@@ -104,7 +105,7 @@ class Places:
 
     @contextmanager
     def held(self, name: str = "") -> Iterator[bool]:
-        """Hold a place for the time of the block, if one is free; yield whether it is."""
+        """Hold a place during the block if one is free; yield whether a place was free."""
         free = self.enter(name)
         try:
             yield free

@@ -1,7 +1,7 @@
 """Asks the operating system for punctual scheduling, once, before any thread starts.
 
-Only the control loop's own thread becomes real-time. The threads of the bus and child processes do
-not inherit it, so a flood on the bus does not compete with the loop.
+Only the control loop's own thread gets real-time priority. The threads of the bus and child
+processes do not inherit it, so a flood on the bus does not compete with the loop.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ PRIORITY = 10
 """Real-time priority: above ordinary processes, below the kernel's interrupt threads (50)."""
 
 SPIN_S = 1
-"""Time that the loop may run without a pause before the kernel ends it, s. The loop has priority
-over everything else on its core, and a step takes a thousandth of this.
+"""Time that the loop may run without a pause before the kernel ends the process, s. A limit is
+needed because the loop has priority over everything else on its core. A step takes a thousandth of
+this time.
 """
 
 DOZE = "/dev/cpu_dma_latency"
@@ -47,9 +48,9 @@ def ask() -> str:
 
 
 def has(pid: int) -> bool | None:
-    """Return whether the first thread of a process, such as a daemon's loop, is real-time.
+    """Return whether the first thread of a process has real-time scheduling.
 
-    Returns None if that cannot be seen.
+    In a daemon, this thread runs the control loop. Returns None if the scheduling cannot be read.
     """
     try:
         policy = os.sched_getscheduler(pid)
@@ -61,8 +62,8 @@ def has(pid: int) -> bool | None:
 def allowed() -> bool:
     """Return whether a daemon started by this user would get real-time scheduling.
 
-    The capability or the limit grants it. Without the capability, as in a container, the limit also
-    applies to root.
+    Either the capability CAP_SYS_NICE or the limit RLIMIT_RTPRIO grants it. Without the capability,
+    as in a container, the limit also applies to root.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
@@ -104,12 +105,13 @@ def _stay_awake() -> bool:
 
 
 def _lock() -> bool:
-    # Under a finite limit the call might succeed and a later allocation fail, so ask only if it is
-    # unlimited. Without the capability, as in a container, the limit also applies to root.
+    # Under a finite limit this call might succeed, but a later allocation might fail. So ask only
+    # without a limit or with the capability. Without the capability, as in a container, the limit
+    # also applies to root.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     if not unlimited and not _capable(_CAP_IPC_LOCK):
         return False
-    # Lock pages when they are touched: locking whole thread stacks and arenas would take ten times
-    # the memory.
+    # Lock each page only when it is first used. Locking whole thread stacks and arenas would take
+    # ten times the memory.
     flags = _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT
     return bool(ctypes.CDLL(None).mlockall(flags) == 0)

@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
-"""Number of times that the watchdog is fed within its timeout. No separate timer feeds it,
-because that would hide a loop that is late.
+"""Number of times that the control loop feeds systemd's watchdog within its timeout. No separate
+timer feeds the watchdog, because that would hide a loop that is late.
 """
 
 PATIENCE_S = 30
@@ -51,11 +51,11 @@ class Systemd:
         self._send("READY=1")
 
     def stopping(self) -> None:
-        """Report that the daemon is ending, so that the watchdog need not be fed any more."""
+        """Report that the daemon is ending, so that the watchdog need no longer be fed."""
         self._send("STOPPING=1\nSTATUS=ramping to zero")
 
     def waiting(self, why: str) -> None:
-        """Report that the start waits for something; call it again within `PATIENCE_S`."""
+        """Report that the start waits, and the reason `why`. Call again within `PATIENCE_S`."""
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 
     def status(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""The terminal: whether output may contain colours, and single key presses for driving by keys."""
+"""The terminal: whether output may contain colours, and how a program reads single key presses."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def coloured(stream: TextIO) -> bool:
 def one_by_one() -> Iterator[None]:
     """Deliver the keys of standard input one by one, and restore the terminal at the end.
 
-    Ctrl-S is an ordinary key meanwhile. Otherwise it would block the program's output, and with it
-    the program that drives the robot.
+    During the block Ctrl-S is an ordinary key. Otherwise it would block the program's output, and
+    with it the program that drives the robot.
     """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

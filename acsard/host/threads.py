@@ -24,9 +24,9 @@ async def in_thread(
 ) -> T:
     """Return the result of `call`, or raise `TimeoutError` after `timeout` s (None: wait for ever).
 
-    Raises `NoThreadError` at once if no thread can be started. If the caller has stopped waiting
-    when the result comes, or stops in the same round of the loop, a thread passes the result to
-    `late`, which releases it.
+    Raises `NoThreadError` at once if no thread can be started. If the caller no longer waits when
+    the result comes, or stops waiting in the same round of the event loop, a thread passes the
+    result to `late`, which must release the result.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()

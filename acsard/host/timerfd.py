@@ -1,7 +1,8 @@
 """A kernel timer for the event loop, more precise than asyncio's timers.
 
 On epoll asyncio rounds every wait up to milliseconds. A timerfd wakes the loop on time and counts
-missed expirations. Python has these calls from 3.13 on; the C library's work with every version.
+missed expirations. Python itself offers timerfd only from 3.13 on, so this module calls the C
+library.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class _Itimerspec(ctypes.Structure):
 class TimerFd:
     """One timer. Its file descriptor becomes readable when the timer expires.
 
-    The kernel does not offer a timerfd on CLOCK_MONOTONIC_RAW, so `set` passes the remaining time.
+    The kernel does not offer a timerfd on CLOCK_MONOTONIC_RAW, the daemon's clock. So `set` passes
+    the remaining time.
     """
 
     def __init__(self) -> None:

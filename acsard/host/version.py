@@ -14,7 +14,8 @@ from acsard import __version__
 _PACKAGE = Path(__file__).parents[1]
 
 COMMIT_FILE = "commit"
-"""Name of the file in an installed package that has the commit. `deploy/build_hook.py` adds it."""
+"""Name of the file in an installed package that contains the commit. `deploy/build_hook.py` adds
+the file."""
 
 DIGITS = 9
 """Number of digits of a commit that are shown."""
@@ -30,8 +31,8 @@ def version() -> str:
 def commit_of(clone: Path) -> str:
     """Return the commit that is checked out in this directory, or "" if it is not a git clone.
 
-    The files of git are read directly, because a computer that runs the daemon may have no git.
-    Changes since the commit are not visible in them.
+    This function reads git's files itself, because a computer that runs the daemon may have no git.
+    The files do not show whether the source has changed since the commit.
     """
     git = clone / ".git"
     if git.is_file():  # the directory is a worktree

@@ -1,8 +1,8 @@
 """Certificates and their authority as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
 
-The keys are P-256 keys, in files that only their owner can read. People trust the authority on
-their phones, so its certificate limits the hosts that it may sign for. A thief of its key can pose
-as the robots and as hosts of a private network, but not as any other web site.
+The keys are P-256 keys, in files that only their owner can read. People make their phones trust the
+authority, so its certificate limits the hosts that it may sign for. A thief of the authority's key
+can pose as the robots and as hosts of a private network, but not as any other web site.
 """
 
 from __future__ import annotations
@@ -46,12 +46,13 @@ class Authority:
     ) -> Authority:
         """Create an authority in `directory` with the common name `name`.
 
-        It is valid for five times `days`, the validity of the certificates that it signs.
+        Its own certificate is valid for five times `days`, which is the validity of the
+        certificates that it signs.
 
         The host names that it may sign are those of `addresses` and of `LOCAL`, with all names
-        below them. The IP addresses are those of `addresses` and of `PRIVATE`. For an IPv6 address,
-        the whole /64 network is permitted. Names of other kinds are not limited: a certificate may
-        have any common name, which names a client on the bus.
+        below them. The IP addresses that it may sign are those of `addresses` and of `PRIVATE`. For
+        an IPv6 address, the whole /64 network is permitted. Names of other kinds are not limited:
+        a certificate may have any common name, which names a client on the bus.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -85,10 +86,10 @@ class Authority:
         return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
 
     def permits(self, address: str) -> bool:
-        """Return whether a certificate of this authority for a host name or address would be valid.
+        """Return whether this authority may sign a certificate for a host name or IP address.
 
-        An authority that acsard made is limited to some names. One that another program made may
-        have no limits.
+        An authority that acsard made is limited to some names. An authority that another program
+        made may have no limits.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -122,8 +123,9 @@ class Authority:
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
         """Write a certificate for server and client use, its key and the authority's certificate.
 
-        `name` is the common name of the certificate. `addresses` are the host names and IP
-        addresses at which the holder of the certificate is reached. `days` is its validity.
+        The files are written to `directory`. `name` is the common name of the certificate.
+        `addresses` are the host names and IP addresses at which the holder of the certificate is
+        reached. `days` is the validity of the certificate.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -159,7 +161,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        # A robot's clock may be behind when the robot starts.
+        # The validity begins an hour ago, because a robot's clock may be behind when it starts.
         .not_valid_before(min(now, now + timedelta(days=days)) - timedelta(hours=1))
         .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
@@ -220,5 +222,5 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file by one of this user. It never has more permissions than `mode`."""
+    """Replace a file by one that this user owns and that never has more permissions than `mode`."""
     replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))

@@ -1,6 +1,6 @@
 """Examines the certificates of this machine and of the routers that it connects to.
 
-Each finding about a problem has the remedy, with the commands that a person can type.
+Each finding about a problem contains the remedy, with the commands that a person can type.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def certificates(tls: str) -> Iterator[Finding]:
 
 
 def renewal(tls: str, whose: str) -> str:
-    """Return the commands that replace a certificate which ends soon.
+    """Return the commands that replace a certificate that expires soon.
 
-    `tls` is the directory of this machine's certificate. `whose` is the owner of the certificate
-    that ends first; "" means this machine. `expiry` has the same names of owners.
+    `tls` is the directory of this machine's certificate. `whose` is the owner of the certificate to
+    replace, with a name as in `expiry`; "" means this machine.
     """
     directory, name = Path(tls), common_name(tls)
     if whose == AUTHORITY:
@@ -98,8 +98,8 @@ def _mend_of_absent(directory: Path) -> str:
 def _command(action: str, directory: Path) -> str:
     """Return the command line of an action of `acsard tls` in this directory.
 
-    If the command needs sudo, it has the path of the program, because sudo does not search this
-    user's PATH.
+    If the command needs sudo, it contains the full path of the program, because sudo does not
+    search this user's PATH.
     """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"

@@ -1,7 +1,7 @@
-"""Makes and renews the certificates in a directory: the authority's, the robot's, the clients'.
+"""Makes and renews the certificates of the authority, of the robot and of the clients, as files.
 
 The robot admits a client if the robot's authority has signed the client's certificate. The common
-name in that certificate decides on the client's permissions (`[access]`).
+name in that certificate determines the client's permissions (`[access]`).
 """
 
 from __future__ import annotations
@@ -67,7 +67,11 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 
 
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Create one more client certificate with the common name `name`, and return its directory."""
+    """Create one more client certificate with the common name `name`, and return its directory.
+
+    `directory` contains the authority. `addresses` are host names and IP addresses of the client.
+    `days` is the validity of the certificate.
+    """
     authority = _load(directory)
     place = directory / "clients" / name
     if place.exists():
@@ -81,7 +85,8 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Replace the certificate that `add` made for this name, and return its directory.
 
-    The new certificate has `addresses`, and the host names and addresses of the old one.
+    The new certificate contains `addresses`, and the host names and addresses of the old one for
+    which the authority may sign. `days` is its validity.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -102,7 +107,8 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     """Replace the robot's own certificate, and return the names and addresses in the new one.
 
-    They include those of the old certificate, unless the authority may not sign for them.
+    These include `addresses`, and those of the old certificate for which the authority may sign.
+    `days` is the validity of the new certificate.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)

@@ -1,4 +1,4 @@
-"""Queries the running daemon, and examines whether it can be reached, and its own reports.
+"""Examines whether the running daemon can be reached, and the reports that it returns to queries.
 
 The doctor queries the daemon's configuration once, and its state twice, a second apart. The
 difference between the counters of the two states shows how well the serial link works.
@@ -54,7 +54,8 @@ OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""Keys that `acsard run` takes as options. A value that differs from the file's is intended."""
+"""Keys that `acsard run` takes as options. If such a value differs from the file's, that is
+intended."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
@@ -93,7 +94,8 @@ class Running(Struct, frozen=True):
     before: RobotState
     state: RobotState
     looked_ns: int
-    """Time halfway between the request for `state` and its answer, this host's wall clock, ns."""
+    """Time halfway between the request for `state` and its answer, by this host's wall clock, ns.
+    """
     trip_ns: int = 0
     """Time from the request for `state` to its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
@@ -110,13 +112,14 @@ class Running(Struct, frozen=True):
 def asked(config: Config, address: Address) -> Running:
     """Query the daemon at this address for its configuration, its state and its events.
 
-    `config` is the content of the configuration file. It replaces the daemon's configuration if
-    this client may not query the latter. Raises an `AcsardError` if the daemon does not answer.
+    `config` is the content of the configuration file. It is used in place of the daemon's
+    configuration if this client may not query that. Raises an `AcsardError` if the daemon does not
+    answer.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
-        time.sleep(1.0)  # about a hundred lines are counted meanwhile
+        time.sleep(1.0)  # the daemon counts about a hundred lines in this time
         rows, events = tuple(robot.get("diagnostics").status), tuple(robot.get("events").events)
         runs, here = _configuration(robot, info, config), name_of(info.pid) == "acsard"
         asked = clock.now()
@@ -158,7 +161,7 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(its: Mapping[str, Difference]) -> str:
-    """Return the daemon's values in the form that the configuration file has."""
+    """Return the daemon's values in the form of the configuration file."""
     parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
@@ -194,10 +197,11 @@ def link(running: Running) -> Iterator[Finding]:
     passed = {
         key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
     }
-    # A fault that occurs at most once a day on average is history. One that is more frequent is a
-    # warning.
+    # A fault that occurs at most once a day on average is reported as ok. One that is more frequent
+    # is a warning. `often` is the number of days that the daemon has run.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / 86400
-    # The built-in simulator is late whenever the daemon is, and it is never unplugged.
+    # The built-in simulator is late whenever the daemon is, and it is never unplugged. So this
+    # computer has caused every loss of its link.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = f"lost {late_times} since the daemon's start because this computer did not run"
@@ -233,7 +237,7 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
     """Yield a finding about bumpers that the board reports or should report."""
     safety, pressed = config.safety, state.bumpers
     if pressed is not None and any(pressed):
-        # A board that has fallen silent looks as if all were pressed.
+        # If the board has fallen silent, all bumpers count as pressed.
         todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
         if safety.bumper == "away":
             todo = f"drive straight away from it, or {todo} if the robot is stopped"
@@ -268,7 +272,7 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     """Yield a warning if too few of the lines sent between the two states were answered.
 
-    `passed` has the increase of each counter between the two states.
+    `passed` gives the increase of each counter between the two states.
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     # With fewer than 40 lines between both states the fraction means nothing.
@@ -281,7 +285,10 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a warning about lines that the daemon refused, or nothing if they are few."""
+    """Return a list with a warning about lines that the daemon refused, [] if they are few.
+
+    `counters` are the daemon's counters, or the increases of its counters.
+    """
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
@@ -296,7 +303,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     """Return the number of link losses that this computer did not cause, with a description.
 
-    The list is empty if there were none.
+    The result is a list with this pair, or [] if there were no such losses.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
@@ -327,7 +334,8 @@ GYRO_MENDS = {
 """Remedy for each gyro status in `state`; "" if the status is good."""
 
 CAUSES_SHOWN = 3
-"""Largest number of events with a cause of lateness that are shown. The last ones are chosen."""
+"""Largest number of events with a cause of lateness that are shown. If there are more, only the
+last ones are shown."""
 
 CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
@@ -369,7 +377,7 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the answers of the daemon at this address, or a finding that it cannot be reached.
+    """Return the answers of the daemon at this address, or a finding if it cannot be queried.
 
     Raises `UsageError` if the address has no valid endpoint.
     """
@@ -420,7 +428,7 @@ def daemon(running: Running) -> Iterator[Finding]:
 
 
 def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
-    """Yield a finding if a certificate that the daemon or its gateway uses ends soon.
+    """Yield a finding if a certificate that the daemon or its gateway uses expires soon.
 
     `row` is the row about certificates in the daemon's diagnostics, or None. `here` says whether
     the daemon runs on this machine, so that its files are examined as well.
@@ -442,7 +450,8 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
 def late(running: Running) -> Iterator[Finding]:
     """Yield a warning if the daemon misses control periods, over its whole run or recently.
 
-    Its counters show the whole run, and its diagnostics the recent time.
+    The counters cover the whole run, and the diagnostics cover the recent time. Also yield the last
+    causes of lateness that the daemon's events name.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -464,9 +473,9 @@ def late(running: Running) -> Iterator[Finding]:
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Yield warnings if clocks differ, or if stamps were replaced.
+    """Yield warnings if the daemon's clock differs from this machine's, or if stamps were replaced.
 
-    The daemon took its time at an unknown moment between the request and the answer. A daemon on
+    The daemon read its clock at an unknown moment between the request and the answer. A daemon on
     this machine has the same clock as the doctor.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters

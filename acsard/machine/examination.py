@@ -1,4 +1,4 @@
-"""All examinations in their order, from the configuration to a moving robot.
+"""All examinations of the doctor in their order, from the configuration to a moving robot.
 
 This module itself examines the configuration, the machine and the serial port.
 `certificate_findings.py` examines the certificates, and `daemon_findings.py` examines the daemon
@@ -81,7 +81,7 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
 
 
 LOOK_S = 0.3
-"""Time between two readings of the kernel's counters, s: 30 ticks of its clock."""
+"""Time between two readings of the kernel's counters, s: 30 ticks of the kernel's clock."""
 
 
 def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
@@ -162,7 +162,7 @@ def examine(
         where: the path of the configuration, for messages.
         text: the content of the configuration file.
         given: values that override the file, by table and key.
-        told: returns the daemon's address for a configuration.
+        told: function that returns the daemon's address for a configuration.
 
     Raises `UsageError` if that address is not a valid endpoint.
     """
@@ -195,8 +195,8 @@ def examine(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
     yield from slowness()
-    # The service made copies of the certificates when it started. A file that has been deleted
-    # since then is reported at its original path.
+    # The service made copies of the certificates when it started. So examine the original files
+    # too, because they may have been deleted since.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)

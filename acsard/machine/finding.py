@@ -8,7 +8,7 @@ from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
 LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
-"""Levels in the order of the numbers in ROS diagnostics."""
+"""Levels in the order of their numbers in ROS diagnostics, which begin with 0."""
 
 
 class Finding(Struct, frozen=True):

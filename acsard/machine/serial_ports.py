@@ -1,4 +1,4 @@
-"""The serial ports of this machine: the boards behind them and the processes that use them.
+"""The serial ports of this machine, with the boards on them and the processes that use them.
 
 The module reads sysfs and procfs and opens no port, so a running robot is not disturbed.
 """
@@ -25,7 +25,7 @@ BOARDS: dict[str, str] = {
 }
 """USB ids of the boards and USB-to-serial chips through which a robot's microcontroller connects.
 
-A test proves that deploy/udev/70-acsar.rules has the same ids.
+A test proves that deploy/udev/70-acsar.rules contains the same ids.
 """
 
 BY_ID = Path("/dev/serial/by-id")
@@ -42,7 +42,7 @@ class SerialDevice(Struct, frozen=True):
     """`vid:pid` in hex; "" if the port is not on USB."""
     description: str
     board: str
-    """Usual microcontroller board with this USB id; "" if none matches."""
+    """Name of the common board or chip with this USB id; "" if `BOARDS` does not list the id."""
     holders: list[Holder]
 
 

@@ -3,7 +3,7 @@
 The files are those of `deploy/`, with the path of this installation in the units. A file that
 another person or program has written is neither overwritten nor removed without force. A service
 cannot run from every directory: `misplaced` returns why it cannot run from this one. A step is an
-object with a text, so that the user can read all steps before they are carried out.
+object that can be shown as text, so that the user can read all steps before they are carried out.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ class File(Struct, frozen=True):
     content: bytes
     mode: int = 0o644
     kept: bool = False
-    """True for a file that the user may change. It is not replaced, nor removed if changed."""
+    """True for a file that the user may change. Such a file is never replaced. If it has been
+    changed, only a purge removes it."""
 
     def found(self) -> bytes | None:
         """Return the present content of the path, or None if the file does not exist."""
@@ -166,12 +167,12 @@ class Remove(Struct, frozen=True):
             try:
                 place.rmdir()
             except OSError:
-                # The directory holds something else.
+                # The directory still contains other files.
                 return
 
 
 class Keep(Struct, frozen=True):
-    """Step that leaves a file as it is. `why` is the reason for the user, or ""."""
+    """Step that leaves a file as it is. `why` is the reason that the user reads, or ""."""
 
     path: Path
     why: str = ""
@@ -279,11 +280,12 @@ def lan_drop_in(unit: str) -> File:
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that gives the TLS gateway of the service these certificates, or None.
+    """Return the step that gives the service's TLS gateway the certificates in `directory`.
 
-    None means that the service is not installed, or that the user is not root. Without the drop-in,
-    the gateway may use loopback only and cannot read root's files. An existing drop-in keeps its
-    networks, because an administrator may have narrowed them.
+    Return None if the service is not installed, or if the user is not root. The step writes a
+    drop-in, which is a file that extends the gateway's unit. Without it, the gateway may use only
+    loopback and cannot read root's files. An existing drop-in keeps its networks, because an
+    administrator may have narrowed them.
     """
     if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
@@ -294,8 +296,8 @@ def admitting(directory: Path) -> Write | Keep | None:
 def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
     """Return the step that puts the certificates of `directory` into the drop-in.
 
-    `found` is the drop-in's present content, which is changed. If it is None, the content of `file`
-    is changed instead.
+    The new text is made from `found`, the drop-in's present content. If that is None, it is made
+    from the content of `file`.
     """
     place = str(directory).encode()
     text = re.sub(
@@ -316,8 +318,8 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
     """Return the installation steps.
 
-    `found` has the present contents of the files. Raises `MendableError` if a step would replace a
-    changed file, unless `force` is set.
+    `found` gives the present contents of the files. Raises `MendableError` if a step would replace
+    a changed file, unless `force` is set.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -336,7 +338,7 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
 
 
 def own_places() -> list[Path]:
-    """Return the directories that may hold files of the service that were not installed."""
+    """Return the directories that may contain files that the installation did not write."""
     return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
 
 
@@ -358,12 +360,13 @@ def uninstalling(
 ) -> list[Step]:
     """Return the steps that remove the service, with a reason for each file that stays.
 
-    `found` has the present contents of the files in `wanted`. `others` are further paths in the
+    `found` gives the present contents of the files in `wanted`. `others` are further paths in the
     directories of the service, and `stateful` are the units that have a state directory.
 
-    A changed file stays unless `force` or `purge` is set. A changed file with `kept` stays unless
-    `purge` is set. So do `others`, and the state directories of the `stateful` units. To purge
-    these directories, the steps first install their units again if they are missing.
+    A changed file stays unless `force` or `purge` is set. Three kinds of paths stay unless `purge`
+    is set: a changed file with `kept`, the `others`, and the state directories of the `stateful`
+    units. To purge these directories, the steps first install their units again if they are
+    missing.
     """
     wanted, stateful = list(wanted), list(stateful)
     # systemd knows the real path of a state directory, but only while the unit is installed. An
@@ -401,7 +404,7 @@ def uninstalling(
 
 
 def state(unit: str) -> str:
-    """Return systemd's report about a unit; "" if systemd does not answer."""
+    """Return systemd's report about a unit as lines `NAME=value`; "" if systemd does not answer."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
         done = called(("systemctl", "show", unit, about), 10.0)

@@ -1,9 +1,9 @@
-"""Writes a file or a directory atomically, and never over a recording.
+"""Writes a file or a directory atomically, and protects recordings against an overwrite.
 
 The content is written under another name in the same directory and renamed at the end. Therefore
 the target is complete or absent. With `force` an existing target is replaced, but only if it is a
-regular file or a ROS bag. A recording is replaced only by a recording with the same content or more
-of it. A directory with other files is never replaced.
+regular file or a ROS bag. A recording is replaced only by another recording that contains all of
+it. A directory with other files is never replaced.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BAG_SUFFIXES = (".mcap", ".db3")
 
 
 def never(recording: Recording) -> bool:
-    """Return False. This is the default of a caller that must not replace any recording."""
+    """Return False, so that no recording is replaced. This is the default of `replacing`."""
     return False
 
 
@@ -63,8 +63,8 @@ def synced(stream: BinaryIO) -> None:
 def _put(part: Path, new: Path) -> None:
     """Rename `part` to `new`.
 
-    No call replaces a directory that has files. Therefore an old directory is renamed first, and
-    deleted at the end.
+    No system call replaces a directory that contains files. Therefore an existing directory at
+    `new` is renamed first, and deleted at the end.
     """
     if not new.is_dir():
         os.replace(part, new)
@@ -123,7 +123,7 @@ def _recording(path: Path) -> Recording | None:
 def _remove(path: Path) -> None:
     """Remove a file, or the files of a ROS bag and their directory.
 
-    A recursive delete could remove more than a bag.
+    The removal is not recursive, because that could delete more than a bag.
     """
     if path.is_dir() and not path.is_symlink():
         for file in path.iterdir():

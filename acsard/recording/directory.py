@@ -93,7 +93,7 @@ def listed(directory: Path) -> list[Path]:
 
 
 def is_being_recorded(path: Path, now_s: float) -> bool:
-    """Return whether a daemon writes to this recording at the time `now_s`, s since 1970.
+    """Return whether a daemon is writing to this recording. `now_s` is the time now, s since 1970.
 
     Raises `OSError` if the file cannot be examined.
     """
@@ -180,8 +180,8 @@ class Ring:
             self._directory.mkdir(parents=True)
             # The umask may have removed bits of the mode.
             self._directory.chmod(DIRECTORY_MODE)
-        # Only this user and the group may open this file: every process that can open the file
-        # can hold the lock.
+        # Only this user and the group may open this file, because every process that can open it
+        # can also lock it.
         self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -229,19 +229,22 @@ class Ring:
                 self._retain_before(part, found.st_mtime_ns)
 
     def _retain_before(self, part: Path, cut_ns: int) -> None:
-        """Retain the files that ended less than a minute before the crash that cut off `part`."""
+        """Retain the files that ended less than a minute before a crash cut off `part`.
+
+        `cut_ns` is the time of the crash, ns since 1970.
+        """
         for path in listed(self._directory):
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
                 before_ns = cut_ns - path.stat().st_mtime_ns
                 earlier = (_number(path) or 0) < (_number(part) or 0)
-                # A computer without a clock of its own starts in the past. Then all older files
-                # seem to have ended long after the crash.
+                # The clock of a computer without a battery-backed clock starts in the past. Then
+                # all older files seem to have ended long after the crash.
                 if earlier and abs(before_ns) < AROUND_NS:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and its files, even files of an earlier version."""
+        """Let every user read the directory and its files, also those of an earlier version."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -260,7 +263,7 @@ class Ring:
         stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
         path = self._directory / f"{number:06}-{stamp}{PART}"
         writing = Writing(path, about, OPEN_MODE if self._open_to_all else MODE)
-        # The names of the files must be on the disk as well as their content.
+        # The name of the new file must reach the disk as well as its content.
         sync(self._directory)
         return writing
 
@@ -279,7 +282,7 @@ class Ring:
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
         """Yield the files that ended less than a minute ago according to the wall clock.
 
-        Yields the path, the retention class, and the end in ns of the monotonic clock.
+        Each item is the path, the retention class, and the monotonic time of the end, ns.
         """
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)

@@ -36,7 +36,7 @@ _DATA_END = HEAD.pack(Opcode.DATA_END, 4)
 """Head of the record that follows the end record."""
 
 Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-"""Time in ns since 1970 that fits in a signed 64-bit integer."""
+"""Time in ns that fits in a signed 64-bit integer."""
 
 CUTS = {
     "bug": "cut: an internal error ended the daemon",
@@ -53,7 +53,7 @@ finished later.
 
 
 class EndRecord(Struct, frozen=True):
-    """Content of the last metadata record. A list of recordings reads only this record."""
+    """Content of the last metadata record. To list recordings, only this record is read."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""

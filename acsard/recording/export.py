@@ -166,7 +166,7 @@ def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def wheel_columns(estimate: Estimate) -> str:
-    """Return the CSV columns with the measured wheel values of one feedback line."""
+    """Return the measured columns of one feedback line: time, wheel speeds, no yaw rate."""
     wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
     return f"{_csv_seconds(estimate.at.wall_ns)},{wheels},"
 
@@ -372,7 +372,7 @@ def _write_steps(
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in the time span. The first step after the span ends the log."""
+        """Return whether a step is in the time span. End the output at the first step after it."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:

@@ -132,7 +132,7 @@ class About(Struct, frozen=True):
 
 
 class EndRecordBuilder:
-    """Collects the end record of a recording from its messages."""
+    """Builds the end record of a recording from its messages."""
 
     def __init__(self, about: About) -> None:
         self._wall_ns = self._last_ns = self._earliest_ns = about.wall_ns
@@ -366,7 +366,10 @@ def _is_intact(metadata: Mapping[str, str]) -> bool:
 
 
 def _definitions() -> Iterator[McapRecord]:
-    """Yield the schema and the channels. A file has them at its beginning and in its summary."""
+    """Yield the records that define the schema and the channels.
+
+    A file contains them at its beginning and in its summary section.
+    """
     schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
     yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.TimelineEntry")
     for topic, number in NUMBERS.items():
@@ -432,7 +435,7 @@ class Recording:
         return "; ".join(filter(None, [damaged, self.ending]))
 
     def compute_end_record(self) -> EndRecord:
-        """Read all messages, and return an end record for them whose `cut` is ""."""
+        """Build an end record from all messages of the recording. Its `cut` is ""."""
         builder = EndRecordBuilder(self.about)
         for topic, wall_ns, data in self.messages():
             builder.message(topic, wall_ns, data)
@@ -461,7 +464,7 @@ class Recording:
                     if topic == "unfinished":
                         self.unfinished = data
                     yield topic, wall_ns, data
-            # A damaged chunk has its readable messages before the damage.
+            # In a damaged chunk, all readable messages precede the damage.
             self.damaged += place.damaged
         if not self.ended and (end := end_in(self._data)) is not None:
             # `walk` mistook the damage for the end of a cut-off file, because no complete chunk
@@ -526,7 +529,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def is_part(part: Recording, recording: Recording) -> bool:
-    """Return whether `recording` has the metadata and all messages of `part`.
+    """Return whether `recording` has the same metadata as `part` and contains all its messages.
 
     Then `recording` may replace `part`.
     """

@@ -51,7 +51,8 @@ INCOMPLETE_STATE_ERRORS = (
 class Gap(Struct):
     """A part of a recording that is not replayed.
 
-    It has the steps that cannot be read, and the steps from there to the next state of the robot.
+    It consists of the steps that cannot be read, and of the steps between them and the next state
+    of the robot in the file.
     """
 
     begin_ns: int
@@ -59,7 +60,7 @@ class Gap(Struct):
     end_ns: int
     """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
     unreadable: int = 0
-    """Known number of steps that cannot be read."""
+    """Number of steps that cannot be read, as far as the step numbers show it."""
     skipped: int = 0
     """Number of steps that are readable, but not replayed: they precede the next robot state."""
     lines: int = 0
@@ -80,11 +81,14 @@ class ReplayResult(NamedTuple):
     It is "" if the daemon did not fail.
     """
     event_copies: str = ""
-    """Sentence about the first event in a step whose copy differs; "" if all are equal."""
+    """Sentence about the first event whose copy in the channel `events` differs from its step.
+
+    It is "" if all copies are equal.
+    """
 
     @property
     def same(self) -> bool:
-        """True if the replayed outputs equal the recorded ones, and the copies equal the events."""
+        """True if the replayed outputs equal the recorded ones, and all copies of events agree."""
         return self.comparison.same and not self.event_copies
 
 
@@ -224,7 +228,10 @@ class RecordedRun(_Source):
         self.copies = EventCopies(recording)
         """Compares the events in the steps with their copies in the channel `events`."""
         self._next, self._state = _first_state(recording)
-        """Number of the step before which `robot` is known. The state is None for a new robot."""
+        """`_next` is the number of the step before which `robot` is known.
+
+        `_state` is None for a new robot.
+        """
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
         """The robot with which to replay, and its guard's memory. A gap replaces both objects."""
         if self._state is not None:
@@ -331,7 +338,7 @@ def replay_file(
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
-    """Run the step in which the daemon failed, and say whether this version fails too.
+    """Run the step in which the daemon failed; return `ReplayResult.failed_step`.
 
     `robot` is the replayed robot after the step with the number `last`. The failed step must be
     the next one.

@@ -9,9 +9,9 @@ while it grows:
 3. When the chunk is complete, it replaces the first head by the true head.
 
 The reader does not need the head. Each zstd block holds its own length, and the sequence number of
-each message is the message's checksum. So the reader gets all seconds before a cut or a damaged
-place. After a damaged chunk or a record whose length is wrong, it searches for the next complete
-chunk.
+each message is the message's checksum. So the reader recovers every second that was written before
+a cut or a damaged place. After a damaged chunk or a record whose length is wrong, it searches for
+the next complete chunk.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ ZSTD = struct.pack("<I4s", 4, b"zstd")
 """The length and the name of the compression. Every chunk has these bytes in its head."""
 
 _ENDLESS = (1 << 63) - 1
-"""Length in the head of a chunk that still grows."""
+"""Value of the length in the head of a chunk that is still growing. No file is that long."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Head of a message's record: opcode, length, channel, sequence number, and the time twice."""
@@ -92,9 +92,9 @@ _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed and uncompressed."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Effort that is added for each block, bytes.
+"""Effort that each block counts in addition to its unpacked bytes, bytes.
 
-To unpack an empty block takes about as long as to unpack 1 KiB of a large block.
+Unpacking an empty block takes about as long as unpacking 1 KiB of a large block.
 """
 
 _REPEATED = 1
@@ -351,9 +351,10 @@ class Found(NamedTuple):
 
 
 def walk(data: bytes) -> Iterator[Found]:
-    """Yield the records of a file up to the footer, or to the end of the file.
+    """Yield the records, chunks and damaged places of a file, up to its footer or its end.
 
-    If the damaged chunks need more than `MAX_EFFORT`, the rest of the file is one damaged place.
+    If the damaged chunks need more effort than `MAX_EFFORT` allows, the rest of the file is one
+    damaged place.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
     # If the first bytes of a finished file are damaged, its last bytes still identify it.
@@ -438,7 +439,7 @@ class _Chunks:
     def read(self, begin: int) -> ReadChunk | None:
         """Read the chunk whose head begins at the offset `begin`; return None if there is none.
 
-        Each chunk that is incomplete or empty uses up a part of the work that is allowed for one
+        Each chunk that is incomplete or empty uses up a part of the effort that is allowed for the
         file.
         """
         chunk = read_chunk(self._data, begin)

@@ -52,8 +52,8 @@ class Publisher:
 
         Args:
             robot: the robot that replays the steps.
-            started_ns: wall-clock time of the daemon's start, ns since 1970; the stamp of the
-                messages that never change.
+            started_ns: wall-clock time of the daemon's start, ns since 1970. The messages that
+                never change have this stamp.
         """
         self.robot = robot
         """The robot that replays the steps. Set it to another one after a gap."""
@@ -102,7 +102,8 @@ class Publisher:
 
     def _line(self, entry: TimelineEntry) -> Published:
         wall_ns = round(entry.seconds * NS_PER_S)
-        # The time of an entry is rounded to fractions of a us, and the stamps of events are exact.
+        # An entry's time is rounded to fractions of a us. The exact time of its step agrees with
+        # the stamps of events, which are exact.
         if abs(wall_ns - self._now.wall_ns) < ROUNDED_NS:
             wall_ns = self._now.wall_ns
         line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)

@@ -158,7 +158,7 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Extend the CRC-32 `before` over all bits of the poses, twists and wheel angles; return it.
+    """Return the CRC-32 `before`, extended over all bits of the poses, twists and wheel angles.
 
     `before` is the CRC-32 of the earlier estimates of the batch, or 0 if there is none.
     """
@@ -181,7 +181,7 @@ def input_names(inputs: Inputs, before: int) -> int:
         *[name for refusal in inputs.refusals for name in (refusal.source, refusal.sender)],
         *[event.by for event in inputs.events],
     ]
-    # Most steps have no name. The JSON encoding shows where each name ends.
+    # Most steps contain no names. The JSON encoding shows where each name ends.
     return zlib.crc32(msgspec.json.encode(names), before) if names else before
 
 

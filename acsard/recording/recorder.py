@@ -65,8 +65,8 @@ class Recorder:
         Args:
             config: the configuration at the daemon's start.
             report: function that receives the recorder's own events. Only `step` calls it.
-            started_ns: wall-clock time of the daemon's start, ns since 1970. An export stamps the
-                messages that never change with it.
+            started_ns: wall-clock time of the daemon's start, ns since 1970. In an export, the
+                messages that never change have this stamp.
         """
         self._queue: deque[Taken | Start] = deque()
         self._report = report
@@ -100,7 +100,10 @@ class Recorder:
     # These methods run in the control loop's thread.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Begin the first file with this robot. Without this call the file has a new robot."""
+        """Begin the first file with this robot and its guard.
+
+        Without this call, a replay of the first file begins with new ones.
+        """
         self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
 
     def step(
@@ -188,7 +191,7 @@ class Recorder:
         self._over.set()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive() and self._writer.bug is None:
-            # A disk that hangs must not delay the end of the daemon as well.
+            # A hanging disk may delay the marker too, but must not delay the end of the daemon.
             marking = threading.Thread(target=self._writer.mark_cut, args=["late"], daemon=True)
             marking.start()
             marking.join(MARK_S)

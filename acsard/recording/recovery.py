@@ -143,8 +143,8 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
     """Return the writes that finish a file, each with its offset, and the file's new size.
 
-    `before` is the present content of the file, and `last` is the end record to write. The end of
-    the file comes before the heads, because the disk may have no room for the end.
+    `before` is the present content of the file, and `last` is the end record to write. The first
+    write is that of the end, because the disk may have no room for it. The heads follow.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
@@ -163,7 +163,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
                 index.message(message.channel, message.wall_ns)
             if chunk.complete and not before.startswith(head := chunk.head(before), chunk.begin):
                 heads.append((chunk.begin, head))
-    # Without any chunk, another process has changed the file since it was read.
+    # The file had a chunk when it was read. If it has none now, another process has changed it.
     if chunk is None:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
     before_end = b""

@@ -1,10 +1,10 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
 A recording is protected if an incident happened in it, or within a minute of it. Protected
-recordings are deleted last. All recordings together have a largest size, and a part of the disk
+recordings are deleted last. The total size of all recordings is limited, and a part of the disk
 (`Disk.spare`) is left to other programs. If less than that part is free, old unprotected recordings
 are deleted, but not the newest recording. Protected recordings and the newest one are deleted only
-if less than a fifth of that part is free, or if the largest size is exceeded.
+if less than a fifth of that part is free, or if the limit of the total size is exceeded.
 
 `ClockWatch` decides whether the wall clock can be trusted for the age of a recording.
 """

@@ -24,9 +24,10 @@ from acsard.recording.time_span import Contents, Span, clock, part_between, read
 MARGIN_S = 60.0
 """Tolerance for the times in an end record, s.
 
-A file is read completely if it covers a time within this tolerance of the searched range. The end
-record has only the time at which the last message began, and a slow disk makes messages long. The
-pause between two files of one series is also shorter than this.
+A file is read completely if it covers a time within this tolerance of the searched range. The
+tolerance is necessary because the end record gives only the time at which the last message began,
+and messages are long if the disk is slow. The pause between two files of one series is also shorter
+than this.
 """
 
 GAP_S = 2.0
@@ -37,7 +38,7 @@ class Series(Recording):
     """Several files of one run of the daemon, read as one. No step is missing between them."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the first file. Raises `RecordingError` as `Recording` does."""
+        """Read the first file; `messages` reads all. Raises the same errors as `Recording`."""
         super().__init__(_present(paths[0]))
         self.paths = list(paths)
 
@@ -148,10 +149,10 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of the earlier files with the drive that is under way as a file begins.
+    """Return the indices of the files that contain the earlier part of an unfinished drive.
 
-    `number` is the index of that file, and `contents` are its contents. If no drive is under way
-    at its beginning, the list is empty.
+    The drive is under way at the beginning of the file with the index `number`, whose contents are
+    `contents`. If no drive is under way there, the list is empty.
     """
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":

@@ -89,7 +89,7 @@ class StepWriter:
         self.lost = 0
         """Number of steps lost because the disk refused to write."""
         self.syncs = 0
-        """Number of syncs that have begun plus number that have ended; odd during a sync."""
+        """Number of syncs begun plus number of syncs ended. It is odd during a sync."""
         self._lost_before = 0
         """Number of steps that were lost before the present trouble began."""
         self._safe_ns: int | None = None
@@ -288,11 +288,11 @@ class StepWriter:
         if self.trouble or not self._reported:
             missing = many(self.lost - self._lost_before, "step is", "steps are")
             if self.lost > self._lost_before and self._safe_ns is not None:
-                # The file may have steps that no sync has brought to the disk.
+                # The cut-off file may contain some of these steps although no sync confirmed them.
                 at_most = f", at most {(self._began_ns - self._safe_ns) / NS_PER_S:.1f} s"
             else:
                 at_most = ""
-            # The disk refused the event with the reason too, so no recording has it.
+            # The disk also refused the event with the reason, so repeat the reason here.
             since = f" again; {missing} missing{at_most} ({self.trouble})" if self.trouble else ""
             self.trouble, self._reported = "", True
             self._report(Event("recording", f"to {self.where}{since}"))

@@ -20,7 +20,7 @@ from acsard.recording.timeline import SET_NS
 
 
 class Span(NamedTuple):
-    """A part of a recording, s after its beginning by the monotonic clock."""
+    """A part of a recording. Its limits are monotonic times, s after the recording began."""
 
     begin: float = -math.inf
     end: float = math.inf
@@ -47,7 +47,7 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A day from `begin` to `end`, s since 1970. For a moment `begin` and `end` are equal."""
+    """A moment, or a day from `begin` to `end`, s since 1970. In a moment, both are equal."""
 
     begin: float
     end: float
@@ -135,7 +135,7 @@ def _unknown(text: str) -> TimeError:
 
 
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
-    """Return the begin and the end of a range of time, s since 1970. Both may be infinite.
+    """Return the range of time that `begin` and `end` mean, s since 1970. It may be infinite.
 
     - None, or an `Offset`, does not limit the range on its side.
     - A time of day in `begin` means its last occurrence before `end` if `end` is a `Moment`.
@@ -168,7 +168,7 @@ def _last_occurrence(when: TimeOfDay, before_s: float) -> float:
 
 
 def clock(seconds: float, day: bool = False) -> str:
-    """Format `seconds` since 1970 as local time, with the date if `day`, else with ms."""
+    """Format `seconds`, s since 1970, as local time: with the date if `day`, otherwise with ms."""
     local = time.localtime(seconds)
     if day:
         return time.strftime("%Y-%m-%d %H:%M:%S", local)

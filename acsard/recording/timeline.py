@@ -32,7 +32,7 @@ FURTHEST_S = 2**63 / 1e9
 REASON_NS = NS_PER_S
 """Shortest time between two entries about a reason, ns.
 
-Two sources may alternate in every step.
+Without it, two sources that alternate in every step would fill the timeline.
 """
 
 POSE_NS = NS_PER_S
@@ -105,7 +105,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
 
 
 def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
-    """Return the entry of an event that happened at a wall-clock time, ns since 1970."""
+    """Return the entry of an event that happened at `wall_ns`, wall-clock ns since 1970."""
     late = event.name == "link_stale" and is_ours(event.text)
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
@@ -133,11 +133,11 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Detects that the reason changes while the mode stays the same, without an event about it."""
+    """Detects changes of the reason that neither a change of the mode nor an event reports."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
-        """The last mode and reason that the timeline shows. In the reason `#` replaces numbers."""
+        """The last mode and reason that the timeline shows. The reason has `#` for each number."""
         self._reported_ns = -REASON_NS
         """Monotonic time of the last entry, or of the last event about a lost link, ns."""
         self._sender = ("", "")
@@ -231,10 +231,10 @@ class WaitingSenders:
         """Monotonic time of the last entry."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry for each sender that has waited for `WAITS_NS`: one for each wait."""
+        """Yield one entry for each wait of a sender, once the wait has lasted for `WAITS_NS`."""
         for event in step.recorded.events:
             if event.name == "commander":
-                # If the log combined several changes, `by` has several names.
+                # If the log combined several changes, `by` contains several names.
                 self._commander = event.by
         mode, _, _, source = step.recorded.status
         if mode != "driving":
@@ -300,7 +300,7 @@ class TimelineWriter:
     def __init__(self, config: Config | None = None) -> None:
         """Prepare for the first step.
 
-        `config` has the priorities of the sources. If it is None, there are no `waits` entries.
+        `config` gives the priorities of the sources. If it is None, there are no `waits` entries.
         """
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
@@ -411,11 +411,10 @@ class TimelineWriter:
             self._began_ns = None
 
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
-        """Yield the entries after the last step.
-
-        They are an entry for a drive that is still under way, and an entry with `ending`.
+        """Yield the entries after the last step: an unfinished drive, and the text `ending`.
 
         `ending` is `Recording.ending`: how the recording ended, or "" if the daemon ended normally.
+        In the latter case there is no entry for it.
         """
         yield from self._continues()
         if self._now is None:
@@ -459,7 +458,7 @@ SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fa
 
 def is_serious(text: str) -> bool:
     """Return whether the summary `text` counts a stop, a bumper hit or a fault."""
-    # A client may have a name that looks like a fault.
+    # Ignore the names of the clients, because a name may look like a fault.
     return SERIOUS.search(text.partition(" (stopped by ")[0]) is not None
 
 

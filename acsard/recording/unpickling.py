@@ -215,9 +215,9 @@ class _Machine:
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """Add the size of `entry`, whose values are copied into a new part, to the copied values.
+        """Count the values of `entry` as copied, because they are copied into a new part.
 
-        Raises `ValueError` if there are more than `MAX_COPIED`.
+        Raises `ValueError` if more than `MAX_COPIED` values have been copied.
         """
         self._copied += entry.size
         if self._copied > MAX_COPIED:

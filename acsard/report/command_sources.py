@@ -47,7 +47,7 @@ class CommandSources:
         self._newest: dict[tuple[str, str], Command] = {}
         """The last command of each source and sender, the newest last."""
         self._counted: Counter[str] = Counter()
-        """Number of commands that the robot had refused after the last step, for each reason."""
+        """For each reason, the number of commands refused from the start to the last step."""
         self._refused: dict[str, tuple[float, str]] = {}
         """For each refused source: the time until which it counts as refused, s, and the reason."""
 

@@ -79,7 +79,7 @@ class Clip(NamedTuple):
 
 
 MARKS_APART = 0.02
-"""Smallest distance of two marks of a curve that leaves its diagram.
+"""Smallest distance between two marks of a curve that leaves its diagram.
 
 It is a fraction of the diagram's width.
 """
@@ -95,7 +95,7 @@ after a ramp stays visible. A command of 99 m/s does not flatten the other curve
 def clipped(
     points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
 ) -> tuple[list[Point], list[Clip]]:
-    """Limit a curve to the scale of other curves. Return it, and the times when it is outside.
+    """Limit a curve to the scale of others. Return it, and the times when it exceeds the scale.
 
     Args:
         points: the curve; NaN interrupts it.
@@ -525,8 +525,8 @@ class TimeFigures:
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
     """Return plotly's settings of the text that it shows at the pointer.
 
-    The text has the name of the curve, the time, and one of `values`. If there are no `values`, it
-    has the y coordinate of the point.
+    The text consists of the name of the curve, the time, and one of `values`. If `values` is empty,
+    the text has the y coordinate of the point instead.
     """
     shown = "customdata" if values else "y"
     text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"

@@ -124,7 +124,7 @@ addEventListener("afterprint", () => paper(false));
 
 
 MAX_OPEN = 40
-"""The page first shows the list of events open if it has at most this number of events."""
+"""Largest number of events with which the list of events is open when the page is loaded."""
 
 
 def escaped(text: str) -> str:

@@ -86,13 +86,13 @@ def label(text: str) -> str:
 
 
 def numbers(values: Iterable[float]) -> dict[str, str]:
-    """Return a column of numbers as plotly's base64 of doubles."""
+    """Return a column of numbers as doubles in base64, in the form that plotly reads."""
     data = struct.pack(f"<{len(values := list(values))}d", *values)
     return {"dtype": "f8", "bdata": binascii.b2a_base64(data, newline=False).decode()}
 
 
 def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
-    """Return a curve, or marks, at these points. `look` has the attributes that plotly knows."""
+    """Return a curve, or marks, at these points. `look` contains further attributes for plotly."""
     return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
 
 

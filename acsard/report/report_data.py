@@ -56,7 +56,7 @@ class Mark(Struct, frozen=True):
     place: Place | None
     """Place according to odometry; None before the first pose."""
     seconds: float
-    """Wall-clock time of the event by the robot's clock at that moment, s since 1970."""
+    """Wall-clock time of the event according to the robot's clock at that moment, s since 1970."""
 
     @property
     def words(self) -> str:
@@ -74,7 +74,7 @@ class Marks:
         self._count = 0
         """Number of calls of `add`."""
         self.counts: Counter[str] = Counter()
-        """Number of events of each name. A mark for several equal events counts that often."""
+        """Number of events of each name. A mark for several equal events adds their number."""
         self.left_out = 0
         """Number of events that were dropped."""
 
@@ -107,7 +107,7 @@ class Driven(Struct):
 class Lateness:
     """Delay of each period's step, relative to the step with the smallest delay.
 
-    The recording has the number of missed periods, so the number of each period is known. The time
+    The recording gives the number of missed periods, so each period's number is known. The time
     at which a period was due is then known except for a constant offset. The step with the smallest
     delay gives this offset.
     """

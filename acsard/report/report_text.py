@@ -63,7 +63,7 @@ OF_THE_BOARD = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""Maps the event of each stop that the board caused to words."""
+"""Maps the name of each event in which the board caused a stop to its words in the text."""
 
 
 def differences(config: Config) -> list[Setting]:
@@ -160,7 +160,11 @@ def _late(marks: Iterable[Mark], clock: Clock) -> str:
 
 
 def notes(data: ReportData, origin: Origin) -> list[str]:
-    """Return notes about missing steps and about the resolution of the pictures."""
+    """Return the notes for the reader of the report.
+
+    They are the notes of `origin`, and notes about missing steps, about a clock that was set, and
+    about the resolution of the pictures.
+    """
     found = list(origin.notes)
     if data.missing:
         found.append(

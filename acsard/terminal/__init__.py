@@ -1,6 +1,6 @@
 """Prints the output of the tools, and asks questions of the person beside the robot.
 
-`output.py` has tables and output that fits a terminal. `prompt.py` has the interface through which
+`output.py` fits tables and text to a terminal. `prompt.py` defines the interface through which
 `acsard calibrate` and `acsard mcu check` ask a person: at a terminal, through another program, or
 not at all.
 """

@@ -142,7 +142,7 @@ class JsonPrompt:
     def __exit__(self, *error: object) -> None:
         with self._news:
             self._left = True
-        self._reader.join(1.0)  # it does not end if the program does not read
+        self._reader.join(1.0)  # the thread does not end if the program does not read
 
     # Output
 

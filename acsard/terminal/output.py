@@ -19,7 +19,7 @@ WHOLE = 10_000
 """Width in characters that wraps no row of a table, so that a row can be copied."""
 
 SENTENCES = 100
-"""Width in characters of output that has sentences."""
+"""Largest width of output that contains sentences, characters."""
 
 
 def table(

@@ -20,7 +20,7 @@ from acsard.core.values import AcsardError
 
 
 class NobodyError(AcsardError):
-    """Nobody is there to answer a question."""
+    """No person is there to answer a question."""
 
 
 class Ask(Struct, frozen=True):
@@ -81,7 +81,7 @@ class Prompt(Protocol):
         """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask, and return one of the answers, or None if no person watches the robot."""
+        """Ask the question. Return one of `answers`, or None if no person watches the robot."""
 
     def start(self, text: str, by_key: bool = False) -> None:
         """Show the text, and wait until the person starts the leg.
@@ -90,7 +90,7 @@ class Prompt(Protocol):
         """
 
     def number(self, ask: Ask) -> float:
-        """Ask, and return the number that the person measured.
+        """Ask for a number, and return the number that the person measured.
 
         Raises `NobodyError` if there is no person who can measure.
         """

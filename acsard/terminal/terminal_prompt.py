@@ -31,7 +31,7 @@ COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_
 
 
 class Screen:
-    """Output of a subcommand that asks.
+    """Output of a subcommand that asks questions.
 
     The present activity is a line on the terminal that the next output overwrites. It is left out
     if standard error is a pipe. With `as_json`, the subcommand prints one JSON object at its end,

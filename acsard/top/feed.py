@@ -35,7 +35,7 @@ class Feed:
             raise ReplyError(
                 f"cannot read the state ({error}); does the daemon have another version?"
             ) from None
-        # A state that arrived before the answer is usually older than it, but not always.
+        # A state that arrived before the answer is usually older than the answer, but not always.
         self.poll()
         held, now = self._watch.state, time.monotonic()
         if held is None or state.stamp.to_ns() > held.stamp.to_ns():

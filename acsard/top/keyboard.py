@@ -107,7 +107,7 @@ class Ride:
     def __init__(self, robot: Client, keyboard: Keyboard) -> None:
         self._robot, self._keyboard = robot, keyboard
         # After a silence the robot may require a return to neutral, for example because it was
-        # stopped and cleared meanwhile.
+        # stopped and cleared during the silence.
         self._commander = Commander(leads=True)
         self._fine = time.monotonic()
         self._watch = Watch(robot, self._fine)

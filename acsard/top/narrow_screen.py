@@ -1,4 +1,4 @@
-"""The parts of a narrow screen: the same figures as on a wide one, but below each other.
+"""The parts of a narrow screen: the same figures as on a wide one, but one below the other.
 
 This module is pure. Continued lines are indented. The figures since the start of the daemon come
 last, so a screen with few lines cuts them off first.

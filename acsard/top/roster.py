@@ -1,4 +1,4 @@
-"""The robots of `acsard fleet`, and one line for each of them, for any width."""
+"""The robots of `acsard fleet`, and one line for each of them, for any width of the terminal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NAME, WHY = 12, 32
 one its minimum, but never narrower than its own minimum."""
 
 BATTERY = HEADS.index("BATTERY")
-"""Column of the state of charge. The table has it only if a robot has a battery."""
+"""Column of the state of charge. The table shows it only if a robot reports a battery."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
 """Modes that need attention. Robots in these modes are listed first, because the lines may not all
@@ -149,10 +149,10 @@ class Roster(Fleet):
         return [replace(row, here=bool(row.here)) for row in super().rows()]
 
     def gather(self) -> list[Row]:
-        """Wait until all named robots have answered, and return the rows.
+        """Wait until all robots that the user named have answered, and return the rows.
 
-        The wait ends after 1.5 s. Without any robot it ends after 3 s, because the first answer is
-        late on a busy computer; then there are no rows.
+        The wait ends after 1.5 s, or after 3 s if no robot has answered, because the first answer
+        is late on a busy computer. If no robot has answered by then, there are no rows.
         """
         began, rows = time.monotonic(), self.rows()
         while not self.whole:
@@ -165,7 +165,7 @@ class Roster(Fleet):
 
     @property
     def whole(self) -> bool:
-        """Whether all named robots are present and have reported their state and version.
+        """Whether all robots that the user named are present and have reported state and version.
 
         It is never true if the user did not name robots, because their number is unknown.
         """

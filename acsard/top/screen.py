@@ -1,8 +1,8 @@
-"""One screen of `acsard top`: turns a robot's state into lines of coloured text. This module is
-pure.
+"""One screen of `acsard top`: turns a robot's state into lines of coloured text.
 
-Each line is cut to the width of the terminal, and the number of lines to its height, so no message
-can break the layout. If space is short, empty lines are left out first, then sources.
+This module is pure. Each line is cut to the width of the terminal, and the number of lines to its
+height, so no message can break the layout. If space is short, empty lines are left out first, then
+sources.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return the warnings, in one line on a wide screen. A single warning has its details."""
+    """Return the warnings, in one line on a wide screen. Show details if there is only one."""
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
     wide = width >= narrow_screen.BELOW

@@ -1,4 +1,4 @@
-"""The screens of `top`, `fleet` and `drive`, and their output on a terminal without screens.
+"""The screens of `top`, `fleet` and `drive`, and lines for a terminal that shows no screens.
 
 A screen ends with a key or a signal. ^Z suspends it, and `fg` resumes.
 """
@@ -71,7 +71,7 @@ def live(feed: Feed) -> None:
 
 
 def drive(ride: Ride) -> None:
-    """Drive by the typed keys, and show the robot, until the input ends or a signal arrives."""
+    """Drive with the typed keys, and show the robot, until the input ends or a signal arrives."""
     if has_screen():
         console = Console()
         _hold(lambda suspend: _steer(ride, console, suspend))
@@ -80,7 +80,7 @@ def drive(ride: Ride) -> None:
 
 
 def part(ride: Ride) -> None:
-    """Wait until the robot has stopped, at most 2 s, and print a last report.
+    """Wait until the robot has stopped, at most 2 s, and print a last report on a terminal.
 
     Without the wait, this report would say that the robot is driving, although it stops a moment
     later.
@@ -280,7 +280,7 @@ class Page:
         """Number of lines printed since the first line of the help."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """Return the lines of a report, below the help if that would not be in sight otherwise.
+        """Return the lines of a report. Put the help first if it would be out of sight otherwise.
 
         `height` is the number of lines of the terminal.
         """

@@ -1,4 +1,4 @@
-"""Builds the parts of a wide screen below the line of the mode, each below a rule.
+"""Builds the parts of a wide screen that follow the mode. Each begins with a horizontal rule.
 
 This module is pure.
 """

@@ -2,14 +2,14 @@
 
 No other module counts connections. A connection goes through these states:
 
-1. silent: only a socket and a place in `Sockets`. TLS starts with the first byte, so a silent
-   connection costs a file and no memory;
+1. silent: it has only a socket and a place in `Sockets`. TLS starts with the first byte, so a
+   silent connection costs a file descriptor and no memory;
 2. waiting, if `HANDSHAKES_AT_ONCE` others are in the TLS handshake, or if its network has begun too
    many handshakes lately;
 3. starting: in the TLS handshake, for at most `HANDSHAKE_S`, or `HURRIED_S` if others wait;
 4. open: aiohttp reads its requests.
 
-If all places are taken, `Sockets` names the connection to close. The first request must arrive
+If all places are taken, `Sockets` chooses the connection to close. The first request must arrive
 within `REQUEST_S`. By itself, aiohttp answers bytes that are not an HTTP request with a bare line,
 and logs a traceback each time. `Reader` answers them with an explanation, and counts the refusal.
 """
@@ -47,7 +47,8 @@ connections wait for theirs. Clients that fall silent in their handshakes must n
 waiting for `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
-"""Time limit from the accept to the head of the first request; the connection is cut after that."""
+"""Time limit, s, from accepting a connection to the head of its first request. After that, the
+connection is cut."""
 
 UNREAD_S = 5.0
 """Time limit, s, for a client that does not read its answers, or whose network is lost. The kernel
@@ -83,11 +84,11 @@ class Acceptor:
         the started connection moves to the end."""
         self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
-        """The connections in the TLS handshake, with the time of its start, oldest first."""
+        """The connections in the TLS handshake, each with the time of its start, oldest first."""
         self._again: asyncio.TimerHandle | None = None
         """Timer of the next call of `_next`, or None if no call is scheduled."""
         self._ended: set[_Connection] = set()
-        """The connections whose token had ended at the last call of `tidy`."""
+        """The connections whose token was no longer valid at the last call of `tidy`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Accept connections at a listening socket; `make` creates their protocol.
@@ -128,7 +129,8 @@ class Acceptor:
     def tidy(self, valid: Collection[str]) -> None:
         """Cut the connections whose token is not in `valid`. `Page.tidy` calls this once a second.
 
-        A connection is cut at the second such call, because a WebSocket gets the reason first.
+        A connection is cut at the second call that finds its token invalid, because a WebSocket is
+        sent the reason first.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -157,7 +159,7 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Close a connection to free its file, and accept connections again after `PAUSE_S`.
+        """Close a connection to free its file descriptor; accept again after `PAUSE_S`.
 
         A connection from the robot itself is closed only if `Sockets` allows closing none from
         another machine.
@@ -214,7 +216,7 @@ class Acceptor:
             one = next(iter(same))
             del same[one]
             if same:
-                self._waiting[network] = same  # behind the others
+                self._waiting[network] = same  # after all other networks
             self._starting[one] = loop.time()
             one.start()
         # A handshake occupies the server for 1 to 2 ms, and a stop must not wait for 32 in a row.

@@ -1,9 +1,9 @@
 """Admission of requests, between the socket and the handler of a row in the table of routes.
 
-Each request passes `Admission` in this order: the client's place (`callers.py`), the origin of the
-web page that sent it, its token, its request rate, and the role that the row asks for. Only then
-does the handler see the request, and with it the caller's identity (a `Who`). A path without a row
-requires a token as well, so a stranger does not learn which paths exist.
+`Admission` checks each request in this order: whether the client is on the robot (`callers.py`),
+the origin of the web page that sent the request, its token, its rate, and the role that the row
+requires. Only then does the handler see the request, and with it the caller's identity (a `Who`). A
+path without a row requires a token as well, so a stranger does not learn which paths exist.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the tokens from the file, read after this call, so no revoked token is among them.
+        """Return the tokens, read after this call, so that none of them was revoked before it.
 
         Raises `TimeoutError` if the disk does not answer.
         """
@@ -121,7 +121,7 @@ class Admission:
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
-        """Return the application that serves these rows; `page` is passed to each handler."""
+        """Return the application that serves the routes `rows`; each handler receives `page`."""
         app = web.Application(middlewares=[self._serve], client_max_size=MAX_BYTES)
         app.on_response_prepare.append(secured)
         app.on_response_prepare.append(self._shared)
@@ -162,7 +162,7 @@ class Admission:
                 await self._pace_stranger(request)
                 return self._preflight(request)
             waits = await self._admit(request, self._rows.get(request.match_info.route))
-            # Of a POST only the answer waits, so a stop is sent to the robot at once.
+            # For a POST, only the answer is delayed, so a stop is sent to the robot at once.
             if waits and request.method != "POST":
                 await asyncio.sleep(HOLD_S)
             answer = await handler(request)
@@ -195,7 +195,7 @@ class Admission:
             return problem(error.status, WORDS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Delay a request by `HOLD_S` if it has no valid token and its network sends many such."""
+        """Delay a request without a valid token by `HOLD_S` if its network sends many of them."""
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
 
@@ -212,8 +212,9 @@ class Admission:
         if request.method not in ("GET", "HEAD") if is_open else not listed:
             require_own_origin(said)
         if is_open:
-            # A browser loads the files of the page over several connections. If they show a valid
-            # token, they must not be displaced before one of them requests a row that needs it.
+            # A browser loads the files of the page over several connections. If these show a valid
+            # token, they must not be closed to make room for others before the browser requests a
+            # row that needs the token.
             shown = [] if here else tokens_shown(request, self._robot)
             if who := next(filter(None, map(self._vault.known, shown)), None):
                 self._acceptor.admitted(request.transport, who)
@@ -222,7 +223,7 @@ class Admission:
             return False
         who = replace(self._local, address=said.peer)
         if not here:
-            # A cookie belongs to the robot's own page, so a listed page must send a token itself.
+            # Cookies are only for the robot's own page. A page in `web.origins` must send a token.
             shown = tokens_sent(request) if listed else tokens_shown(request, self._robot)
             who = await self.owner(said.peer, shown)
         request[WHO] = who
@@ -236,7 +237,7 @@ class Admission:
         return fast
 
     def _too_fast(self, who: Who, row: Route | None) -> bool:
-        """Count a request; return whether it exceeds the rate of its row (None: `REQUESTS`)."""
+        """Count a request; return whether it exceeds the rate of `row`, or `REQUESTS` for None."""
         if not who.token:
             return False  # clients on the robot itself have no rate limit
         rate = row.rate if row else REQUESTS
@@ -306,7 +307,7 @@ def own_port(request: web.Request) -> int:
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
     """Return the tokens of a request, the likeliest to be valid first.
 
-    They are those in its headers or, without any, those in the browser's cookies for `robot`.
+    They come from its headers or, if these contain none, from the browser's cookies for `robot`.
     """
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 

@@ -126,7 +126,7 @@ async def secured(request: web.Request, response: web.StreamResponse) -> None:
 
 
 def _policy(request: web.Request, more: str = "") -> str:
-    """Return the content security policy for an admitted request, followed by `more` directives.
+    """Return the content security policy for an admitted request, with `more` appended.
 
     Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out.
     """
@@ -153,8 +153,8 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""The files that are sent inside another file. Each has the HTML element that loads it in the
-source of the other file, and the name of the element that contains it in the sent file."""
+"""Maps a file to the files that are sent inside it. Each of these comes with the HTML element that
+loads it in the source of the outer file, and the name of the element that contains it when sent."""
 
 
 class File(Struct, frozen=True):

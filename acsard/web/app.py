@@ -66,7 +66,7 @@ DEFAULT = WebConfig()
 class TokenForm(Struct, frozen=True):
     """The token of an invitation.
 
-    With `replace`, it takes the place of a cookie that has more permissions.
+    If `replace` is true, the token replaces a cookie of the browser that has more permissions.
     """
 
     token: str
@@ -275,9 +275,9 @@ class Page:
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Wait for a camera picture that the client has not seen; return it, or 304 without one.
+        """Wait for a camera picture that the client has not seen; return it, or 304 if none comes.
 
-        The header `If-None-Match` has the number of the last picture that the client has seen.
+        The header `If-None-Match` contains the number of the last picture that the client has seen.
         """
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.mono_ns()
@@ -287,7 +287,7 @@ class Page:
             return web.Response(status=304)
         async with self._camera.sending(request[WHO].token):
             _limit_buffer(request)
-            picture = self._camera.newest or picture  # there may have been a wait
+            picture = self._camera.newest or picture  # a newer one may have arrived
             now_ns = clock.mono_ns()
             told = {
                 "Content-Type": "image/jpeg",

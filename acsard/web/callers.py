@@ -1,4 +1,4 @@
-"""Finds the client of a request by its source address and headers, and the rights of its role.
+"""Identifies the client of a request from its address and headers, and checks its role.
 
 This module is pure.
 
@@ -140,7 +140,7 @@ def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
     `origins` are in lower case. The result is False for the robot's own page, even if its origin
-    is listed: the cookies of a listed page are ignored, so the page could not stop its own robot.
+    is listed: cookies from a listed page are ignored, so the robot's page could not stop the robot.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False

@@ -1,8 +1,8 @@
 """Service calls and queries to the robot.
 
 Each call blocks a thread of its own, and the number of calls is limited, so a stop never waits
-behind other calls. If one client sends several stops to one robot in quick succession, they are
-merged: each gets the reply to a stop that was sent to the robot after it arrived.
+for other calls. If one client sends several stops to one robot in quick succession, they are
+merged: each is answered with the reply to a stop that was sent to the robot after its arrival.
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ class Calls:
     ) -> ServiceReply:
         """Stop another robot, and return its reply.
 
-        The slots for waiting are limited, so robot ids that do not exist cannot block other
-        callers. Without a free slot, the stop is sent without waiting for the reply.
+        The slots for waiting are limited, so stops of robots that do not exist cannot block other
+        callers. If no slot is free, the stop is sent without waiting for the reply.
         """
         with self._elsewhere.held() as free:
             if free:

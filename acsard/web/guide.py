@@ -59,7 +59,7 @@ class Reach(Struct, frozen=True):
 
 
 class Board(Struct, frozen=True):
-    """A serial port and a description of the device behind it."""
+    """A serial port and a description of the device that is connected to it."""
 
     port: str
     what: str
@@ -98,7 +98,7 @@ class Guide:
         self._task: asyncio.Task[None] | None = None
 
     async def choices(self, *, simulated: bool) -> Choices:
-        """Return the options that the page may start now.
+        """Return the checks and calibrations that the page may start now.
 
         `simulated` says whether the robot is simulated.
         """
@@ -235,7 +235,7 @@ def boards(configured: str) -> list[Board]:
 
 
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
-    """Return the arguments of the `acsard` command for a request to begin.
+    """Return the arguments of the `acsard` command for a request to begin a check or calibration.
 
     `ports` are the serial ports that may be checked. Raises `FrameError` if the request is not
     allowed.

@@ -18,10 +18,10 @@ from acsard.core.values import NS_PER_S, WHEELS
 LASTS_NS = 60 * NS_PER_S
 
 STEP_NS = NS_PER_S // 5
-"""Nominal interval of the rows; a phone's plot has about one pixel for it."""
+"""Nominal interval of the rows, ns. It is about one pixel wide in a phone's plot."""
 
 EARLY_NS = STEP_NS // 4
-"""Tolerance for states that arrive a little early."""
+"""Tolerance for states that arrive a little early, ns."""
 
 ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
 """Maximum number of rows in a minute."""

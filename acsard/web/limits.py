@@ -18,7 +18,7 @@ six in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
 """Maximum number of TCP connections without a valid token from one network, and of connections that
-count under one token. Further connections of that token are treated as if they had none."""
+count under one token. Further connections with that token are treated as if they had no token."""
 
 SOCKETS_OF_BROWSER = 7
 """Number of connections of a token that are never displaced: those of one browser."""
@@ -283,7 +283,7 @@ class Shares:
         return True
 
     def leave(self, holder: str, thing: Hashable) -> None:
-        """Release a resource that the holder has acquired once."""
+        """Undo one call of `enter` for the same holder and resource."""
         holders = self._held[thing]
         holders[holder] -= 1
         if not holders[holder]:

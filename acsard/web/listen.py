@@ -1,4 +1,4 @@
-"""The addresses at which the page listens: parsing, binding, and the form on an invitation."""
+"""The addresses at which the page listens: parsing, binding, and the URLs on an invitation."""
 
 from __future__ import annotations
 
@@ -110,9 +110,9 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
-    """Open a socket at each address, or at a later free port if `next_port`.
+    """Open a socket at each address. If its port is taken and `next_port` is true, try later ports.
 
-    Raises `InUseError`.
+    Raises `InUseError` if no port is free.
     """
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]

@@ -1,6 +1,6 @@
 """The counters of the page's server, for its log and for `/metrics`.
 
-`/metrics` adds the robot's figures, and has the Prometheus text format 0.0.4.
+`/metrics` adds the robot's figures, and uses the Prometheus text format 0.0.4.
 """
 
 from __future__ import annotations

@@ -82,11 +82,11 @@ ERRORS = {
     "429": "Too many requests, or too many wrong tokens.",
     "default": "Any other failure.",
 }
-"""Errors of every path, by HTTP status. The body of the answer has the reason, in words."""
+"""Errors of every path, by HTTP status. The body of the answer gives the reason in words."""
 
 
 def document(version: str, routes: Sequence[Route]) -> Described:
-    """Return the document that `GET /api` answers."""
+    """Return the document that answers `GET /api`; `version` is the version of acsard."""
     described = [row for row in routes if row.summary]
     bodies = [body.kind for row in described for body in row.gives.values()]
     bodies += [row.takes for row in described if row.takes is not None]
@@ -117,7 +117,7 @@ def document(version: str, routes: Sequence[Route]) -> Described:
 
 
 def _operation(row: Route, refs: Refs) -> Described:
-    """Return the OpenAPI operation of one row; `refs` has the schemas of its bodies."""
+    """Return the OpenAPI operation of one row; `refs` contains references for its bodies."""
     errors = {status: Body(what, Problem) for status, what in ERRORS.items()}
     answers = {str(status): body for status, body in row.gives.items()} | errors
     told: Described = {

@@ -134,7 +134,7 @@ def rows(directory: Path) -> list[Recording]:
 
 
 def _files(directory: Path) -> list[Path]:
-    """Return the paths of the recordings, or none until the recorder has made the directory."""
+    """Return the paths of the recordings; none if the recorder has not made the directory yet."""
     try:
         return listed(directory)
     except FileNotFoundError:
@@ -194,7 +194,7 @@ class _Drawing:
         self.percent = 0
         self.begun_ns = self.asked_ns = clock.mono_ns()
         self.packed = b""
-        """The finished report, compressed by gzip; empty until then."""
+        """The report, compressed by gzip; empty until the report is finished."""
         self.failed = ""
         self.told = False
         """True once a client has been informed that the drawing ended."""
@@ -209,8 +209,8 @@ class Reports:
 
     The child runs `acsard recording report` at the lowest priority. Its time, memory and output are
     bounded. It is killed when this server ends or no client asks for the report any more. The
-    finished report is kept compressed in memory until another one is drawn or nobody has asked for
-    it for `KEEP_NS`; no file is written.
+    finished report is kept compressed in memory until another one is drawn, or until no client has
+    asked for it for `KEEP_NS`; no file is written.
 
     A report shows text of unknown origin (names, sentences), which may be malicious. There are
     three defences. The report escapes the text. Its own policy allows exactly two scripts and loads
@@ -308,7 +308,10 @@ class _FailedError(Exception):
 
 
 def _why(said: str) -> str:
-    """Return the child's error output, or its last line if it is a traceback."""
+    """Return why the child failed, according to its error output `said`.
+
+    From a traceback, use only the last line. For a `MemoryError`, return `TOO_MUCH`.
+    """
     last = said.rpartition("\n")[2]
     if last.startswith("MemoryError"):
         return TOO_MUCH

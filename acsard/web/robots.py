@@ -91,7 +91,7 @@ class Robots:
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
         """Prepare the connection, which `connect` opens.
 
-        `about` has the facts from the local configuration, used until the daemon answers.
+        `about` gives the facts from the local configuration. It is used until the daemon answers.
         """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)

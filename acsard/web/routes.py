@@ -81,8 +81,8 @@ class Route(Struct, frozen=True):
     """True makes a request beyond the rate wait instead of refusing it.
 
     A stop must always go through: it is sent at once, and its answer waits. A page that reconnects
-    must not be kept out by another program that uses the same token elsewhere. So the rate then
-    applies to a token in one network.
+    must not be kept out by another program that uses the same token elsewhere. So, if this is true,
+    the rate applies to each token in each network separately.
     """
 
     @property
@@ -115,7 +115,7 @@ def services(handler: Handler) -> Iterator[Route]:
     """Yield the row of each service."""
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():
-        # The daemon decodes the payload, so a refusal has the daemon's message.
+        # The daemon decodes the payload, so a refusal contains the daemon's message.
         takes = Which if verb == "stop" else SERVICES[verb].payload or None
         gives = {
             200: Body("It was done.", "ServiceReply"),

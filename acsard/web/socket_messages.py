@@ -1,9 +1,10 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
-Each message is one JSON object. The kind of an incoming message is the only field of `KINDS` that
-it has (`subscribe`, `cmd`, `call`, ...). A message of no kind, of two kinds, or with an unknown
-field is refused as a whole. An outgoing message is identified by its first field. Messages of
-subscribed keys are built in socket_sender.py instead, because their values are already JSON.
+Each message is one JSON object. An incoming message, a frame, contains exactly one of the fields in
+`KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none or two of these
+fields, or with an unknown field, is refused as a whole. An outgoing message is identified by its
+first field. Messages of subscribed keys are built in socket_sender.py instead, because their values
+are already JSON.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ Device = Annotated[str, Meta(max_length=200)]
 
 
 class FrameError(AcsardError):
-    """A message that is not a valid frame. `about` names its intended kind, or is "message"."""
+    """A message is not a valid frame. `about` is the kind it was meant to have, or "message"."""
 
     def __init__(self, about: str, text: str) -> None:
         super().__init__(text)
@@ -81,7 +82,7 @@ class Wish(_Frame, frozen=True):
 class Command(_Frame, frozen=True):
     """Drive at this velocity.
 
-    `stamp` is the time of the command in ms by the sender's own clock.
+    `stamp` is the time of the command on the sender's own clock, ms.
     """
 
     least: ClassVar[Role] = COMMAND_ROLE
@@ -119,7 +120,7 @@ class Ping(_Frame, frozen=True):
 
 
 class Begin(_Frame, frozen=True):
-    """Check the board at `port`, or calibrate by a `method`; "" selects the default method."""
+    """Check the board at `port`, or calibrate with `method`; "" selects the default method."""
 
     least: ClassVar[Role] = "maintainer"  # both turn wheels and write configuration files
     begin: Literal["check", "calibrate"]
@@ -145,7 +146,7 @@ class Press(_Frame, frozen=True):
 Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
 
 KINDS: dict[str, type[Frame]] = {kind.__struct_fields__[0]: kind for kind in get_args(Frame)}
-"""The frame type for each field that identifies one."""
+"""Maps each field that identifies a kind of frame to the type of the frame."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
@@ -196,7 +197,7 @@ class Greeting(Struct, frozen=True):
     version: str
     role: Role
     sender: str
-    """Public name that `state.sender` has while this viewer drives."""
+    """Public name of this viewer. It is the value of `state.sender` while this viewer drives."""
     limits: Limits
     simulated: bool
     state_rate: float
@@ -288,9 +289,9 @@ class Gone(Struct, frozen=True):
 
 
 class Running(Struct, frozen=True, omit_defaults=True):
-    """The running check or calibration, or "".
+    """The running check or calibration, or "" if nothing runs.
 
-    `by` started it, and `yours` is true for this viewer.
+    `by` is the user who started it, and `yours` is true if this viewer started it.
     """
 
     running: str
@@ -307,6 +308,6 @@ class Ended(Struct, frozen=True):
 
 
 class Guided(Struct, frozen=True):
-    """A check or a calibration: that it is running, each line that it prints, and its end."""
+    """News of a check or calibration: that it is running, a line that it printed, or its end."""
 
     guide: Running | msgspec.Raw | Ended

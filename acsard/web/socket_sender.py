@@ -70,7 +70,7 @@ class Outgoing:
         self._closing = False
 
     def say(self, message: object) -> None:
-        """Queue a message, which is sent as soon as the client reads earlier data."""
+        """Queue a message, which is sent as soon as the client has read the earlier data."""
         self._out.append(msgspec.json.encode(message))
         self._news.set()
 
@@ -132,9 +132,9 @@ class Outgoing:
             self._transport.abort()
 
     def pong(self, data: bytes) -> None:
-        """Answer a ping with this data, and no earlier ping that still waits for its answer.
+        """Answer the newest ping, which carried `data`. Earlier unanswered pings get no answer.
 
-        The protocol allows that, and the pings of a client that does not read cannot fill the
+        The protocol allows this. It keeps the pings of a client that does not read from filling the
         memory.
         """
         self._pong = data
@@ -265,7 +265,7 @@ class Keys:
             stream = await self._found(one)
         if stream is None:
             return
-        if not self._is_followed(one):  # the viewer unsubscribed meanwhile
+        if not self._is_followed(one):  # the viewer unsubscribed during the wait
             self._robots.streams.leave(one.robot, one.name)
             return
         one.stream = stream

@@ -86,7 +86,7 @@ class Stream:
 
 
 class Streams:
-    """The streams with at least one user. The last user's release ends the subscription."""
+    """The streams with at least one user. A subscription ends when its last user leaves."""
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
@@ -121,7 +121,7 @@ class Streams:
     def leave(self, robot: str, key: str) -> None:
         """Remove a user from a stream; without users, the subscription ends in the background.
 
-        The call does not wait, so a user that ends at the same moment leaves nothing behind.
+        The call does not wait, so a user whose task is ending can still release its stream.
         """
         stream = self._streams.get((robot, key))
         if stream is None:

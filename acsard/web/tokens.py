@@ -62,7 +62,7 @@ class Vault:
         replace it."""
 
     def known(self, text: str) -> Who | None:
-        """Return the owner of a valid token without access to the disk, or None.
+        """Return the owner of the token `text`, or None if it is not valid. Do not read the disk.
 
         The answer depends on the last read of the file. The server reads it once a second.
         """
@@ -171,7 +171,8 @@ class Vault:
             ) from None
 
     def _write(self, tokens: list[Token]) -> None:
-        # If root writes the file, the service still reads it as its own user.
+        # If root writes the file, give it to the directory's owner, because the service reads it as
+        # its own user.
         directory = self.path.parent.stat()
         owner = (directory.st_uid, directory.st_gid) if os.geteuid() == 0 else None
         replace(self.path, msgspec.json.encode(tokens), mode=MODE, owner=owner)

@@ -55,7 +55,7 @@ ACTIONS: dict[str, Role] = {
     "recordings": RECORDINGS,
     "begin": Begin.least,
 }
-"""The least role for each action of which the page shows a control."""
+"""The least role for each action for which the page shows a control."""
 
 HEARTBEAT_S = 10.0
 """Ping interval, s. The connection ends if a ping is not answered within half of it."""
@@ -145,8 +145,8 @@ class Viewer:
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
-        """Public name that `state.sender` has while this viewer drives. The secret part of the
-        sender's id is never sent to the client."""
+        """Public name of this viewer, the value of `state.sender` while this viewer drives. The
+        secret part of the sender's id is never sent to the client."""
         self._socket = socket
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
@@ -292,7 +292,7 @@ class Viewer:
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
-            # A stop is kept in its own set of tasks, which is not cancelled when the connection
+            # Stops are in a separate set of tasks, which are not cancelled when the connection
             # ends.
             self._start(self._answer(frame), self._stops)
         else:
@@ -303,7 +303,7 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message beyond a limit. Answer each call, because a program waits for it."""
+        """Refuse a message beyond a limit. Answer a call, because a program waits for an answer."""
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
             self._out.say(socket_messages.Answer(frame.id, False, text))
@@ -360,7 +360,7 @@ class Viewer:
     def _look_around(self, now: float) -> float:
         """Report changes of the robot's reachability and facts, and the rows of the fleet.
 
-        Return the time of the next call. It and `now` are s on the event loop's clock.
+        Return the time of the next call. This time and `now` are s on the event loop's clock.
         """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone

@@ -1,12 +1,12 @@
-"""The error budget of a drive: how large the odometry error by each single cause is.
+"""The error budget of a drive: the size of the odometry error that each single cause makes.
 
 The errors of one cause are propagated alone through the error model of the odometry
 (`core/motion/uncertainty.py`). The recorded drive is repeated until the robot has driven 100 m,
 which gives the position error. It is also repeated until the robot has turned by 360 deg to one
 side, which gives the heading error.
 
-The feedback lines show the errors of time, quantisation, gaps and contradicting wheels, and the
-gyro noise that the odometry assumes. These errors are measured for each step of the drive. All
+From the feedback lines, this module measures the errors of time, quantisation, gaps and
+contradicting wheels, and the gyro noise that the odometry assumes, for each step of the drive. All
 other errors are those that `[odometry]` declares.
 """
 
@@ -32,7 +32,7 @@ from acsard.core.values import REST, PoseCovariance
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""The source of an error's size: feedback lines, settings of `[odometry]`, or none."""
+"""The source of an error's size: the feedback lines, the settings of `[odometry]`, or none."""
 
 METRES = 100.0
 """Distance after which the position error is given, m."""
@@ -53,7 +53,7 @@ STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
 """A step of 0.05 m straight ahead and a step of 0.05 rad on the spot, both without errors.
 
-They replace the recorded steps if the robot stood.
+They replace the recorded steps if the robot stood still.
 """
 
 
@@ -61,17 +61,17 @@ NOISE = (
     "distance_variance_per_metre", "yaw_variance_per_metre", "yaw_variance_per_radian",
     "wheel_slip_std",
 )  # fmt: skip
-"""Settings of `[odometry]` for the errors by skidding."""
+"""Settings of `[odometry]` that state the errors due to skidding."""
 
 PARAMETERS = (
     "wheel_separation_multiplier_std", "left_wheel_radius_multiplier_std",
     "right_wheel_radius_multiplier_std", "wheel_radius_ratio_std", "distance_scale_std",
 )  # fmt: skip
-"""Settings of `[odometry]` for the errors of wheel radii and track."""
+"""Settings of `[odometry]` that state the errors of wheel radii and track."""
 
 
 class Share(Struct, frozen=True):
-    """The errors by one cause alone. An error is None if this drive does not show it."""
+    """The errors that one cause alone makes. An error is None if this drive does not show it."""
 
     cause: Cause
     mm_per_100_m: float | None
@@ -101,11 +101,11 @@ class Budget(Struct, frozen=True):
     quantum: float
     """Quantization step of the wheel speeds in feedback lines, rad/s."""
     counts: int
-    """Encoder counts per wheel turn, as feedback lines or the configuration show; 0 if unknown."""
+    """Encoder counts per wheel turn, from feedback lines or the configuration; 0 if unknown."""
     gyro: bool
     """True if the heading comes from a gyro."""
     still: bool
-    """True if the robot hardly moved. Only the errors that settings declare are given then."""
+    """True if the robot hardly moved. `shares` then contains only errors that settings declare."""
     at_rest: tuple[float, float]
     """Standard deviations (m/s, rad/s) of the twist because wheel speeds have two decimals."""
     shares: tuple[Share, ...]
@@ -155,7 +155,7 @@ class Received(Struct, frozen=True):
     sent: list[float]
     """Times at which the daemon sent lines to the microcontroller, s."""
     whole: bool = True
-    """True if `lines` has every feedback line that the daemon received."""
+    """True if `lines` contains every feedback line that the daemon received."""
     counted: bool = False
     """True if feedback lines carry encoder counts and the microcontroller's time."""
     gyro: bool = False
@@ -196,7 +196,7 @@ def budget(received: Received, config: Config, metres: float = METRES) -> Budget
 
 
 def _standing(received: Received, config: Config, model: _Model) -> Budget:
-    """Return the budget of a robot that stands, which follows from the settings alone."""
+    """Return the budget of a robot that stands still. It follows from the settings alone."""
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
@@ -218,7 +218,7 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
 
 
 def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
-    """Yield the errors by each cause alone.
+    """Yield the errors that each cause alone makes.
 
     `counts` are the encoder counts per wheel turn, 0 if unknown.
     """
@@ -277,7 +277,7 @@ class _Model:
         self, cause: Cause, basis: Basis, ahead: Steps, left: Steps, only: OdometryConfig,
         counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
-        """Return the errors by one cause.
+        """Return the errors that one cause makes.
 
         Args:
             cause: the name of the cause.

@@ -70,7 +70,7 @@ def parts(budget: Budget) -> Iterator[RenderableType]:
 def advice(budget: Budget) -> str:
     """Return advice on the largest measured cause.
 
-    If a cause by the settings is larger, the advice also covers that cause.
+    If a cause whose error the settings declare is larger, the advice also covers that cause.
     """
     if budget.still:
         return (

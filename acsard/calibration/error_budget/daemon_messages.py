@@ -33,13 +33,13 @@ MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 SHARE_COARSE = 0.1
-"""Fraction of feedback lines with the marks of coarse encoders above which the report says so."""
+"""Fraction of feedback lines with marks of coarse encoders, above which the report says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
 """Limits for the daemon's feedback lines that this program did not receive.
 
 They are a number and a fraction, and the larger one applies. A few lines are always missing,
-because the counters and the messages do not begin and end at the same moment.
+because the counters and the messages do not start and stop at the same moment.
 """
 
 SAMPLED = "checked with samples"
@@ -63,7 +63,7 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
 
 
 def _await_line(robot: Client, lines: Subscription) -> None:
-    """Wait for the first message of a feedback line. From then on, all of `KEYS` are published."""
+    """Wait for the first message on `lines`. From then on, the daemon publishes all of `KEYS`."""
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
@@ -112,7 +112,7 @@ class Feed:
             self._join(message.header.stamp.to_ns())
 
     def received(self, last: RobotState, diagnostics: DiagnosticArray) -> Received:
-        """Return the drive so far. `last` and `diagnostics` are the daemon's present values."""
+        """Return the drive so far. `last` and `diagnostics` are the daemon's latest messages."""
         learned, deviation, used = _learned(diagnostics)
         return Received(
             list(self._lines),
@@ -127,7 +127,7 @@ class Feed:
         )
 
     def _coarse(self, last: RobotState) -> bool:
-        """Return whether many feedback lines have the marks of coarse encoders of unknown counts.
+        """Return whether many feedback lines have marks of coarse encoders with unknown counts.
 
         `last` is the present state of the daemon.
         """

@@ -14,8 +14,8 @@ size. If a wheel passes through a value while it becomes faster or slower, the r
 errors of its first and second half cancel.
 
 Some firmware counts encoder edges in each period and reports multiples of the speed of one count.
-It counts an edge that it misses in one period in the next period. So only the rounding of the
-reported multiple to two decimals adds up, and this rounding error is known.
+If it misses an edge in one period, it counts that edge in the next period. Therefore only the
+rounding of the reported multiple to two decimals adds up, and this rounding error is known.
 
 `Driving` divides a drive into steps, each with the errors of one cause. An error that is
 independent from step to step is given as a variance. An error that has the same sign in each step
@@ -78,9 +78,9 @@ class LineTimes(Struct, frozen=True):
 def line_times(t: Floats, sent: Floats) -> LineTimes:
     """Estimate the delays of at least 3 feedback lines, and the lines that were lost.
 
-    `t` has the stamps of the feedback lines, and `sent` the times of the daemon's own lines, in s.
-    A board sends feedback lines at a fixed period, or one as the answer to each line of the daemon.
-    Both kinds are tried, and the estimate with the smaller delays is returned.
+    `t` contains the stamps of the feedback lines, and `sent` the times of the daemon's own lines,
+    in s. A board sends feedback lines at a fixed period, or one as the answer to each line of the
+    daemon. The function tries both, and returns the estimate with the smaller delays.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -109,7 +109,7 @@ def _even(t: Floats) -> LineTimes:
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
     """Estimate the delays of lines with the stamps `t`, s, if the board answers the daemon's lines.
 
-    `sent` has the times of the daemon's lines, s. Returns None if these times are too few.
+    `sent` contains the times of the daemon's lines, s. The result is None if they are too few.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -127,8 +127,8 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 def _missing(at: Floats) -> Counts:
     """Return the number of lines that were lost before each line.
 
-    `at` has the stamp of each line in periods, counted from the first line or from the daemon's
-    first line.
+    `at` contains the stamp of each line in periods, counted from the first line or from the
+    daemon's first line.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -157,7 +157,7 @@ columns of turn and time is above `ALIKE`, the fit cannot separate both.
 """
 
 LATEST_S = 0.1
-"""Limit, s, between the errors of stamps and gaps.
+"""Limit, s, that separates the errors of stamps from gaps.
 
 A stamp with a larger delay is not used as an error of a stamp. An interval of at least this length
 in which the pose did not move counts as a gap.
@@ -199,7 +199,7 @@ class Motion(Struct, frozen=True):
     yaw_variance: Floats | None
     """Variance that odometry added to the heading with time, rad2; None if it is unknown."""
     late: Floats
-    """Errors of the motion because of wrong stamps, rows of (m, rad)."""
+    """Errors of the motion due to wrong stamps, rows of (m, rad)."""
     lateness: float
     """RMS error of the stamps, s."""
     filled: Floats
@@ -221,7 +221,7 @@ class Motion(Struct, frozen=True):
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
     """Compute the motion of a drive of at least 3 feedback lines, and its errors.
 
-    `sent` has the times of the daemon's own lines, s. `whole` is true if this program received
+    `sent` contains the times of the daemon's own lines, s. `whole` is true if this program received
     every feedback line that the daemon received. If it is false, a missing line may have been lost
     between the daemon and this program, so it is not treated as a gap that the odometry filled.
     """
@@ -254,7 +254,7 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
     scale error of the gyro, S^2 A^2. S is the relative standard deviation of the scale, and A is
     the turn since the pose was set. A line with the turn dA adds 2 S^2 A dA, which is subtracted
     here. The turn before the first line is unknown, so a least-squares fit estimates it together
-    with the rate of growth. Returns None if the fit cannot separate turn and time.
+    with the rate of growth. The result is None if the fit cannot separate turn and time.
     """
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
@@ -272,9 +272,9 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
 
 
 def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
-    """Return the errors of the motion because of wrong stamps, rows of (m, rad).
+    """Return the errors of the motion due to wrong stamps, rows of (m, rad).
 
-    A wrong stamp changes the interval dt of a line, and so the distance, which is speed times dt.
+    A wrong stamp changes the interval dt of a line, and thus the distance, which is speed times dt.
     Summation by parts turns the sum of these errors into terms of one line each: minus the delay of
     the line times the change of the speed after it.
     """
@@ -292,8 +292,9 @@ def _gaps(
 ) -> tuple[Floats, Floats, int, float]:
     """Return `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
 
-    The variances come from the odometry's own model of gaps, `Gaps`. `twists` are by the reported
-    speeds, and `rolled` is the motion by the reported positions from each line to the next.
+    The variances come from the odometry's own model of gaps, `Gaps`. `twists` contains the twists
+    according to the reported speeds. `rolled` contains the motion from each line to the next,
+    according to the reported positions.
     """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0
@@ -339,9 +340,12 @@ class Rounding(Struct, frozen=True):
     """Rounding errors. Rows are feedback lines, columns are wheels in `values.WHEELS` order."""
 
     variance: Floats
-    """Variance of the angle that a wheel rolled in a line, rad2. The entries are independent."""
+    """Variance of the angle that a wheel rolled from line to line, rad2.
+
+    The entries are independent.
+    """
     offset: Floats
-    """Known error of the angle that a wheel rolled in a line, rad."""
+    """Known error of the angle that a wheel rolled from line to line, rad."""
     alike: Floats
     """Shape (4, 4): 1 for a pair of wheels with the same errors, otherwise 0."""
     quantum: float
@@ -353,7 +357,8 @@ class Rounding(Struct, frozen=True):
 def rounding(speeds: Floats, period: float) -> Rounding:
     """Estimate the rounding errors of wheel speeds, rad/s.
 
-    `speeds` has a row for each feedback line, which covers `period` s, and a column for each wheel.
+    `speeds` contains a row for each feedback line, which covers `period` s, and a column for each
+    wheel.
     """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
@@ -389,7 +394,7 @@ def _runs(values: Floats) -> Floats:
 
 
 def _quantum(speeds: Floats) -> float:
-    """Return the speed in rad/s of which all speeds are multiples, or 0 without such a speed."""
+    """Return the step, rad/s, of which all speeds are multiples, or 0 if there is none."""
     # A value that is repeated for a whole drive is no more evidence than a single one.
     seen = np.unique(np.abs(speeds[speeds != 0.0]))
     return quantization_step(seen) if len(seen) >= LEAST_VALUES else 0.0
@@ -411,7 +416,7 @@ class Steps(Struct, frozen=True):
     """Whether a gyro measured the turns. Otherwise the wheels did."""
 
     def to_the_left(self) -> Steps:
-        """Return the steps with all turns to the left. Missed turns change their sign with them."""
+        """Return the steps with all turns to the left, and their missed turns reversed as well."""
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
         return Steps(rows, self.by_gyro)
@@ -459,7 +464,7 @@ class Driving:
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return the steps with the rounding errors of lines, without the encoders' resolution."""
+        """Return the steps with the rounding errors of lines, not the encoders' resolution."""
         found = self._rounding
         if found.count:
             return self._steps(missed=self._of_wheels(found.offset[1:]))

@@ -1,13 +1,13 @@
 """Finds the quantization step of reported wheel speeds.
 
 A firmware may compute speeds from the encoder counts in each period T, s. It then reports only
-multiples of the step q = 2 pi / (N T), in two decimals, where N is the number of counts per wheel
-turn. The search finds the largest q of which nearly all speeds are multiples. It rejects a q that
-chance could have produced. Speeds that a filter has smoothed are not multiples of any step. A mean
+multiples of the step q = 2 pi / (N T), rounded to two decimals, where N is the number of counts per
+wheel turn. The search finds the largest q of which nearly all speeds are multiples. It rejects a q
+that fits only by chance. Speeds that a filter has smoothed are not multiples of any step. A mean
 over M periods has a step that is M times as fine.
 
-One of the largest speeds is V = j q for a whole number j. So the candidates for q are V / j for
-j = 1, 2 and so on.
+One of the largest speeds is V = j q for a whole number j. The candidates for q are therefore V / j
+for j = 1, 2 and so on.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def quantization_step(speeds: Floats) -> float:
         speeds: At least three different speeds above 0 in rising order, shape (n,).
     """
     spare = max(1, int(STRAYS * len(speeds)))
-    # The largest speed, without the few that need not be multiples of the step.
+    # The largest speed, apart from the few that need not be multiples of the step.
     anchor = float(speeds[-1 - spare])
     for part in range(1, int(anchor / FINEST) + 1):
-        # The anchor is rounded too, and each speed is off by its share of that.
+        # The anchor is rounded too, so each multiple is off in proportion to its size.
         if _strays(speeds, anchor / part, ROUNDING / anchor) <= spare:
             step = _fitted(speeds, anchor / part, spare, part)
             if step:
@@ -78,7 +78,7 @@ def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
     if not squares:
         return 0.0
     step, deviation = float(whole @ speeds[near]) / squares, DEVIATION / math.sqrt(squares)
-    # A multiple is off by the step's error times the factor.
+    # A multiple of the step is off by the step's error times the factor of the multiple.
     if step < FINEST or _strays(speeds, step, 4 * deviation / step) > spare:
         return 0.0
     by_chance = tries * (FINEST / step) ** (len(np.unique(whole)) - 1)

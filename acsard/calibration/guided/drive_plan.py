@@ -1,12 +1,12 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
 A method of calibration consists of questions to ask first and legs to drive in order. `methods.py`
-has the table of the methods, and `runner.py` leads a person through one of them. The command line
-and the page import this module to name the methods, so it does not load numpy.
+contains the table of the methods, and `runner.py` leads a person through one of them. The command
+line and the page import this module to name the methods, so it does not load numpy.
 
 The robot stays within its limits and on a floor of 3 m x 3 m. The angle that it turns for a command
-is not known before the calibration. So the plan must work for an effective track of 1 to 2.5 times
-the wheel separation. Each drive takes one of these forms, so that it still stays on the floor:
+is not known before the calibration. The plan must therefore work for an effective track of 1 to 2.5
+times the wheel separation. Each drive stays on the floor because it has one of these forms:
 
 - It goes there and back.
 - It follows a line that a person set the robot on.
@@ -50,7 +50,7 @@ class GuideError(AcsardError):
 
 
 class DisturbedError(GuideError):
-    """A leg was cut short for a reason that may not occur again, so the leg can be repeated."""
+    """A leg was cut short for a temporary reason, so the leg can be repeated."""
 
     def __init__(self, why: str, text: str) -> None:
         """Store the reason `why`. `text` is the whole message if the leg is not repeated."""
@@ -77,7 +77,7 @@ Quantity = Literal["turned", "angle", "distance", "ahead", "aside"]
 """The quantity that a tape reading gives about the robot's motion since its last known pose.
 
 - `turned`: the turn in rad, positive to the left, including whole turns.
-- `angle`: the turn in rad, positive to the left, of which whole turns are unknown.
+- `angle`: the turn in rad, positive to the left, with an unknown number of whole turns.
 - `distance`: the straight-line distance in m.
 - `ahead`, `aside`: the displacement in m, along the first heading and to the left of it.
 """
@@ -98,7 +98,7 @@ class Mean(Struct, frozen=True):
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn by the distances of two points of the robot from a line."""
+    """A measurement of the robot's turn, from the distances of two of its points from a line."""
 
     quantity: Quantity
     near: str
@@ -194,9 +194,9 @@ class Setup(Struct, frozen=True):
     wheel: float
     """Largest rolling speed of the wheels in a turn, m/s."""
     odometry: OdometryConfig = OdometryConfig()
-    """The present noise of the odometry."""
+    """The configured noise of the odometry."""
     feedback: FeedbackConfig = FeedbackConfig()
-    """The present response time of the wheels."""
+    """The configured response time of the wheels."""
 
     @property
     def from_edge(self) -> float:
@@ -230,7 +230,7 @@ class Setup(Struct, frozen=True):
         return Move(straight.seconds, straight.linear, self.command(rate))
 
     def turn(self, angle: float, rate: float, track: float) -> Move:
-        """Return a turn on the spot by the true angle, which takes account of skidding.
+        """Return a turn on the spot by a true angle. The command makes up for skidding.
 
         Args:
             angle: the true angle in rad, positive to the left.
@@ -255,7 +255,7 @@ class Setup(Struct, frozen=True):
         """Turn rate without skidding, rad/s, for an angular command of 1 rad/s.
 
         The daemon computes the wheel speeds of a command with the configured multipliers. The turn
-        rate is the one that these wheels cause by the radius and the separation alone.
+        rate follows from these wheel speeds, the radius and the separation, without multipliers.
         """
         bare = replace(
             self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
@@ -275,8 +275,8 @@ measurement shows that ratio, so the legs up to this measurement are the same fo
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is computed.
 
-Computing it for the largest ratio alone is not enough: with a smaller one, more whole turns fit
-into the time allowed, so that the drive can take longer.
+The largest ratio alone is not enough: with a smaller ratio, more whole turns fit into the time
+allowed, so the drive can take longer.
 """
 
 

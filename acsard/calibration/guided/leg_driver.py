@@ -1,8 +1,8 @@
 """Drives one leg: decides the commands from the daemon's messages and from key presses.
 
 The driver goes through the phases of `Phase`. It commands zero until the daemon accepts its
-commands, then each move of the leg for its duration, then zero until the wheels stand. An
-unexpected condition halts the leg for good. `LegDriver.halted` then has the reason.
+commands, then each move of the leg for its duration, then zero until the wheels stand still. An
+unexpected condition halts the leg for good. `LegDriver.halted` then contains the reason.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Phase(StrEnum):
     """The driver commands zero until the daemon accepts its commands."""
     MOVING = "moving"
     SETTLING = "settling"
-    """The driver commands zero until the wheels stand."""
+    """The driver commands zero until the wheels stand still."""
     DONE = "done"
     HALTED = "halted"
 
@@ -64,7 +64,7 @@ class LegDriver:
         self.halted = ""
         """The reason why the leg was cut short, or ""."""
         self.disturbed = False
-        """Whether the reason in `halted` may not occur again, so that the leg can be repeated."""
+        """Whether the reason in `halted` is temporary, so that the leg can be repeated."""
         self.silent = False
         """Whether the leg was halted because nothing was received from the daemon.
 
@@ -96,9 +96,9 @@ class LegDriver:
     def key(self, pressed: str, now: float) -> None:
         """Handle a key press.
 
-        If the leg has `by_key` set, a key ends its last move, and keys are ignored while the wheels
-        then come to rest. At any other time a key halts the leg. Enter is ignored in phase OPENING,
-        because the person who started the leg with Enter may still hold the key.
+        If the leg has `by_key` set, a key ends its last move, and further keys are ignored while
+        the wheels come to rest. At any other time a key halts the leg. Enter is ignored in phase
+        OPENING, because the person who started the leg with Enter may still hold the key.
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
@@ -140,9 +140,9 @@ class LegDriver:
     def step(self, now: float) -> Twist:
         """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
-        # After a pause of this process, it is unknown whether the daemon was silent. The robot has
-        # braked meanwhile, and the time of a move may be over. The next move would then begin at
-        # the wrong place.
+        # After a pause of this process, it is unknown whether the daemon was silent. During the
+        # pause the robot has braked, and the time of the move may have run out. The next move would
+        # then begin at the wrong place.
         if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
             self._halt(HELD_UP, disturbed=True)
         elif now - self._received > QUIET_S:
@@ -198,8 +198,8 @@ class LegDriver:
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
         """Halt the leg if an objection lasts for `DEVIATES_S`.
 
-        A shorter one is tolerated: a computer that is busy for a moment sends its commands late,
-        and the robot slows down meanwhile.
+        A shorter objection is tolerated: if this computer is busy for a moment, it sends its
+        commands late, and the robot only slows down.
 
         Args:
             why: the present objection, or "" if there is none.
@@ -214,7 +214,7 @@ class LegDriver:
             self._halt(why, disturbed=disturbed)
 
     def _objection(self, state: RobotState) -> str:
-        """Return why the daemon does not follow the commands of this leg, or ""."""
+        """Return why the daemon does not follow the commands of this leg, or "" if it does."""
         if why := objection(state, self._source, self._sender):
             return why
         # A source with a long timeout still drives the robot after its commands stop arriving.
@@ -224,9 +224,9 @@ class LegDriver:
         return ""
 
     def _deviation(self, state: RobotState, now: float) -> str:
-        """Return a sentence about how the wheels deviate from the command, or "".
+        """Return a sentence about how the wheels deviate from the command, or "" if they do not.
 
-        The turn rate by a gyro is not compared. If the wheels skid, the robot turns less than
+        The turn rate of a gyro is not compared. If the wheels skid, the robot turns less than
         commanded although the wheels follow the command.
         """
         if now - self._changed < OBEYED_S:

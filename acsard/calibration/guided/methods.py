@@ -27,7 +27,10 @@ from acsard.calibration.multipliers import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
-"""Standard deviation of the length of the straight drive by tape, m, both ends included."""
+"""Standard deviation, m, of the length of the straight drive that a person measures by tape.
+
+It includes the errors at both ends.
+"""
 
 BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
@@ -44,7 +47,7 @@ FIRST_TURN = 1.2
 MISSED = 1.1
 """Timeout of the first turn, as a multiple of the time that a turn takes with the widest track.
 
-If it expires, the person has missed the moment at which the circle was full.
+If it expires, the person has missed the moment at which the circle was complete.
 """
 
 MOST_SPIN_S = 24.0
@@ -73,8 +76,8 @@ def _at_the_edge(setup: Setup) -> str:
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
     """Return the leg of one turn to the left on the spot, which the person ends with a key.
 
-    `until` says when to press the key; it completes the instruction "Press SPACE ...". `asks` are
-    the questions after the turn, and `measures` the measurements that the answers give.
+    `until` says when to press the key; it completes the instruction "Press SPACE ...". `asks`
+    contains the questions after the turn, and `measures` the measurements from the answers.
     """
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
@@ -150,7 +153,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
     )
 
 
-# The method "wall": a tape measure, and a wall that a person sets the robot's back against.
+# The method "wall": a tape measure, and a wall against which a person sets the robot's back.
 
 GAP_M = 0.2
 """Distance from the wall at which the robot stops when it returns, m."""
@@ -318,7 +321,7 @@ for positions (rad), as it would be without skidding.
 """
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Pairs of rates, rad/s, of a turn on the spot and of the curve after it.
+"""Pairs of turn rates, rad/s: that of a turn on the spot, and that of the curve after it.
 
 The robot would have these rates without skidding.
 """
@@ -383,7 +386,7 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve there and back, which stays on the floor for any heading of the robot.
+    """Return a curve there and back. It stays on the floor whatever the heading of the robot is.
 
     `rate` is the turn rate that the robot would have without skidding, rad/s.
     """

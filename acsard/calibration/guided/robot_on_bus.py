@@ -2,9 +2,9 @@
 
 `leg_driver.py` decides which command to send. `Recorder` keeps the samples of a leg in the same
 form as a log. Each sender stamps its messages with its own clock, or not at all, and the clocks
-need not agree. So the stamps of a key are used only for the intervals between its samples. The
-sample of a key with the smallest delay from stamp to arrival is assumed to have arrived without
-delay. The fit finds the delays that remain.
+need not agree. The stamps of a key therefore show only the intervals between its samples. The
+recorder assumes that the sample of a key with the smallest delay from stamp to arrival arrived
+without delay. The fit finds the delays that remain.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ SHOWN_S = 0.2
 RETURNS_S = 3.0
 """Time within which a silent daemon must send its state again, s.
 
-If the daemon does, its computer was only too busy to run it, and the leg can be repeated.
+If it does, its computer was only too busy to run it, and the leg can be repeated.
 """
 
 POSITIONS = (Odometry, PoseStamped)
 """Types of a position message, in the order in which they are tried.
 
-A CDR payload does not name its type. To decode a pose as odometry fails, because a pose is shorter.
+A CDR payload does not name its type. Decoding a pose as odometry fails, because a pose is shorter.
 """
 
 Take = Callable[[Any, float], object]
@@ -117,9 +117,9 @@ class Sample(Struct, frozen=True):
     """The values of one message, with its time of arrival and its stamp."""
 
     came: float
-    """Time of arrival by this computer's clock, s."""
+    """Time of arrival on this computer's clock, s."""
     made: float | None
-    """Stamp by the sender's clock, s; None if the message has no stamp."""
+    """Stamp of the sender's clock, s; None if the message has no stamp."""
     values: tuple[float, ...]
     """Values of the columns that `STREAMS` lists for the source."""
 
@@ -127,8 +127,8 @@ class Sample(Struct, frozen=True):
 class Recorder:
     """Collects the samples of one leg.
 
-    `joints` has the names of the wheel joints: front right, front left, rear left, rear right. Each
-    `came` is the time of arrival of a message, s.
+    `joints` contains the names of the wheel joints: front right, front left, rear left, rear right.
+    In all methods, `came` is the time of arrival of the message, s.
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
@@ -146,7 +146,7 @@ class Recorder:
         self._add("gyro", message.header.stamp, came, (message.angular_velocity.z,))
 
     def place(self, message: PoseStamped | Odometry, came: float) -> None:
-        """Add a position. Its heading, if it has one, is ignored."""
+        """Add a position. The heading of the message is ignored."""
         pose = message.pose if isinstance(message, PoseStamped) else message.pose.pose
         spot = pose.position
         self._add("places", message.header.stamp, came, (spot.x, spot.y))
@@ -175,7 +175,7 @@ class Recorder:
 
 
 def times(samples: Sequence[Sample]) -> Floats:
-    """Return the times of samples by this computer's clock, s.
+    """Return the times of samples on this computer's clock, s.
 
     If a sample has no stamp, they are the times of arrival.
     """
@@ -288,5 +288,5 @@ class RobotOnBus:
         self._watch.look(time.monotonic())
 
     def _full(self, key: str) -> str:
-        """Return the full key: one that `acsard topics` lists gets this robot's id in front."""
+        """Return the key, with this robot's id in front if `acsard topics` lists the key."""
         return self._client.key(key) if by_key(key) is not None else key

@@ -34,17 +34,18 @@ MOST_REPEATS = 2
 MOST_SIMULATED_REPEATS = 20
 """Maximum number of times that a disturbed leg is repeated on the simulator.
 
-There the floor has no limits, and nobody has to set the robot back.
+There the floor has no limits, and no person has to set the robot back.
 """
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
     """Return the index of the leg from which the drive goes on after a disturbance.
 
-    A sensor measures each leg alone, so only the disturbed leg is repeated. The tape readings after
-    one placement of the robot belong together, so the drive goes back to the leg for which a person
-    placed the robot. There is one exception: a leg whose turn is measured from the robot's angle
-    after an earlier leg is repeated alone. The person then measures that angle again.
+    A sensor measures each leg alone, so it needs only the disturbed leg again. Tape readings after
+    one placement of the robot belong together, so the drive goes back to the leg for which the
+    person placed the robot. There is one exception: if the turn of a leg is measured from the
+    robot's angle after an earlier leg, that leg is repeated alone, and the person measures the
+    angle again.
 
     Args:
         legs: the legs of the method.
@@ -57,10 +58,10 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 
 
 def angle_before(leg: Leg) -> str:
-    """Return the name of the earlier leg after which the angle was measured that this leg needs.
+    """Return the name of the earlier leg whose final angle is the start of this leg's turn.
 
-    The turn of this leg is measured from that angle. The name is "" if the measurements of this leg
-    need no such angle, or if they cover several legs.
+    The person measured the robot's angle after that earlier leg. The name is "" if the measurements
+    of `leg` need no such angle, or if they cover several legs.
     """
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")

@@ -38,10 +38,10 @@ from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 
 SKIDDING = 0.015
-"""Standard deviation of the heading by skidding, rad for each square root of a metre of rolling."""
+"""Standard deviation of the heading due to skidding, rad per square root of a rolled metre."""
 
 SKIDDING_LENGTH = 0.002
-"""Standard deviation of a distance by skidding, as a fraction of the distance."""
+"""Standard deviation of a distance due to skidding, as a fraction of the distance."""
 
 UNKNOWN = 1.0
 """Prior standard deviation of the mean radius, as a fraction."""
@@ -82,7 +82,7 @@ class Reading(Struct, frozen=True, dict=True):
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return the measured minus the predicted value; of an `angle`, without whole turns."""
+        """Return the measured minus the predicted value, for an `angle` without whole turns."""
         off = self.value - prediction
         return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
@@ -94,7 +94,7 @@ class Predicted(Struct, frozen=True):
     derivatives: Floats
     """Derivatives of the value with respect to the parameters, shape (COUNT,)."""
     variance: float
-    """Variance of the value by skidding, rad2 or m2."""
+    """Variance of the value due to skidding, rad2 or m2."""
 
 
 class TapeFit(Struct, frozen=True):
@@ -105,7 +105,7 @@ class TapeFit(Struct, frozen=True):
     residuals: Floats
     """Measured minus predicted value of each reading."""
     held_out: Floats
-    """Measured minus predicted value of each reading, by a fit to all other readings.
+    """Measured minus predicted value of each reading, predicted by a fit to all other readings.
 
     It is NaN if that fit fails.
     """
@@ -196,8 +196,8 @@ def _compared(
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
     """Return the parameters that fit the readings best, and the normal equations of this fit.
 
-    `start` has the parameters from which the search starts. Raises `RefusedError` if the readings
-    do not determine the parameters.
+    `start` contains the parameters from which the search starts. Raises `RefusedError` if the
+    readings do not determine the parameters.
     """
     parameters, configured = start.copy(), base.start()
     for _ in range(MOST_STEPS):
@@ -240,7 +240,7 @@ def _held_out_residual(
 
 
 READ_M = 0.002
-"""Standard deviation of a measured distance, and of a robot placed on a line by hand, m."""
+"""Standard deviation of a measured distance, and of a robot's place on a line, set by hand, m."""
 
 CREDIBLE = 0.85, 3.0
 """Range of credible ratios of effective track to wheel separation.
@@ -331,7 +331,7 @@ straight. The heading error of a drive in between is not reported.
 def calibrated(
     tool: str, readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
 ) -> Calibration:
-    """Return the calibration by tape readings.
+    """Return the calibration from tape readings.
 
     `tool` names the measuring tool, such as "a tape". Raises `RefusedError` if the readings
     contradict each other or are too inaccurate.
@@ -339,7 +339,8 @@ def calibrated(
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
     fit = fit_readings(readings, base)
-    # No gyro is compared, so the blocks only have to be short enough to show the turn rates.
+    # The rows are not compared with a gyro, so the blocks only have to be short enough to show the
+    # turn rates.
     rows = heading.rows(None, rides, blocks(rides, 4.0))
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)

@@ -1,1 +1,4 @@
-"""Decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix; pure."""
+"""Decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix.
+
+The package does no input or output.
+"""

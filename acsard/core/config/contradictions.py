@@ -363,4 +363,5 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""The rules. Each is a separate function, because a rule that reads an invalid key is skipped."""
+"""The rules. Each is a separate function, so that an invalid key skips only the rules that read
+it."""

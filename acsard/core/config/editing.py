@@ -62,10 +62,10 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Change a list in place and return True, so that the comments in it stay.
+    """Try to change a list in place to the new value, so that the comments in it stay.
 
-    The list then lacks the items that are not in the new value, and has its new ones at the end.
-    Return False if that is not the new value.
+    The function removes the items that are not in `value`, and appends the items that are new.
+    Return True if the list then equals `value`. Otherwise return False.
     """
     from tomlkit.items import Array
 
@@ -82,13 +82,14 @@ def _adjusted(array: object, value: object) -> bool:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert the new keys of tables that the text writes as dotted keys, such as `mcu.port = ...`.
+    """Insert the new keys of all tables that the text writes as dotted keys.
 
-    They are inserted as dotted keys as well. tomlkit would insert a table header in the middle of
-    the dotted keys.
+    An example of a dotted key is `mcu.port = ...`. The new keys are dotted keys as well. This
+    function inserts them, because tomlkit would insert a table header in the middle of the dotted
+    keys.
 
     Returns:
-        The text with the inserted keys, and the settings that it does not have yet.
+        The text with the inserted keys, and the settings that were not inserted.
     """
     import tomlkit
 

@@ -81,7 +81,7 @@ LIVE: dict[str, Live] = {
     "rates.diagnostics": Live("always", "how often diagnostics are published"),
     "log.level": Live("always", "lowest level that is logged"),
 }
-"""The settings by their dotted keys as in `acsard.toml`.
+"""The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`.
 
 The name of a source stands in place of its index, and "*" stands for every source.
 """
@@ -100,7 +100,7 @@ def live(key: str) -> Live | None:
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
     """Yield the dotted name and the value of each key in nested tables.
 
-    The name of a table in a list, such as a source, has the value of its key `name` in place of its
+    A table in a list, such as a source, is named by the value of its key `name` and not by its
     index. `name` is the dotted name of `value` itself, "" for the whole configuration.
     """
     if isinstance(value, Mapping):
@@ -154,7 +154,8 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
         at_rest: whether the robot stands.
 
     Raises:
-        ConfigError: the change is not allowed, so no setting is changed. The error has the reasons.
+        ConfigError: the change is not allowed, so no setting is changed. The error gives the
+        reasons.
     """
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))
@@ -208,7 +209,7 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    """Return why this change is allowed only while the robot stands, or "" if it always is."""
+    """Return why this change must wait until the robot stands, or "" if it need not wait."""
     row = live(key)
     if row is None or row.when == "always":
         return ""

@@ -1,4 +1,4 @@
-"""Keeps limits that `acsard set` has lowered, even if the daemon restarts.
+"""Keeps the limits that `acsard set` has lowered, even if the daemon restarts.
 
 A limit is lowered if its value is below that in the configuration file. Lowered decelerations are
 not kept, because a robot with a lower deceleration brakes more softly, which is not safer. A jerk
@@ -36,10 +36,10 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
     """Return the configuration with the limits that were lowered before the restart, and events.
 
-    `kept` has these limits by dotted key. A limit is applied only if it is below that of `config`.
-    Together, the limits may contradict the configuration if the file has changed. Then they are
-    applied one by one, and each limit that contradicts it is dropped. The events report the limits
-    that are applied and dropped.
+    `kept` contains these limits by dotted key. A limit is applied only if it is below that of
+    `config`. If the file has changed since then, the limits together may contradict it. Then they
+    are applied one by one, and each limit that contradicts the file is dropped. The events report
+    the limits that are applied and dropped.
     """
     limits = config.limits
     wishes: dict[str, object] = {

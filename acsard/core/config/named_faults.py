@@ -1,7 +1,8 @@
 """Reads the names of the simulator's faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
 
-It holds the tables of the names, and finds mistakes in `[sim] faults`. Methods with the same
-names in `core/simulator/faults.py` produce the faults.
+The module contains the tables of the names, and finds mistakes in `[sim] faults`. The methods that
+produce the faults have the same names. They are in `core/simulator/faults.py` and
+`core/simulator/fake_mcu.py`.
 """
 
 from __future__ import annotations

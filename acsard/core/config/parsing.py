@@ -20,7 +20,7 @@ MAX_BYTES = 65536
 
 
 class ConfigError(AcsardError):
-    """The configuration cannot be used. `problems` has a line with each mistake and its fix."""
+    """The configuration cannot be used. `problems` lists each mistake with its fix."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
@@ -30,8 +30,8 @@ class ConfigError(AcsardError):
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
     """Return the configuration in the bytes of a file. Raises `ConfigError` with every mistake.
 
-    `overrides` has values from the command line, by table and key. They replace the values of the
-    file.
+    `overrides` contains values from the command line, by table and key. They replace the values of
+    the file.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(

@@ -23,7 +23,7 @@ class InvalidKeyError(AcsardError):
 def view_without(config: Config, invalid: Set[str]) -> Config:
     """Return a view of `config` that raises `InvalidKeyError` if an invalid key is read.
 
-    `invalid` has the dotted names of the invalid keys.
+    `invalid` contains the dotted names of the invalid keys.
     """
     return cast(Config, _View(config, "", invalid)) if invalid else config
 

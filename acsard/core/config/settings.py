@@ -315,7 +315,7 @@ class RatesConfig(Struct, frozen=True):
 
 
 TLS = "tls/"
-"""Prefix of endpoints that present a certificate and require one."""
+"""Prefix of endpoints with TLS, which present a certificate and require one from the client."""
 
 
 class BusConfig(Struct, frozen=True):

@@ -16,7 +16,7 @@ CHECK_BYTES = 8
 SAMPLE_BYTES = 21
 """Length of `@` and the five sample fields of a reply, bytes.
 
-A command that requests these fields has one more letter.
+A command that requests these fields is one letter longer.
 """
 
 STATUS_BYTES = 28
@@ -27,13 +27,13 @@ STATUS_HZ = 10
 """Rate at which a board sends status lines, Hz."""
 
 FIELD = 65536
-"""Number of values of a sample field. It has four hexadecimal digits, and FFFF wraps to 0."""
+"""Number of values of a sample field, which has four hexadecimal digits. FFFF wraps to 0."""
 
 COMFORTABLE_USE = 0.8
 """Largest comfortable use of the wire, as a share of its capacity.
 
-Above it, a line that is a little late delays the next one. The rest of the capacity also has room
-for boards that send a space after each comma, so that a reply is 9 % longer (36 bytes).
+Above it, a line that is a little late delays the next one. The rest of the capacity also leaves
+room for boards that send a space after each comma, which makes a reply 9 % longer (36 bytes).
 """
 
 
@@ -47,8 +47,8 @@ def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) 
 
     Args:
         trailing_comma: whether commands end with a comma.
-        check: whether lines have a sequence number and a checksum.
-        sample: whether replies have sample fields.
+        check: whether lines contain a sequence number and a checksum.
+        sample: whether replies contain sample fields.
     """
     checked = PLAIN_BYTES + (CHECK_BYTES if check else 0)
     return max(checked + trailing_comma + sample, checked + (SAMPLE_BYTES if sample else 0))

@@ -20,7 +20,7 @@ from acsard.core.values import Event, RoutersStatus
 
 
 class BusInput(Struct, frozen=True):
-    """Input from the bus since the last call."""
+    """Input from the bus since the last call of `Bus.take`."""
 
     arrivals: tuple[Arrival, ...] = ()
     queries: tuple[Query, ...] = ()
@@ -41,7 +41,7 @@ NOTHING = BusInput()
 
 
 class Waker(Protocol):
-    """Wakes the control loop. The bus calls these methods on any thread."""
+    """Wakes the control loop. The bus may call these methods from any thread."""
 
     def command(self) -> None:
         """Wake the control loop because a sample has arrived that may be a command."""
@@ -60,15 +60,15 @@ class Bus(Protocol):
     def take(self, queries: int) -> BusInput:
         """Return the input since the last call, with at most `queries` queries.
 
-        There may be one more if all of these are service calls and a slow query waits. The other
-        queries wait for the next call.
+        There may be one more query if all of these are service calls and a slow query waits. The
+        other queries wait for the next call.
         """
 
     def publish(self, key: str, message: Message) -> None:
         """Queue a message for the subscribers of `key`. `flush` sends it."""
 
     def flush(self) -> None:
-        """Start to send the queued messages, without waiting for the end."""
+        """Start to send the queued messages, and do not wait until they are sent."""
 
     def reply(self, reply: Reply) -> None:
         """Reply to the query that holds the ticket `reply.ticket`."""

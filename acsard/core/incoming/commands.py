@@ -4,7 +4,7 @@ The whole sample is refused for each of these reasons:
 
 - The payload cannot be decoded or is too big.
 - A field that the daemon reads is NaN or infinity.
-- The key has a wildcard.
+- The key contains a wildcard.
 - The sample is a DELETE.
 - The sender id belongs to another certificate.
 
@@ -46,11 +46,12 @@ from acsard.core.values import Twist as BodyTwist
 BOUND_NS = 60 * NS_PER_S
 """Silence after which a sender may use another certificate, ns.
 
-It is needed because a program with a fixed id may move from the robot to a laptop.
+It must be able to do so, because a program with a fixed id may move from the robot to a laptop.
 """
 
 MAX_BOUND = 1024
-"""Largest number of senders that are remembered. The one with the oldest command is forgotten."""
+"""Largest number of senders that are remembered. With one more, the sender with the oldest command
+is forgotten."""
 
 
 class Bindings:
@@ -59,8 +60,8 @@ class Bindings:
     One id with two certificates is a mistake or a stolen secret. The daemon refuses the second
     certificate while the sender with the first one keeps commanding.
 
-    Only native keys name a certificate. A sender that commands on a ROS key is not bound, and its
-    public name never equals that of a native sender.
+    Only acsard's own (native) keys name a certificate. A sender that commands on a ROS key is not
+    bound, and its public name never equals that of a native sender.
     """
 
     def __init__(self) -> None:
@@ -87,13 +88,15 @@ class Bindings:
 
 
 MAX_COMMAND_BYTES = 4096
-"""Largest payload in bytes. A TwistStamped has less than 300 bytes as JSON."""
+"""Largest payload in bytes. A TwistStamped in JSON is shorter than 300 bytes."""
 
 REPLACED_NS = NS_PER_S // 2
-"""If a timestamp is ahead of the daemon's clock by more than this, Zenoh replaces it, ns."""
+"""Largest time by which a timestamp may be ahead of the daemon's clock, ns. Zenoh replaces a
+timestamp that is further ahead."""
 
 Via = Literal["native"] | Transport
-"""The tree of keys on which a sample or query arrived: acsard's own, or that of a transport."""
+"""The tree of keys on which a sample or query arrived: acsard's own, or that of a ROS
+transport."""
 
 
 class Arrival(Struct, frozen=True):
@@ -137,7 +140,8 @@ If the Encoding names no type, only the size distinguishes the two.
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
-"""Type names that an Encoding may have for a Twist and for a TwistStamped."""
+"""The type names that an Encoding may contain: `TWISTS` for a Twist, `STAMPED_TWISTS` for a
+TwistStamped."""
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
@@ -295,7 +299,8 @@ class Identity(Struct, frozen=True):
     command on a native key with a sender id."""
 
 
-# Each command needs the parts of its key twice, and few different keys carry commands.
+# The results are cached, because each command needs the parts of its key twice, and few different
+# keys carry commands.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
     """Return the kind, the source and the certificate in a command's key, "" for a missing part."""
@@ -352,7 +357,7 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def sender(arrival: Arrival) -> str:
-    """Return the public name of a sample's sender, "" for a rmw_zenoh sample without a GID."""
+    """Return the public name of a sample's sender, "" for an rmw_zenoh sample without a GID."""
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
         # A shorter GID could look like the public name of a native sender.

@@ -74,7 +74,7 @@ class Query(Struct, frozen=True):
     ticket: int
     """The number with which replies name the query."""
     topic: str
-    """The key of the row of the topic table that the query matches."""
+    """The key of the row that the query matches in the topic table."""
     asked: str
     """The key expression of the query, without `acsard/<id>/` if it begins with exactly that."""
     fmt: str
@@ -247,8 +247,8 @@ class Queries:
     def _matches(self, query: Query, key: str) -> bool:
         """Return whether the key expression of a query includes a key below `acsard/<id>/`.
 
-        If the client's expression begins with exactly these two chunks, `query.asked` does not have
-        them. Otherwise it is the complete expression, for example `acsard/*/info`.
+        If the client's expression begins with exactly these two chunks, `query.asked` omits
+        them. Otherwise `query.asked` is the complete expression, for example `acsard/*/info`.
         """
         if "*" not in query.asked:
             return query.asked == key
@@ -275,7 +275,7 @@ def includes(expression: str, key: str) -> bool:
 def _fits(pattern: str, chunk: str) -> bool:
     """Return whether `pattern`, a chunk of a key expression, includes a chunk of a key.
 
-    The pattern may be `*`, or have `$*` for any characters.
+    The pattern may be `*`, or contain `$*`, which matches any characters.
     """
     if pattern == "*":
         return True
@@ -315,14 +315,15 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
 
 
 def most_bytes(topic: str) -> int:
-    """Return the size in bytes above which the payload of a query is refused."""
+    """Return the largest allowed payload of a query for the key `topic`, bytes."""
     return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment of a reply, from which rmw_zenoh knows the request.
+    """Return the attachment of a reply, by which rmw_zenoh matches the reply with its request.
 
-    `asked` is the attachment of the request. If it is None, the reply has no attachment.
+    `asked` is the attachment of the request. If it is None, the reply has no attachment. `wall_ns`
+    is the wall-clock time of the reply, ns.
     """
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 

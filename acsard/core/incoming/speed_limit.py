@@ -1,6 +1,6 @@
 """Lowers the robot's highest speed to that of a nav2_msgs/SpeedLimit on the key `speed_limit`.
 
-A speed limit never raises a speed. The robot's `limits.linear_speed` is the lower one of two:
+A speed limit never raises a speed. The robot's `limits.linear_speed` is the lower of two values:
 
 - the *setting*: the value in the configuration, or the value of the last `set`.
 - the limit in the last message, in m/s. A message with 0.0 lifts the limit.
@@ -8,7 +8,7 @@ A speed limit never raises a speed. The robot's `limits.linear_speed` is the low
 The robot itself does not know speed limits. This module turns a message into a request like that of
 a client's `set`. While a limit is in force, a client's `set` is checked against the settings
 without the limit, because they apply again when the limit is lifted. The robot then gets the
-client's value or the limit, whichever is lower. So no control step drives faster than either.
+client's value or the limit, whichever is lower. So no control step exceeds either of them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PAUSE_NS = NS_PER_S // 10
 """Least time between two changes of the limit, ns.
 
 Each change builds the whole configuration again, so a flood of messages would delay the control
-loop. Meanwhile the newest message waits.
+loop. Until the time has passed, the newest message waits.
 """
 
 LIFTED = 0.0
@@ -102,15 +102,21 @@ class SpeedLimiter:
         """The newest message that has not been applied yet."""
         self._changed_ns = 0
         self._robot = self._settings = config
-        """The robot's configuration, and the same configuration without the speed limit."""
+        """`_robot` is the robot's configuration, and `_settings` that without the speed limit."""
         self._asked: tuple[Request, float] | None = None
         """The client's `set` of the speed in this step, and the speed that it asks for, m/s."""
         self._held: list[Request] = []
-        """The `set` requests that wait for the next step, until the first one is settled."""
+        """The `set` requests that wait for the next step.
+
+        While a limit is in force, a step takes only one of them.
+        """
 
     @property
     def settings(self) -> Config:
-        """The configuration in force without the speed limit; the same object until it changes."""
+        """The configuration that applies without the speed limit.
+
+        It is the same object until one of its settings changes.
+        """
         return self._settings
 
     @property
@@ -183,7 +189,7 @@ class SpeedLimiter:
         return replace(request, settings=request.settings | {SETTING: self._limit.speed})
 
     def _own(self, now_ns: int) -> tuple[Request, ...]:
-        """Return the request that makes the robot obey the newest message, or () for none."""
+        """Return the request that makes the robot obey the newest message, or () if none is due."""
         if self._waiting is None or now_ns - self._changed_ns < PAUSE_NS:
             return ()
         new, self._waiting = self._waiting, None

@@ -1,16 +1,18 @@
-"""Decodes the status line, with which a board reports its inputs and its supply.
+"""Decodes the board's status line: emergency stop, bumpers, motor driver, battery, temperature.
 
     !status estop=ok bumpers=..X. driver=ok volts=24.31 amps=-1.20 charge=87% temp=41.5*HHHH
 
 Every field is optional. The fields may come in any order, and each at most once. The board sends
 the line in addition to its replies, never instead of one. So the line says nothing about the speeds
 and does not count as a reply. Decoding is strict: one invalid field makes the whole line invalid.
-The forms of the values make damage visible:
+The format of the values makes damage detectable:
 
-- The words of an input differ in many bits, so no small damage turns `pressed` into `ok`.
-- Each number has a fixed number of decimals or ends with `%`, so a number that was cut is refused.
+- The two words of an input, such as `pressed` and `ok`, differ in many bits. So a few flipped bits
+  cannot turn one word into the other.
+- Each number has a fixed number of decimals or ends with `%`, so a truncated number is refused.
 
-After `*` comes the CRC-16/XMODEM of everything before it. A checked link requires it.
+After `*` comes the CRC-16/XMODEM of everything before it. It may be omitted, except on a checked
+link, where all lines have a checksum.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from acsard.core.link.codec import FrameError
 STATUS = b"!status"
 """First bytes of every status line.
 
-A reply begins with a letter, and the line in which a board identifies itself with `!acsard-mcu`.
+No other line begins like this. A reply begins with a letter, and the line in which a board
+identifies itself begins with `!acsard-mcu`.
 """
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
@@ -41,11 +44,11 @@ _FORMS = {
     b"charge": re.compile(rb"(?:100|[0-9]{1,2})%"),
     b"temp": re.compile(rb"-?[0-9]{1,3}\.[0-9]"),
 }
-"""The form of each field's value."""
+"""The pattern that the value of each field must match."""
 
 
 class BoardStatus(Struct, frozen=True):
-    """The fields of one status line. None stands for a field that the line does not have."""
+    """The fields of one status line. A field that the line does not contain is None."""
 
     estop: bool | None = None
     """Whether the emergency stop is pressed."""
@@ -64,13 +67,13 @@ class BoardStatus(Struct, frozen=True):
 
 
 def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
-    """Return the fields of `newer`, and those of `status` that `newer` does not have."""
+    """Return `status`, updated with the fields of `newer` that are not None."""
     pairs = zip(astuple(status), astuple(newer), strict=True)
     return BoardStatus(*[old if new is None else new for old, new in pairs])
 
 
 def shown(status: BoardStatus) -> dict[str, str]:
-    """Return the fields of `status` that are not None, as text by name, for `diagnostics`."""
+    """Return the fields of `status` as text, by name, except those that are None."""
     bumpers = status.bumpers
     values = {
         "emergency_stop": _word(status.estop, "pressed", "released"),

@@ -4,9 +4,10 @@
     reply    ap12.50,bn08.75,cp15.00,dn10.25#07@TTTTAAAABBBBCCCCDDDD*HHHH
 
 After `#` come the two digits of the sequence number. In a command, request letters may follow. In a
-reply, `@` and the sample fields follow if the command asked for them. After `*` comes the
-CRC-16/XMODEM of everything before it. All digits are upper-case hexadecimal, so each line has one
-correct form. `codec.py` handles the plain part.
+reply, `@` and the sample fields (the board's clock and its encoder counts) follow if the command
+asked for them. After `*` comes the CRC-16/XMODEM of everything before it. All digits after `#` are
+upper-case hexadecimal, so there is only one correct way to write them. `codec.py` handles the plain
+part, which comes before `#`.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from msgspec import Struct
 from acsard.core.link.codec import FrameError
 
 SEQUENCES = 256
-"""Number of different sequence numbers. After the last one they begin again at 0."""
+"""Number of different sequence numbers. The number after 255 is 0."""
 
 ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
 
 ASK_NOTHING = b"H"
-"""A request letter that asks for nothing and that the board ignores. No reply carries letters, so a
-line that comes back with it is an echo."""
+"""A request letter that the board ignores. Replies contain no request letters, so a received line
+with this letter is an echo of the daemon's own line."""
 
 # The pattern also restricts the characters of the plain part, because zero bytes in front of a line
 # do not change an XMODEM CRC.
@@ -34,7 +35,7 @@ _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9
 
 
 class Reading(Struct, frozen=True):
-    """The sample fields of a reply, taken when the board read its encoders.
+    """The sample fields of a reply, with the values at the time when the board read its encoders.
 
     `mcu_ms` is the board's clock in ms. `counts` are the encoder counts of the motors a to d. A
     count rises when its motor turns in the `p` direction. All five numbers are modulo 65536.
@@ -48,7 +49,7 @@ class Checked(Struct, frozen=True):
     """A reply with a correct CRC.
 
     `plain` is its plain part. `sequence` is the sequence number of the command that it answers.
-    `reading` has the sample fields, or is None for a reply without them.
+    `reading` contains the sample fields, or is None for a reply without them.
     """
 
     plain: bytes
@@ -57,9 +58,12 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return a plain command line in its checked form. Both end with CR LF.
+    """Return the checked form of a plain command line. Both forms end with CR LF.
 
-    `letters` are the request letters, such as `ASK_SAMPLE`.
+    Args:
+        line: The plain command line.
+        sequence: The sequence number of the command, 0 to 255.
+        letters: The request letters, such as `ASK_SAMPLE`.
     """
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))

@@ -1,10 +1,10 @@
 """Encodes four wheel speeds as one line of the board's plain protocol, and decodes such a line.
 
-An example is `ap12.50,bn08.75,cp15.00,dn10.25`. Each value has a motor letter, `p` (positive) or
-`n` (negative) for the direction, and a speed in rad/s. Encoding is exact to the byte. Decoding is
-lenient about form: it accepts spaces after commas, a trailing comma, one or two integer digits, and
-one to three decimals. It is strict about meaning: one invalid value makes the whole line invalid.
-Only this module maps motor letters and signs to wheels.
+An example is `ap12.50,bn08.75,cp15.00,dn10.25`. Each value consists of a motor letter, `p`
+(positive) or `n` (negative) for the direction, and a speed in rad/s. Encoding is exact to the byte.
+Decoding is lenient about form: it accepts spaces after commas, a trailing comma, one or two integer
+digits, and one to three decimals. It is strict about meaning: one invalid value makes the whole
+line invalid. Only this module maps motor letters and signs to wheels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LETTERS = "abcd"
 Motors = tuple[float, float, float, float]
 
 MAX_SPEED = 99.99
-"""Largest speed in a line, rad/s: it has two integer digits and two decimals."""
+"""Largest speed in a line, rad/s. A speed is written with two integer digits and two decimals."""
 
 Reason = Literal[
     "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
@@ -51,7 +51,8 @@ class FrameError(AcsardError):
 class Codec:
     """An encoder and decoder of lines for one wiring of the motors.
 
-    With `trailing_comma`, encoded lines end with a comma.
+    `wheels` names the motor of each wheel and its direction. With `trailing_comma`, encoded lines
+    end with a comma.
     """
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
@@ -88,7 +89,10 @@ class Codec:
         return ",".join(tokens).encode() + self._end
 
     def wheels(self, motors: Motors) -> Motors:
-        """Return values of the motors a to d by wheel, in `WHEELS` order, with forward positive."""
+        """Convert values of the motors a to d to values of the wheels, in `WHEELS` order.
+
+        A positive value of a wheel means forward.
+        """
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
             wheel[index] = motor * sign
@@ -121,7 +125,7 @@ class Codec:
 def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
     """Return the four values of a line as pairs such as `(b"ap", 12.5)`, None if it is malformed.
 
-    A pair has the motor letter with the direction, and the speed without sign, rad/s.
+    A pair consists of the motor letter with the direction, and of the absolute speed, rad/s.
     """
     match = _LINE.fullmatch(line)
     if match is None:

@@ -1,9 +1,10 @@
 """Converts encoder counts into the angle that each motor turned since the previous reading.
 
-The counts are cumulative, so a lost line loses no distance. The board's own milliseconds do not
-depend on when the host read the line. Counts and milliseconds are modulo 65536. So a difference is
-used only if it cannot have wrapped and if the motors are fast enough for it. Otherwise the caller
-uses speed times time. The module also detects a probable restart of the board.
+The counts are cumulative, so a lost line loses no distance. The board sends the time of its own
+clock with the counts, so the time between two readings does not depend on when the host read the
+lines. Counts and milliseconds are modulo 65536. A difference is therefore used only if it cannot
+have wrapped and if the motors can have turned that far. Otherwise the caller computes the angle as
+speed times time. The module also detects a probable restart of the board.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Counts that are allowed in addition to those at the highest speed of a wheel.
+"""Number of counts by which a wheel may exceed the counts at its highest speed.
 
-They cover one count at each end of the interval, and play in the gears.
+This covers one count at each end of the interval, and play in the gears.
 """
 
 ROUNDING_MS = 2
-"""Largest error of the time between two readings, whose times are whole milliseconds, ms."""
+"""Largest error of the time between two readings, ms. The board sends its clock in whole ms."""
 
 LATEST_MS = 1000.0
-"""Largest delay of a line that is tracked, ms. A longer delay is treated as this one. The session
-starts over after such a gap anyway."""
+"""Largest delay of a line that is tracked, ms. A longer delay is clamped to this value, because the
+session restarts after such a gap anyway."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
 """The reason why the difference between two readings cannot be used.
@@ -42,14 +43,14 @@ Unknown = Literal["unknown", "leap", "restarted"]
 
 
 class Turned(Struct, frozen=True):
-    """Angles in rad that the motors a to d turned in the last `dt` s of the board's clock."""
+    """Angles in rad that the motors a to d turned during `dt` s of the board's clock."""
 
     motors: Motors
     dt: float
 
 
 class Encoders:
-    """A comparison of each reading with the previous reading."""
+    """Compares each reading of the encoders with the previous reading."""
 
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start.
@@ -61,7 +62,7 @@ class Encoders:
         Args:
             counts: Encoder counts per turn, 0 if unknown.
             wheel_speed: The highest speed of a wheel, rad/s.
-            quiet_ns: The duration of silence that ends a link, ns.
+            quiet_ns: The duration of silence after which the link is stale, ns.
         """
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000
@@ -73,8 +74,8 @@ class Encoders:
     def forget(self) -> None:
         """Forget the last reading.
 
-        It belongs to another session, or the caller has covered the time since then by speed times
-        time.
+        The reading belongs to another session, or the caller has already used speed times time for
+        a later line.
         """
         self._last = None
 
@@ -102,10 +103,10 @@ class Encoders:
         return Turned((a * angle, b * angle, c * angle, d * angle), mcu_ms / 1000)
 
     def _most(self, ms: float) -> float:
-        """Return a bound on the counts that a wheel makes in `ms` milliseconds."""
+        """Return the largest number of counts that a wheel can make in `ms` milliseconds."""
         return self._fastest * (ms + ROUNDING_MS) + SLACK_COUNTS
 
 
 def _signed(difference: int) -> int:
-    """Return the difference of two counters modulo 65536 that is nearest to 0."""
+    """Return the number nearest to 0 that equals `difference` modulo 65536."""
     return (difference + FIELD // 2) % FIELD - FIELD // 2

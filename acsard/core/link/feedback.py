@@ -1,6 +1,7 @@
-"""Turns a good line into feedback: the time of its sample and the motion since the last line.
+"""Turns a good line into feedback: its sample time and the motion since the last line.
 
-The time between two samples comes from the best clock that is available:
+The sample time is the time at which the board read its encoders. The time between two samples comes
+from the best clock that is available:
 
 - the board's own clock, if the board sends it with its counts;
 - the times at which the command lines were written, if the board answers each line
@@ -26,31 +27,36 @@ from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, Pr
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
-"""Least time between the stamps of two lines, ns. A line with an equal stamp would be taken for the
-previous line."""
+"""Least time between the stamps of two lines, ns. Two lines with equal stamps would look like one
+line."""
 
 LATER = 0.05
-"""Gain of the filter for the mean offset between the two clocks of `sample_time.py`."""
+"""Gain of the filter for the mean offset between the times of `PromptedTimes` and those of
+`FreeRunningTimes`."""
 
 FULL_READ = 1024
-"""Number of bytes in a full read of the port. After a full read more data may wait."""
+"""Number of bytes in a full read of the port. After a full read, the kernel may still hold more
+data."""
 
 DIFFERS = 1.5
-"""Least difference between the periods and the command lines since the last read that scheduling
-alone does not cause. `ReplyStyle` adds up the reads with such a difference."""
+"""Least difference between the number of reply periods and the number of command lines since the
+last read. Scheduling alone does not cause as much. `ReplyStyle` evaluates the reads that reach it,
+and the next `AFTER` reads."""
 
 TELLING = 2.5
-"""Least difference between the sum of periods and the sum of command lines for a decision."""
+"""Least difference between the sum of periods and the sum of command lines for a decision of
+`ReplyStyle`."""
 
 LATEST = 100.0
-"""Largest number of periods since the last read. After more periods, the read is ignored."""
+"""Longest time between two reads, in reply periods. `ReplyStyle` ignores a read after a longer
+time."""
 
 CLEAR = 0.5
-"""For a decision, one sum must be nearer to the number of received lines than the other sum, by at
-least this share of the difference between the sums."""
+"""Margin that a decision of `ReplyStyle` requires. The number of received lines must be nearer to
+one sum than to the other by at least this share of the difference between the sums."""
 
 AFTER = 3
-"""Number of reads after a read with a difference of `DIFFERS` that are added to the sums too."""
+"""Number of further reads that `ReplyStyle` evaluates after a read that reaches `DIFFERS`."""
 
 NEAR = 0.35
 """Largest difference between the nearer sum and the number of received lines, as a share of the
@@ -58,12 +64,12 @@ received lines. It is not 0 because some lines get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
-    """A good line. The board took its sample at `at`, `dt` s after the previous sample.
+    """A good line. The board read its encoders at `at`, `dt` s after the previous sample.
 
     After a gap `dt` is 0, because the motion during the gap is unknown, and `gap` is the length of
     the gap in s. `turned` is the angle of each wheel since the previous line according to the
-    encoder counts in the line, in rad and `WHEELS` order, or None if unknown. It is also valid
-    after a gap.
+    encoder counts in the line, in rad and `WHEELS` order, or None if unknown. `turned` is valid
+    even after a gap.
     """
 
     at: Instant
@@ -72,23 +78,24 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """The part of `dt`, at its start, that no line reported, s. The speeds of the lines before and
-    after it are used for this part."""
+    """The part of `dt`, at its start, whose lines were lost, s. The speeds of the lines before and
+    after it fill this part."""
     asked_ns: int | None = None
-    """Monotonic time at which the command line that this line answers was written, ns. None if that
-    command line is unknown."""
+    """Monotonic time at which the daemon wrote the command line that this line answers, ns. None if
+    that command line is unknown."""
     since: float = 0.0
-    """Time since the previous line, s: by the board's clock if it is known, else by arrival. 0
-    after a silence or a gap. The plausibility checks use it."""
+    """Time since the previous line, s, according to the board's clock if the line contains it, else
+    according to the arrival times. 0 after a silence or a gap. The plausibility checks use it."""
     heard_ns: int = 0
     """Monotonic time at which the host had received the whole line, ns."""
     counted: Motors | None = None
-    """Angle that each wheel turned in `dt` minus `bridged`, rad in `WHEELS` order. None unless the
-    counts per turn are configured and the speeds show whole counts (`whole_counts.py`)."""
+    """Angle that each wheel turned in the last `dt - bridged` seconds, rad, in `WHEELS` order. None
+    unless the counts per turn are configured and the speeds show whole counts
+    (`whole_counts.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Quantization step of each wheel's reported speed, rad/s, `math.inf` if unknown."""
     count: float = 0.0
-    """Angle of one encoder count, rad, 0 if it is not configured."""
+    """Angle of one encoder count, rad, 0 if the counts per turn are not configured."""
 
 
 class ReplyStyle:
@@ -97,9 +104,9 @@ class ReplyStyle:
     While the daemon sends one line per period, both kinds of boards look alike. Sometimes the
     daemon sends more or fewer lines, because the host did not run or because a new command was sent
     at once. Then the number of received lines equals either the number of periods or the number of
-    command lines. Both numbers are added up over the reads in which they differ, and over the next
-    few reads, which bring the lines that an adapter still held. The sum that is nearer to the
-    number of received lines shows the kind of the board.
+    command lines. The class adds up both numbers over the reads in which they differ and over the
+    next few reads, which deliver the lines that a USB adapter still held. The sum that is nearer to
+    the number of received lines shows the kind of the board.
     """
 
     def __init__(self, speaks: bool) -> None:
@@ -111,7 +118,7 @@ class ReplyStyle:
         self._came = self._periods = self._asked = 0.0
 
     def left(self) -> None:
-        """Count a command line that was written."""
+        """Count a command line that was written to the port."""
         self._left += 1
 
     def read(self, lines: int, periods: float) -> None:
@@ -143,7 +150,7 @@ class ReplyStyle:
 
 
 class Timeline:
-    """The times of the good lines in order.
+    """Assigns a sample time to each good line, in order.
 
     For each read of the port, call `read`. Then, for each of its lines in order, call `place` if
     the line is good and `spoilt` if it is bad.
@@ -179,7 +186,7 @@ class Timeline:
         self._later = 0.0
         """Mean time by which `PromptedTimes` places a reply later than `FreeRunningTimes`, ns."""
         self.leaps = 0
-        """Number of readings with impossible counts. Speed times time was used instead."""
+        """Number of readings with impossible counts. Each was replaced by speed times time."""
         self.restarted = False
         """Whether the board's clock in the last line shows that the board has restarted."""
 
@@ -241,7 +248,7 @@ class Timeline:
         silent: bool,
         asked_ns: int | None = None,
     ) -> Feedback:
-        """Return the feedback of the next line of the read, which is good.
+        """Return the feedback for the next line of the read, which must be a good line.
 
         Args:
             speeds: The speeds in the line.
@@ -249,8 +256,8 @@ class Timeline:
             following: The number of bytes in the read after the end of the line.
             length: The number of bytes of the line with its line end.
             silent: Whether the link was silent before the line.
-            asked_ns: Monotonic time at which the line that this reply answers was written, ns. None
-                if unknown.
+            asked_ns: Monotonic time at which the daemon wrote the line that this reply answers, ns.
+                None if unknown.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -283,16 +290,19 @@ class Timeline:
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
     def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
-        """Return the time of the next line by the best available clock."""
+        """Return the time of the next line according to the best available clock.
+
+        `asked_ns` is as in `place`. `came_ns` is the monotonic time at which the line was complete.
+        """
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
             ours = asked_ns is not None or speaks is False or self._prompts.thinks
             if ours and answered is not None:
                 if asked_ns is None and answered.due_ns - came_ns > self._usual_ns / 2:
-                    # The usual delay is too long: it was measured on a first reply that was read
-                    # late because of a stall. The time of the previous line already includes that
-                    # stall, so the time of this line is its arrival.
+                    # The usual delay is too long: it was measured on the first reply, which a stall
+                    # had delayed. The time of the previous line already includes that stall, so the
+                    # time of this line is its arrival.
                     return Placed("prompts", came_ns, early=True)
                 return answered
         slot = self._slots.place(self._rest)
@@ -306,11 +316,11 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return the time since the last good line, and the part of it that no line reported, s.
+        """Return the time since the last good line, and the part of it whose lines were lost, s.
 
         If two different clocks placed the lines, the result is the difference of their `due_ns`,
-        corrected by the mean offset of the clocks. So the errors of changes between the clocks do
-        not add up.
+        corrected by the mean offset of the clocks. This correction keeps the errors of many changes
+        between the clocks from adding up.
         """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
@@ -323,20 +333,20 @@ class Timeline:
         if by_clock is not None:
             return dt, placed.bridged
         period = self._usual_ns / NS_PER_S
-        # A prompted board sends no line that is not asked for, but the replies that were ignored
-        # have reported a part of this time.
+        # A prompted board only answers command lines, so a long time alone does not show that lines
+        # are missing. But a bad or ignored reply has covered a part of this time.
         missing = dt > 1.5 * period and (self._style.speaks is not False or self._spoilt)
         return dt, dt - period if missing else 0.0
 
     def _compare(self, answered: Placed, slot: Placed) -> None:
-        """Update `_later` with the times of one reply by both clocks of `sample_time.py`."""
+        """Update `_later` with the times of one reply according to both clocks."""
         later_ns = answered.due_ns - slot.due_ns
         if slot.dt is None or self._last_placed.clock != "slots":
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return the mean time by which `clock` places a line later than the slots do, ns."""
+        """Return the mean time by which `clock` places a line later than `FreeRunningTimes`, ns."""
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -346,7 +356,11 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return when the board took the sample of a line: before the line's bytes were sent."""
+        """Return the sample time of a line: the time at which the board began to send it.
+
+        `came_ns` is the monotonic time at which the line was complete, and `length` is its number
+        of bytes.
+        """
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
@@ -357,7 +371,7 @@ class Timeline:
         return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
-        """Return the angles of the motors since the previous line, or None if unknown."""
+        """Return the angles that the motors turned since the previous line, or None if unknown."""
         self.restarted = False
         if reading is None or not self._counts:
             self._encoders.forget()

@@ -1,8 +1,8 @@
 """Splits the received bytes into lines, with bounded memory.
 
-This module does not know the meaning of a line. Lines end with LF or CR LF. After noise, the next
-LF begins a new line. Empty lines are dropped silently, because the daemon starts every session with
-a bare line end, and a board that echoes may send it back.
+This module does not know the meaning of a line. Lines end with LF or CR LF. After noise, a new line
+begins after the next LF. Empty lines are dropped silently, because the daemon starts every session
+with a bare line end, and a board that echoes may send it back.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class LineReader:
         """Return the lines that `data` completes, in order and without their line ends.
 
         Each line is paired with the number of bytes of `data` that followed it. Those bytes were
-        on the wire after the line was complete, so their number shows how long ago that was.
+        on the wire after the line was complete, so their number shows how long before the read the
+        line was complete.
         """
         lines = []
         ends = data.split(b"\n")

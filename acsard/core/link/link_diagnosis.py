@@ -2,9 +2,9 @@
 
 The module knows three causes of a silence: this computer did not run (`Lateness`), the board sent
 something other than replies (`SilenceDiagnosis`), or the board is silent. It also warns if a link
-that is up loses answers (`UnansweredLines`). It has the sentences for `state.reason`, the log and
-the web page. The diagnosis does not change the state of the link, which `link_state.py` decides.
-`acsard mcu check` uses the same diagnosis.
+that is up loses answers (`UnansweredLines`). It contains the sentences for `state.reason`, the log
+and the web page. The diagnosis does not change the state of the link, which `link_state.py`
+decides. `acsard mcu check` uses the same diagnosis.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
-"""Share of the silence that ends a link. If two control steps are further apart than this share,
-this computer is the cause of a silence."""
+"""Fraction of the silence after which a link is stale. If two control steps are further apart than
+this fraction, the cause of a silence is this computer and not the board."""
 
 BUSY = "which other program uses the processor? (`top` shows it; as a service acsard has priority)"
 """The advice for a computer that is late."""
@@ -46,7 +46,7 @@ Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "spars
 - foreign: valid lines with other bytes before or after them
 - garbage: nothing that resembles a line
 - few: good lines among others
-- sparse: only good lines, but too seldom
+- sparse: only good lines, but too few of them
 """
 
 LOOK_MENDS: dict[Look, str] = {
@@ -62,7 +62,7 @@ LOOK_MENDS: dict[Look, str] = {
 
 _RIGHT = re.compile(TOKENS)
 _PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
-"""All characters that a reply can contain."""
+"""Pattern of bytes that may be a piece of a reply: only characters that a reply can contain."""
 
 BLOCKED = (
     "the serial port sends nothing, because its driver accepts no bytes: unplug the "
@@ -74,7 +74,7 @@ WINDOW = 1000
 """Number of sent lines that are examined together: 10 s at 100 Hz."""
 
 LOST = 0.02
-"""Share of lines without an answer above which the warning is given. A sound link has none."""
+"""Share of lines without an answer above which the warning is given. A sound link loses none."""
 
 
 def is_ours(words: str) -> bool:
@@ -83,14 +83,14 @@ def is_ours(words: str) -> bool:
 
 
 class Lateness:
-    """The lateness of the control steps."""
+    """Detects late control steps, which make this computer the cause of a silence."""
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
         """Start.
 
         Args:
             simulated: Whether the board is a part of this process.
-            quiet_ns: The duration of silence that ends a link, ns.
+            quiet_ns: The duration of silence after which the link is stale, ns.
         """
         self._simulated, self._least_ns = simulated, SHARE * quiet_ns
         self._looked_ns: int | None = None
@@ -113,7 +113,7 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
-        """Return a sentence about the link."""
+        """Return a sentence about the state `link`, and blame this computer if it is the cause."""
         if link == "stale" and self.late_s:
             return (
                 f"{HOST} {self.late_s:.2f} s, and received nothing from the microcontroller: {BUSY}"
@@ -170,7 +170,7 @@ class Heard(Struct):
     def counted(self) -> str:
         """Text with the number of received lines and the last bad line.
 
-        If no line has ended, the text has the number of bytes and the last bytes.
+        If no line has ended, the text gives the number of bytes and the last bytes.
         """
         if self.statuses and not self.lines:
             return "only status lines were received"
@@ -243,7 +243,7 @@ class UnansweredLines:
     def __init__(self, reply_period: float) -> None:
         """Start. `reply_period` is the setting mcu.reply_period, s.
 
-        It is 0 for a board that answers lines. Otherwise nothing is compared.
+        It is 0 for a board that answers lines. With any other value nothing is compared.
         """
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
@@ -279,7 +279,7 @@ class UnansweredLines:
 
 
 def damaged(link: Link, check: Negotiation) -> bool:
-    """Return whether the daemon asks for checked lines because replies were damaged."""
+    """Return whether the daemon asks for checked lines again because replies were damaged."""
     return link.damaged and check.asking
 
 
@@ -292,7 +292,7 @@ def words(
 ) -> str:
     """Return a sentence about the link of an open port.
 
-    `longest_reply` is the largest value of mcu.reply_period, s.
+    `longest_reply` is the largest value that mcu.reply_period may have, s.
     """
     if link.state in ("booting", "stale"):
         heard = hearing.heard

@@ -1,4 +1,6 @@
-"""Decides whether the link can carry motion, by a state machine for received lines and silences.
+"""Decides, with a state machine, whether the link to the board is good enough to drive.
+
+The inputs are received lines, silences and changes of the port. The states are:
 
 - down: the port is closed.
 - booting: the port was opened or the board has restarted, and fewer than GOOD_LINES good lines have
@@ -6,7 +8,7 @@
 - up: good lines arrive in time.
 - stale: the link was up until one of these happened:
 
-  - No good line came for `quiet_ns`.
+  - No good line came for `Link.quiet_ns`.
   - BAD_LINES bad lines came in a row on a checked link.
   - The open port could not write a line for the board's watchdog time.
   - The received lines were the daemon's own lines (an echo).
@@ -50,7 +52,7 @@ WORDS: dict[State, str] = {
 }
 
 WATCHDOG_S = 0.3
-"""Seconds after the last valid line at which the board stops the motors by itself."""
+"""Time after the last valid line from the daemon after which the board stops the motors, s."""
 
 GOOD_LINES = 3
 """Number of good lines in a row before the link is trusted. A board that has just reset may print
@@ -119,8 +121,8 @@ class Link:
     def excuse(self) -> None:
         """Reset the count of silences.
 
-        The last line came in time, this computer caused the silence, or the port was opened or
-        closed.
+        This is done if a line came in time, if this computer caused the silence, or if the port was
+        opened or closed.
         """
         self._silences, self.sparse_s = 0, 0.0
 

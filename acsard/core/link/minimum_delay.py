@@ -1,9 +1,9 @@
 """Measures the delay of events between two unrelated clocks, relative to the least delay so far.
 
-The arrival time by our clock minus the departure time by theirs is the delay plus an unknown offset
-between the clocks. The offset cancels out in the comparison with the smallest value so far, so the
-result is the delay in excess of the minimum. The clocks drift, so the minimum slowly rises as time
-passes.
+The arrival time by this computer's clock minus the departure time by the other clock is the
+delay plus an unknown offset between the clocks. The smallest such difference so far belongs to the
+event with the least delay. Subtracting it cancels the offset, so the result is the delay in excess
+of the minimum. The clocks drift, so the stored minimum slowly rises as time passes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class MinimumDelay:
         the clocks since the last event.
 
         Args:
-            ours: time since the last event by our clock.
+            ours: time since the last event by this computer's clock.
             theirs: time since the last event by the other clock.
         """
         later = self.late + ours - theirs
@@ -45,8 +45,8 @@ class MinimumDelay:
     def measure(self, ours: float, theirs: float) -> float:
         """Return the delay of an event in excess of the minimum, less the allowed drift.
 
-        A negative result is below the accepted minimum, which does not change until `believe`. The
-        arguments are those of `add`.
+        A negative result means that the delay is below the accepted minimum, which only `believe`
+        changes. The arguments are those of `add`.
         """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late

@@ -1,7 +1,7 @@
 """Negotiates whether lines have a check, at every opening of the port and after every gap.
 
-The check is the sequence number and CRC of `checksum.py`. A question is a stop line that asks for
-it. The states of the negotiation are:
+The check is the sequence number and CRC of `checksum.py`. A question is a stop line with the check.
+A board that knows the check answers it in the same form. The states of the negotiation are:
 
 - off: mcu.link_check is "off". Lines are plain, and the daemon does not ask for the check.
 - waking: the daemon sends only stops. The board has not answered yet, so its silence proves
@@ -11,7 +11,7 @@ it. The states of the negotiation are:
 - plain: only with mcu.link_check = "auto". The board answers, but without the check. The daemon
   asks again after the next gap.
 - checked: the board has answered a question correctly. Now the daemon accepts only checked replies.
-- sampled: as checked, and the replies have the encoder counts that the lines ask for.
+- sampled: as checked, and the replies contain the encoder counts that the lines ask for.
 
 Once a board has answered with the check, the daemon accepts no plain replies until the port is
 reopened, because noise must not end the check.
@@ -43,7 +43,7 @@ Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
 - answer: the board answered a question correctly, without a sample
 - sample: the board answered a question correctly, with a sample
 - refusal: the board answered none of the questions
-- samples_end: the replies have no samples any more
+- samples_end: the replies no longer contain samples
 """
 
 TABLE: dict[tuple[State, Sign], State] = {
@@ -72,7 +72,9 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the negotiation does not end, so that the robot cannot drive. "" means no trouble.
+"""The reason why the negotiation does not end. Until it ends, the robot cannot drive.
+
+"" means that there is no such reason.
 
 - echo: the lines that the daemon sends come back
 - forgotten: the board answered with the check before and does not now
@@ -97,7 +99,8 @@ TRIES = 3
 daemon concludes that the board does not know that kind."""
 
 WINDOW = 64
-"""Largest number of lines that wait for an answer, far fewer than there are sequence numbers."""
+"""Largest number of lines that wait for an answer. It is far below the number of sequence
+numbers."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
 """Largest delay of an answer, ns. After a longer one the board's watchdog has stopped the
@@ -115,11 +118,13 @@ FEW_SAMPLES = 5
 samples."""
 
 REPORTS = 20
-"""Number of reports in a row that must equal sent lines in an echo: 0.2 s at 100 Hz."""
+"""Number of reports in a row that must equal sent lines to count as an echo. At 100 Hz they take
+0.2 s."""
 
 CHANGE = 2.0
-"""Least sum of the speed changes in an echo's reports, rad/s. Each change is that of the wheel that
-changes most. A smaller sum may be a coincidence with coarse encoders."""
+"""Sum of the speed changes that a run of reports must reach to count as an echo, rad/s. Each change
+is that of the wheel whose speed changes most. With coarse encoders, a smaller sum may be a
+coincidence."""
 
 LINES = 8
 """Number of sent lines with which a report is compared. At 100 Hz, this detects an echo that comes
@@ -155,18 +160,21 @@ class Throttle:
 class EchoDetector:
     """Detects a run of reports that only repeat sent lines.
 
-    A reply without a sample has the same form as a command. So an echo looks like a board that
-    reports exactly the commanded speeds. A run of at least `REPORTS` reports is an echo under two
-    conditions. Each report equals, byte for byte, the line that was sent a fixed number of lines
-    earlier, among the last `LINES` lines. And the speed changes in the run add up to at least
-    `CHANGE`. At rest every board looks like an echo, so a run without changes proves nothing.
+    A report is a reply without a sample. It has the same form as a command. So an echo looks like a
+    board that reports exactly the commanded speeds. A run of at least `REPORTS` reports is an echo
+    under two conditions:
+
+    - Each report equals, byte for byte, one of the last `LINES` sent lines, and the number of lines
+      between the two is the same for all reports of the run.
+    - The speed changes in the run add up to at least `CHANGE`. At rest every board looks like an
+      echo, so a run without changes proves nothing.
 
     A board that measures its speeds is not taken for an echo, because the lag of its wheels is not
     a whole number of lines. This was simulated for accelerations of 0.1 to 100 m/s2, encoders of up
-    to 1,000,000 counts a turn, and motors that lag by 2 ms or more. The equal reports in a row then
-    covered at most 0.04 rad/s of changes. A board that reports its set points, or a simulator whose
-    wheels have no lag, looks exactly like an echo. The daemon then does not drive until the port is
-    opened again, and reports the reason.
+    to 1,000,000 counts a turn, and motors that lag by 2 ms or more. The speed changes in a
+    run of equal reports then added up to at most 0.04 rad/s. A board that reports its set points,
+    or a simulator whose wheels have no lag, looks exactly like an echo. The daemon then does not
+    drive until the port is opened again, and reports the reason.
     """
 
     def __init__(self) -> None:
@@ -178,9 +186,9 @@ class EchoDetector:
         """The last sent lines. The newest one has the number `_lines`."""
         self._lines = self._reports = 0
         self._runs: dict[int, _Run] = {}
-        """The runs, by the number of a report minus that of the equal line.
+        """The runs by offset: the number of a report minus the number of the line that it equals.
 
-        This difference is constant in an echo, whatever its delay is.
+        The offset is constant in an echo, whatever the delay of the echo is.
         """
 
     def left(self, line: bytes) -> None:
@@ -215,7 +223,8 @@ class EchoDetector:
 class Negotiation:
     """The negotiation of the check.
 
-    It makes the questions, adds the check to lines, and matches replies with lines.
+    It makes the questions, adds the check to lines, and matches each reply with the line that it
+    answers.
     """
 
     def __init__(self, mcu: McuConfig, stop: bytes) -> None:
@@ -228,14 +237,15 @@ class Negotiation:
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
-        """The last question, without its line end, if no answer can equal it. Otherwise b""."""
+        """The last question, without its line end, if it has request letters, so that no reply can
+        equal it. Otherwise b""."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
         """Sequence number and time (ns) of the last checked line that was made.
 
-        None after `settle` has reported whether the line was written.
+        None after `settle` has recorded whether the line was written.
         """
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
         """Sequence numbers and times (ns) of the written lines that are not answered yet."""
@@ -262,7 +272,8 @@ class Negotiation:
     def begin(self, fresh: bool = False) -> None:
         """Start the negotiation again, and forget the lines that wait for answers.
 
-        `fresh` says that the port has been opened. Then also forget what is known about the board.
+        If `fresh` is True, the port has been opened. Then also forget what is known about the
+        board.
         """
         self._sign("gap")
         self._begin(fresh)
@@ -275,7 +286,7 @@ class Negotiation:
         self._made = None
         self._asked, self._just_asked = Throttle(), False
         self._unanswered, self._open = 0, False
-        # The port replaces the first line after an opening by a plain stop.
+        # The port replaces the first line after an opening with a plain stop.
         self._plain_turn = 0 if fresh else 1
 
     def _sign(self, sign: Sign) -> None:
@@ -284,7 +295,7 @@ class Negotiation:
     # Lines to the board.
 
     def seal(self, line: bytes, now_ns: int) -> bytes:
-        """Return a plain command line in the present form, plain or checked."""
+        """Return the plain command line `line` in the present form, plain or checked."""
         if not self.checked:
             return line
         return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)

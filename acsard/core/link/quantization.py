@@ -1,9 +1,9 @@
-"""Measures how coarsely encoders quantize the reported speeds, and adds whole counts to each line.
+"""Measures how coarsely encoders quantize the reported speeds, and adds whole counts to lines.
 
 If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds.
 Otherwise the pose uses speed times time, because the speeds alone do not show how many counts a
-turn has. The exception is firmware that divides by a fixed period. However, the time of its lines
-is known as well, so the only error of speed times time is the rounding to two decimals.
+turn has. The exception is firmware that divides counts by a fixed period. But then the time between
+its lines is known as well, so speed times time is wrong only by the rounding to two decimals.
 """
 
 from __future__ import annotations
@@ -17,30 +17,33 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import WholeCounts
 
 FLICKER = 0.0105
-"""Smallest change of a reported speed that is a step, rad/s. A smaller change is only rounding."""
+"""Smallest change of a reported speed that counts as a step, rad/s. A smaller change is only
+rounding."""
 
 BLOCK = 64
 """Number of steps that are examined together. They include at least three counts, even if counts
 are rare and the firmware filters the speeds."""
 
 FIRST = 24
-"""Number of steps in the first block after which `Steps.size` gets a value. It may still grow."""
+"""Number of steps in the first block after which `Steps.size` gets its first value, which may still
+grow."""
 
 RECUR = 3
-"""Number of steps in a block that must reach a size. A single damaged line causes only two."""
+"""Number of steps in a block that must be at least as large as `Steps.size`. A single damaged line
+causes only two steps."""
 
 ALIKE = 3.0
 """Bound on the step of a wheel, as a multiple of the second largest step of the four wheels. The
 bound is needed because random jumps look like steps too."""
 
 COARSE, JUMP_GAIN = 0.015, 0.06
-"""`COARSE` is a mean jump of a wheel, rad per line. Above it, the encoder is treated as coarse. An
-encoder with about 200 counts a turn reaches it. `JUMP_GAIN` is the gain of the filter for the mean
-jump."""
+"""`COARSE` is the mean jump of a wheel, rad per line, above which its encoder is treated as coarse.
+An encoder with about 200 counts a turn reaches it. `JUMP_GAIN` is the gain of the filter for the
+mean jump."""
 
 LONGEST_LINE = 0.03
-"""Longest time of a line, s, over which jumps are measured. Over a longer time, the accelerations
-of the motors look like jumps."""
+"""Longest time that a line may cover for a measurement of its jumps, s. Over a longer time, the
+accelerations of the motors look like jumps."""
 
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
@@ -100,7 +103,7 @@ class Coarseness:
     def add(self, speeds: Motors, own: float) -> bool:
         """Process the speeds of a line, rad/s. Return whether the examined encoder looks coarse.
 
-        `own` is the time that the line covers, s.
+        Each call examines the encoder of one wheel. `own` is the time that the line covers, s.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:

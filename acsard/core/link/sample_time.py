@@ -1,4 +1,4 @@
-"""Estimates when the board took its samples, with one clock for each of two kinds of boards.
+"""Estimates when the board read its encoders, with one clock for each of two kinds of boards.
 
 The time at which the host reads a line is not the time of its sample: an adapter, the scheduler or
 a stall of the host may have held the line back. `FreeRunningTimes` finds the period of a board that
@@ -22,7 +22,8 @@ from msgspec import Struct
 from acsard.core.values import NS_PER_S
 
 Read = tuple[int, int]
-"""The time at which the last line of a read was complete, ns, and the number of its lines."""
+"""The time at which the last line of a read was complete, ns, and the number of lines in the
+read."""
 
 BRIDGED_S = 1.0
 """Longest gap between two lines that is filled, s. After a longer one the board may have been
@@ -30,7 +31,7 @@ reset."""
 
 
 class Placed(Struct, frozen=True, gc=False):
-    """The time of a line by one of the clocks.
+    """The time of a line according to one of the clocks.
 
     `clock` is "slots" for `FreeRunningTimes`, "prompts" for `PromptedTimes`, and "reads" for the
     times of the reads. `due_ns` is the monotonic time at which the host should have received the
@@ -43,13 +44,13 @@ class Placed(Struct, frozen=True, gc=False):
     """Time since the previous line that this clock placed, s. None for the first such line, and for
     the clock "reads"."""
     bridged: float = 0.0
-    """The part of `dt` that no line reported, s."""
+    """The part of `dt` whose lines were lost, s."""
     early: bool = False
     """Whether the line came before it was due. Then `due_ns` is the time of its arrival, and the
     time to the next line is the difference of the two `due_ns`."""
 
 
-# A free-running board.
+# A free-running board. A slot is one period of its clock, in which it sends one line.
 
 WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
 """Least duration of a window, ns, and its least number of reads. A clock is found or corrected from
@@ -63,11 +64,11 @@ DRIFT = 0.01
 """Largest relative error of a board's clock. A ceramic resonator has half of it."""
 
 EXACT = 0.001
-"""Largest relative error of a measured period that is not configured. Within it, the period is
-rounded to whole ms. It covers the error of a quartz and the error of the fit."""
+"""Relative error within which a measured period that is not configured is rounded to whole ms. It
+covers the error of a quartz and the error of the fit."""
 
 LONE = 0.7
-"""Share of the reads. If at least this share has a single line, lines are treated as read one by
+"""If at least this share of the reads contains a single line, lines are treated as read one by
 one."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
@@ -77,28 +78,29 @@ for lines that are read one by one, `LATE_BATCHED` for batches; `HELD_NS` limits
 HELD_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
 16 ms. At 20 Hz and less, a later line answers a command that was sent between two periods. If the
-lines of a slow board really vary by more, no clock is found: the times of the reads are used."""
+lines of a slow board really vary by more, no clock is found, and the times of the reads are
+used."""
 
 EARLY_ALONE, ALONE = 0.55, 12
-"""At most one line, and one more for each `ALONE` lines, may be earlier than all others by more
-than `EARLY_ALONE` slots in the window from which a clock is found. These came out of turn: each
-answers a command that was sent between two periods. If there are more, the clock is not accepted,
-because it would make all others a slot late."""
+"""Limit for lines that came out of turn, in the window from which a clock is found. Such a line
+answers a command that was sent between two periods, and is earlier than the others by more than
+`EARLY_ALONE` slots. One such line is allowed, and one more for each `ALONE` reads. With more of
+them the clock is refused, because it would make all other lines a slot late."""
 
 JUMP = 1.4
-"""Time between two reads, in slots. If two reads with a single line each are closer together, no
-line is missing between them."""
+"""If two reads with a single line each are less than this number of slots apart, no line is missing
+between them."""
 
 SURE = 0.15
-"""Margin in slots. A read that is later than the greatest possible lateness of its last line by one
-slot and this margin proves that a line is missing."""
+"""Margin in slots. If the last line of a read is later than its greatest possible lateness by more
+than one slot and this margin, a line is missing."""
 
 EARLY = 0.25
 """If a line of a window is earlier than its slot by more than this number of slots, the clock is
 wrong."""
 
 LOSSY_READS = 0.45
-"""Share of the reads that have missing lines before them, over two windows. Above it, the period is
+"""If more than this share of the reads in two windows follows missing lines, the period is
 wrong."""
 
 
@@ -115,19 +117,20 @@ class FreeRunningTimes:
 
     If lines are read one by one, x is about 0, and a line that is read alone shows at once how many
     lines are missing before it. If an adapter batches lines, x lies between 0 and 1. Then a read
-    shows single missing lines only if it came no later after the previous read than usual. Any
-    other read shows a missing line only if x exceeds the greatest possible lateness. The missing
-    slots are spread over the lines of the read. A line that comes before its slot shows that too
-    many slots were counted as missing, so one is taken back. Twice a second the least x corrects c
-    and T in a second-order loop with the gain g:
+    shows single missing lines only if it came at least as soon after the previous read as usual.
+    Any other read shows a missing line only if x exceeds the greatest possible lateness. The
+    missing slots are spread over the lines of the read. A line that comes before its slot shows
+    that too many slots were counted as missing, so one is taken back. Twice a second the least x
+    corrects c and T in a second-order loop with the gain g:
 
         (2)  c += g x T                 (3)  T += g^2 / 2 x T / slots
 
-    No clock is found for lines without a period. A clock that the lines contradict is given up.
+    No clock is found for lines without a regular period. A clock that the lines contradict is given
+    up.
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        """Start. `known` has the periods that the configuration suggests, s."""
+        """Start. `known` contains the periods that the configuration suggests, s."""
         self._known = known
         self.usual = 0.0
         """The last measured T, ns. 0 until a clock has been found."""
@@ -139,8 +142,8 @@ class FreeRunningTimes:
         self._given = 0
         """Number of slots that were recently counted as missing lines. They may be taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
-        """Usual x of a read, usual time between two reads in slots, gain g, and share of the reads
-        with missing lines."""
+        """`_lag` is the usual x of a read, `_batch` the usual time between two reads in slots,
+        `_gain` the gain g, and `_share` the share of the reads that follow missing lines."""
         self._batched: bool = False
         """Whether an adapter batches lines."""
         self._alone: bool = False
@@ -161,7 +164,7 @@ class FreeRunningTimes:
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
         """Process a read, and return the number of lines that were lost before its last line.
 
-        The result is -1 if there was one line too many.
+        The result is -1 if one slot too many had been counted as missing.
 
         Args:
             at_ns: The monotonic time at which the last line was complete.
@@ -177,10 +180,10 @@ class FreeRunningTimes:
         ahead = (at_ns - self._first) / self.usual - self._slot
         lost = self._missing(ahead, since / self.usual, lines, drained)
         if lost < 0 and (self._given <= 0 or ahead > 0):
-            self.forget()  # the lines are too early or ever later, so the board has another clock
+            self.forget()  # the lines come too early or later and later: another clock
             return 0
         self._slot += lost
-        # If the missing lines cover more time than may be filled, all of them lie before the read.
+        # If the missing lines cover more time than may be filled, place them all before the read.
         self._stretch = 1.0 + lost / lines if lost * self.usual < BRIDGED_S * NS_PER_S else 1.0
         self._given += lost
         self._passed += lines + lost
@@ -224,7 +227,7 @@ class FreeRunningTimes:
         Return -1 if the read contradicts the clock.
 
         Args:
-            ahead: x of the read, slots.
+            ahead: The lateness x of the read's last line, slots.
             since: The time since the last read, slots.
             lines: The number of lines in the read.
             drained: Whether the read took all data that the kernel held.
@@ -274,8 +277,8 @@ class FreeRunningTimes:
     ) -> Iterator[tuple[list[int], float, float]]:
         """Yield candidate clocks, the likelier ones first.
 
-        A candidate has the slot of each read's last line, the largest allowed lateness in slots,
-        and the period in ns. `gaps` are the times between the reads, ns. The order has three
+        A candidate consists of the slot of each read's last line, the largest allowed lateness in
+        slots, and the period in ns. `gaps` are the times between the reads, ns. The order has three
         reasons:
 
         - For jittery lines a configured period is more reliable than half a second of data.
@@ -330,9 +333,10 @@ class FreeRunningTimes:
         self._begin(at_ns)
 
     def _nominal(self) -> float:
-        """Return the period that the firmware means.
+        """Return the nominal period of the firmware, s.
 
-        It is a configured period, a whole number of milliseconds, or the measured period.
+        It is a configured period or a whole number of milliseconds if the measured period is close
+        to one of them. Otherwise it is the measured period.
         """
         seconds = self.usual / NS_PER_S
         for known in self._known:
@@ -390,8 +394,8 @@ replies. So an outdated least delay is forgotten."""
 
 CREEP, CREEPS_FOR = 0.05, 3
 """Rise of the least delay of the last replies, as a fraction of the time since the last reply. So
-the delays of older replies are forgotten. The time counts as one usual time between two lines at
-least, and as `CREEPS_FOR` of them at most, because a board may stall and then answer all lines."""
+the delays of older replies are forgotten. The time is limited to between one and `CREEPS_FOR` times
+the usual time between two lines, because a board may stall and then answer all lines."""
 
 LATE = 1.25
 """Largest difference between the least delay of the last replies and the long-term least delay, in
@@ -399,8 +403,8 @@ usual times between two lines. Above it, replies were lost. A limit of 1 is too 
 delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""Share of lost replies. Below it, the reply to a line that another line follows closely is not
-taken for lost."""
+"""Share of lost replies below which the reply to a line is not taken for lost if another line
+follows that line closely."""
 
 JITTER_NS = 350_000
 """Mean deviation of the delay that USB and the scheduler add to a constant delay, ns."""
@@ -410,23 +414,23 @@ THOUGHT_NS = 800_000
 rarely cause as much."""
 
 RISE_NS = 20_000
-"""Rise per read of the least delay on a batched link, ns. So an outdated least delay is
-forgotten."""
+"""Rise per read of the least delay on a batched link, ns. So an outdated least delay is forgotten.
+A link is batched if an adapter holds replies back, so that one read contains several."""
 
 LOSING = 0.005
 """Gain of the filter for the share of lost replies. It is small, because a filter over 20 reads
 would already show 3 % after two lost replies."""
 
 LOSSY = 0.03
-"""Share of lost replies on a batched link. Above it, any line may lack its reply."""
+"""Share of lost replies on a batched link above which any line may lack its reply."""
 
 SEVERAL = 0.15
-"""Share of the reads that have several lines. Above it, an adapter batches lines. Host stalls alone
+"""Share of the reads with several lines above which an adapter batches lines. Host stalls alone
 cause fewer such reads."""
 
 THINKS = 0.6
-"""Filtered share of the reads with a varying delay. Above it, the board itself varies the delay. An
-adapter that is filled line by line causes a varying delay too, but only for a quarter of a
+"""Filtered share of the reads with a varying delay above which the board itself varies the delay.
+An adapter that is filled line by line causes a varying delay too, but only for a quarter of a
 second."""
 
 BATCH_NS = 2_000_000
@@ -439,8 +443,8 @@ class PromptedTimes:
 
     A plain reply does not say which line it answers. However, a board that answers each line takes
     its sample when the line arrives. So the times at which the lines were written are the sample
-    times, up to a usual delay. The time between two samples is the time between their lines, even
-    if the host reads the replies late. If no line was written, no reply is missing.
+    times, except for a usual delay. The time between two samples is the time between their lines,
+    even if the host reads the replies late. If no line was written, no reply is missing.
 
     Replies come in the order of the lines. Suppose that a reply is later than usual by more than
     half the time from its line to the next line. Then it answers the next line, and the reply to
@@ -469,9 +473,10 @@ class PromptedTimes:
         """
         self._delay: float | None = None
         self._first = False
-        """Whether only the first reply has shown the usual delay."""
+        """Whether the usual delay was measured on the first reply alone."""
         self._spread = self._least = 0.0
-        """Mean deviation from the usual delay, and the long-term least delay, both ns."""
+        """`_spread` is the mean deviation from the usual delay, and `_least` the long-term least
+        delay, both ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
         self._sent: int | None = None
@@ -479,11 +484,11 @@ class PromptedTimes:
         """`_sent` is the time at which the last line was written, and `_apart` the usual time
         between two lines, both ns. `_missing` is the share of lost replies."""
         self._last: int | None = None
-        """Time of the last answered line, plus the delay of its reply beyond the usual delay,
-        ns."""
+        """Time of the last answered line, plus the excess of its reply's delay over the usual
+        delay, ns."""
         self._passed = self._line = 0
-        """Time of the last line that was answered or given up, and time of the last line that was
-        answered, ns."""
+        """`_passed` is the time of the last line that was answered or given up, and `_line` that of
+        the last line that was answered, both ns."""
         self._lost = False
         """Whether a line was given up because of the last reply that was read alone."""
         self._given: list[int] = []
@@ -491,8 +496,8 @@ class PromptedTimes:
         waited in an adapter that stalled."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """For a batched link: least delay and usual time between two reads, both ns, and share of
-        lost replies."""
+        """For a batched link: `_base` is the least delay and `_batch` the usual time between two
+        reads, both ns. `_losses` is the share of lost replies."""
         self._several = 0.0
         """Filtered share of the reads that have several lines."""
         self._thinking = 0.0
@@ -606,11 +611,11 @@ class PromptedTimes:
         self._delay = self._least = self._soon = float(delay_ns)
 
     def _shorten(self, line: int) -> None:
-        """Replace the delay of a first reply that a stall had held back.
+        """Correct the usual delay if a stall had delayed the first reply, on which it was measured.
 
-        The next reply, to `line`, shows it: it comes much earlier than usual. Without this, the
-        usual delay would fall by 5 % of the difference per reply, and the difference would count as
-        variation. A delay that varies much hides lost replies.
+        In that case the next reply, which answers `line`, comes much earlier than usual. Without
+        this correction, the usual delay would fall by only 5 % of the difference per reply, and the
+        difference would count as variation. A delay that varies much hides lost replies.
         """
         own = self._at - line
         self._first = own < (self._delay or 0) - self._apart / 2
@@ -619,8 +624,9 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Give up lines whose replies were lost: the last reply of a batch is too late for them.
+        """Give up the lines whose replies were lost.
 
+        The last reply of a batch shows the loss: it is too late for the line that it would answer.
         If many replies are lost, the first reply of the batch decides instead, because the board
         made it after the previous batch.
 

@@ -12,7 +12,7 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
-"""The result for a line: it was sent, it was dropped in favor of a newer one, or the port is
+"""The result for a line: it was sent, it was dropped in favour of a newer one, or the port is
 closed."""
 
 
@@ -47,7 +47,7 @@ class SerialOutput:
     """The output of a serial port from its opening to its closing. It has no queue."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
-        """Start. `stop` is the plain stop line. Any other line may be `period_ns` old at most."""
+        """Start. `stop` is the plain stop line. Any other line is dropped after `period_ns` ns."""
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
         """The bytes with which every stop line begins, plain or checked."""

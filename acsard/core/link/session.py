@@ -34,8 +34,8 @@ NAMES: dict[LinkState, EventName] = {
 """The event that reports a change to each state of the link."""
 
 LONG_GAP_NS = 1 * NS_PER_S
-"""Duration of a gap, in either direction, after which the MCU may have been reset, ns. Every
-commander must then return to neutral first."""
+"""Duration of a gap in the lines of either direction after which the MCU may have been reset, ns.
+Every sender must then send a zero before it can drive."""
 
 BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
 """Time without a written line after which the output is reported as blocked, ns. By then the MCU
@@ -284,7 +284,7 @@ class McuSession:
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        """Add one event per reason. After a read of noise, one per line would take a period."""
+        """Add one event per reason. After noise, one event per line would take a whole period."""
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""
             self.events.append(

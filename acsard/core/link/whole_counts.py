@@ -16,10 +16,10 @@ With fine encoders, the host's time is too inaccurate to find n. Then the angle 
 speed times the host's time. That time includes the time carried from earlier lines, so no time is
 lost or counted twice.
 
-If the line before is missing, it is unknown whether the reply was lost, so that T covers the time
-since that reply, or the command, so that T covers the whole time since the last good line. If the
-speeds are whole counts in the longer time, and not in the shorter one, the command was lost. A line
-that shows neither is treated like most of the others, if only one line is missing.
+If the previous line is missing, either the reply or the command was lost. If the reply was lost, T
+covers only the time since that reply. If the command was lost, T covers the whole time since the
+last good line. The speeds are then whole counts in the longer time and not in the shorter one. A
+line that shows neither case is treated like most other lines, but only if one line is missing.
 
 Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
 whole counts. The module detects this because the counts of the other wheels are not whole. The
@@ -45,10 +45,10 @@ Above it, a fit proves nothing.
 """
 
 EXACT = 0.3
-"""Largest accepted difference, in counts, between n and the host's time, if a fit proves nothing.
+"""Largest accepted difference between n and the count that the host's time implies, in counts.
 
-This is the case with fine encoders. The limit also decides whether a line covers the time of a
-missing one.
+It applies if a fit proves nothing, as with fine encoders. It also decides whether a line covers the
+time of a missing one.
 """
 
 WIDE, WIDE_S = 0.6, 0.005
@@ -62,8 +62,8 @@ KEPT = 0.95
 carried error of two clocks that differ by 0.5 % would grow for ever."""
 
 REPEATED = 0.65
-"""Share of the firmware's last T. After less time, a line with unchanged speeds may repeat the
-previous line: firmware that is asked again too soon has no new counts."""
+"""After less than this share of the firmware's last T, a line with unchanged speeds may repeat the
+previous line. Firmware that is asked again too soon has no new counts."""
 
 SOON, OFF = 0.45, 0.25
 """Limits for a line with unchanged speeds. After less than `SOON` times the firmware's last T, it
@@ -72,7 +72,7 @@ it shows no whole counts, or if the host's time differs from that of whole count
 counts."""
 
 UNSURE, SLOW = 0.2, 0.025
-"""`UNSURE` is a mean error of the host's time, in counts of the fastest wheel. Above it, the
+"""`UNSURE` is the mean error of the host's time, in counts of the fastest wheel, above which the
 nearest n is often wrong. A random time has a mean error of 0.25. An encoder with 96 counts a turn
 reaches `UNSURE` behind a USB adapter that batches lines for 16 ms. `SLOW` is the gain of the filter
 for this error."""
@@ -102,7 +102,8 @@ class WholeCounts:
         self.covers_gap = False
         """Whether the last line covers the time of the missing line before it."""
         self._cover = 0.0
-        """Filtered share of such lines, of those that show whether they cover it."""
+        """Filtered share of the lines that cover the time of the missing line before them, among
+        the lines that show whether they do."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines that are not whole counts. `_unsure` is the
         filtered error of the host's time, in counts."""
@@ -119,12 +120,14 @@ class WholeCounts:
     def turned(self, speeds: Motors, own: float, gap: float = 0.0) -> Motors | None:
         """Return the angle by which each wheel turned since the previous line, rad.
 
-        Return None if the firmware does not report whole counts, or if all speeds are too low.
+        Return None if the firmware does not report whole counts, or if no speed exceeds its
+        rounding error. If all speeds are 0, the angles are 0 too.
 
         Args:
             speeds: The speeds in the line, rad/s.
             own: The host's estimate of the time since the previous line, s.
-            gap: The time before that since the last good line, s, if the previous line is missing.
+            gap: The time from the last good line to the missing previous line, s. 0 if none is
+                missing.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
@@ -189,7 +192,10 @@ class WholeCounts:
         )
 
     def _fits(self, number: int, fastest: float, want: float) -> bool:
-        """Return whether the host's time `want`, s, is that of `number` counts."""
+        """Return whether the host's time `want`, s, agrees with `number` counts of a wheel.
+
+        `fastest` is the speed of that wheel, rad/s.
+        """
         return abs(number - want * fastest / self.angle) <= EXACT
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:

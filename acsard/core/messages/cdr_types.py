@@ -2,7 +2,7 @@
 
 A number declares its width with `Meta(extra={"cdr": code})`, where the code is one of the struct
 module (`B i I q Q`, and `f` for a float32). A `float` without a code is a float64. In a field of
-type `float | None`, CDR has NaN for None. A list whose `Meta` fixes its length is an array.
+type `float | None`, None is encoded as NaN. A list whose `Meta` fixes its length is an array.
 """
 
 from __future__ import annotations

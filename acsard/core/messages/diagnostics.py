@@ -171,7 +171,7 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """Return the row of the wheels: do front and rear agree, and are they as fast as expected?"""
+    """Return the row that says whether front and rear wheels agree and are as fast as commanded."""
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
@@ -187,7 +187,10 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return the row of the board's inputs, or nothing if it reports none and none is required."""
+    """Return a list with the row of the board's inputs.
+
+    The list is empty if the board reports no input and the configuration requires none.
+    """
     safety, bumpers = config.safety, snapshot.bumpers
     required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
     if not (snapshot.board or required or needed):
@@ -211,7 +214,10 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
 
 
 def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return the row of the battery, or nothing if the board has none and no threshold is set."""
+    """Return a list with the row of the battery.
+
+    The list is empty if the board reports no battery and no threshold is set.
+    """
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
         return [Row("battery", WARN, battery.MISSING, {})] if bounds else []
@@ -228,7 +234,7 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
 
 
 def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
-    """Return the row of the gyro, or nothing if no gyro is configured."""
+    """Return a list with the row of the gyro, empty if no gyro is configured."""
     if gyro.does == "off":
         return []
     values, track = {"delay_s": f"{gyro.delay:.3f}"}, ""
@@ -262,7 +268,7 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
 
 
 def _recording(recording: Recording) -> list[Row]:
-    """Return the row of the recorder, or nothing if recording is switched off."""
+    """Return a list with the row of the recorder, empty if recording is switched off."""
     if not recording.where:
         return []
     missing = {"steps_missing": str(recording.missing)}
@@ -271,7 +277,7 @@ def _recording(recording: Recording) -> list[Row]:
 
 
 def _latch_file(trouble: str | None) -> list[Row]:
-    """Return the row of the latch file, or nothing if latches are not stored."""
+    """Return a list with the row of the latch file, empty if latches are not stored."""
     if trouble is None:
         return []
     return [Row("latch file", WARN if trouble else OK, trouble or "written", {})]

@@ -51,7 +51,10 @@ def encoding_name(form: Format, type_name: str = "") -> str:
 
 
 def encode(message: object, form: Format) -> bytes:
-    """Return the encoded message. Raises `DecodeError` if `form` is CDR and the type has no CDR."""
+    """Return the encoded message.
+
+    Raises `DecodeError` if `form` is "cdr" and CDR cannot represent the type.
+    """
     if form == "cdr":
         return _codec(type(message)).encode(message)
     return _pack.encode(message) if form == "msgpack" else _text.encode(message)

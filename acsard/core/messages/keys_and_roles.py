@@ -43,9 +43,9 @@ class Topic(Struct, frozen=True):
     note: str
     """Meaning of the message."""
     publish: Role | None = None
-    """Least role that may put on the key. None means that no client may."""
+    """Least role that may put on the key. None means that no client may put on it."""
     subscribe: Role | None = None
-    """Least role that may follow the key. None means that no client may."""
+    """Least role that may subscribe to the key. None means that no client may subscribe to it."""
     query: Role | Literal["<role>"] | None = None
     """Least role that may query the key. `<role>` means the role that the key ends with."""
     local: bool = False
@@ -111,7 +111,7 @@ SERVICES: dict[Verb, Service] = {
         '{"settings": {"limits.linear_speed": 0.8}}',
     ),
 }
-"""All services by verb. Each interface takes its facts about a service from this table."""
+"""All services by verb. The bus, ROS, the page and the tools take their facts from this table."""
 
 PLAIN_SERVICES = tuple(
     verb for verb, service in SERVICES.items() if service.optional or not service.payload
@@ -247,11 +247,11 @@ FOLLOWED: tuple[Topic, ...] = tuple(
 """The rows of keys that clients can follow: the published keys and the simulator's gyro."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The rows of keys on which the daemon publishes. To a query it replies with the last message."""
+"""The rows of keys on which the daemon publishes. A query gets the last message."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
-    """Return the rows that a daemon with this configuration has."""
+    """Return the rows of the table whose keys exist with this configuration."""
     simulated, gyro, urdf = config.mcu.simulated, config.odometry.gyro, bool(config.ros.urdf)
     return tuple(
         topic
@@ -263,7 +263,7 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows that a daemon with this configuration publishes.
+    """Return the rows of the keys on which a daemon with this configuration publishes.
 
     The simulator also publishes its gyro.
     """

@@ -84,4 +84,4 @@ SHORT: dict[type, Callable[[Any], list[str]]] = {
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }
-"""Types with a short form, and the functions that make it."""
+"""The types with a one-line form, each with the function that returns its parts."""

@@ -59,8 +59,8 @@ def least_role(key: str) -> Role:
     """Return the least role that may use `key`, the part of the full key after the robot's id.
 
     To use a key means to put on it if the daemon receives on it, to query it if the daemon answers,
-    and otherwise to subscribe to it. An unknown key gets the lowest role. This function does not
-    grant permissions: its result is for the hint to a client that has received nothing.
+    and otherwise to subscribe to it. For an unknown key the function returns the lowest role. That
+    result grants no permission: it is for the hint to a client that has received nothing.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:
@@ -74,4 +74,4 @@ SERVICE_ROLES: dict[Verb, Role] = {verb: least_role(key) for key, verb in VERBS.
 """The least role that may call each service."""
 
 COMMAND_ROLE = least_role("cmd/<source>/<certificate>")
-"""The least role that may command."""
+"""The least role that may command the robot."""

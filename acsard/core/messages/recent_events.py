@@ -2,7 +2,8 @@
 
 An event that repeats is one row with a count. If each repetition had its own row, a computer that
 misses a control period every second would push a fault out of the twenty rows within 20 s. An event
-whose `news` is true always gets its own row. The log, in contrast, has a line for each of them.
+whose `news` is true always gets its own row. The log, in contrast, has a line for each event that
+is added here.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from acsard.core.motion.event_throttle import together
 from acsard.core.values import NS_PER_S, Event, Instant
 
 LAST = 20
-"""Number of rows. So many rows are kept that a client that polls slowly seldom misses an event."""
+"""Number of rows that are kept, so that a client that polls slowly seldom misses an event."""
 
 PAUSE_NS = 60 * NS_PER_S
 """Time without a repetition after which an event of the same name gets a new row."""

@@ -36,7 +36,7 @@ Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
 LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
-"""Number of a latch. JavaScript represents it exactly."""
+"""Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
 """Maximum length of a list. A longer one is refused quickly, and no robot has as many joints."""
@@ -45,7 +45,7 @@ FEW = Meta(max_length=64)
 def one_of(values: Iterable[object]) -> Meta:
     """Return the annotation that lists the possible values of a field in its JSON Schema.
 
-    Decoding accepts other values, which a later version may have.
+    Decoding accepts other values too, because a later version may send them.
     """
     return Meta(extra_json_schema={"enum": list(values)})
 
@@ -196,7 +196,7 @@ class Imu(Message, frozen=True):
 
 
 class SpeedLimit(Message, frozen=True):
-    """A limit on the speed below the configured one, as nav2_msgs/SpeedLimit; 0.0 lifts it."""
+    """A limit that lowers the robot's highest speed, as nav2_msgs/SpeedLimit; 0.0 lifts it."""
 
     header: Header
     percentage: bool
@@ -250,10 +250,10 @@ class BatterySummary(Message, frozen=True):
     amps: float | None
     """Current, A. It is negative while the battery discharges."""
     level: Annotated[str, one_of(get_args(BatteryLevel))]
-    """Level by the thresholds in `[battery]`; `ok` if none is set.
+    """Level according to the thresholds in `[battery]`; `ok` if none is set.
 
-    `unknown` means that the board no longer reports the battery, or not the quantity (V or %) of
-    the thresholds.
+    `unknown` means that the board no longer reports the battery, or does not report the quantity (V
+    or %) that the thresholds use.
     """
 
 
@@ -313,13 +313,13 @@ class RobotState(Message, frozen=True):
     The text begins with "valid" as long as the certificate is valid for 30 more days.
     """
     latencies: dict[str, Latency] = {}
-    """Latencies of the daemon by the names in `daemon/latencies.py`, up to one second old."""
+    """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
     """State of the gyro, which shows whether the odometry uses it."""
     encoder_counts: list[int] = []
     """Configured encoder counts per wheel turn, in the order of `wheels`.
 
-    0 means that they are not configured, or that the speeds are not whole counts of them.
+    0 means that the counts are not configured, or that the reported speeds are not whole counts.
     """
     wheel_fault: str = ""
     """The wheel that the pose leaves out, or the side that slips, in words; else empty."""
@@ -328,7 +328,7 @@ class RobotState(Message, frozen=True):
     effective_track: str = ""
     """Effective track divided by the wheel separation, in words.
 
-    The text has the learned and the configured value, and says which one is in use. It is empty
+    The text gives the learned and the configured value, and says which one is in use. It is empty
     until a value is learned from the gyro.
     """
     recording_error: str = ""
@@ -361,7 +361,7 @@ class RobotState(Message, frozen=True):
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
-    If the daemon could not start again with that file, the text has the reason. A setting that a
+    If the daemon could not start again with that file, the text gives the reason. A setting that a
     speed limit lowers is not listed.
     """
     speed_limit: str = ""
@@ -370,9 +370,9 @@ class RobotState(Message, frozen=True):
     It is empty if no speed limit lowers it.
     """
     certificate_days: float | None = None
-    """Remaining days of the certificate that ends first, of those that TLS needs.
+    """Number of days until the first of the certificates that TLS needs expires.
 
-    The number is negative after the end. It is null without TLS, and while the end is unknown.
+    The number is negative after that. It is null without TLS, and while the expiry is unknown.
     """
 
 
@@ -456,7 +456,7 @@ class Events(Message, frozen=True):
 
 
 class ServiceReply(Message, frozen=True):
-    """Result of a service call. `message` has the outcome, or the mistake and its fix."""
+    """Result of a service call. `message` gives the outcome, or the mistake and its fix."""
 
     success: bool
     message: str
@@ -471,7 +471,7 @@ class SetPose(Message, frozen=True):
 
 
 class Release(Message, frozen=True):
-    """Payload of `clear` and `activate`."""
+    """Payload of the services `clear` and `activate`."""
 
     latch: LatchNumber | None = None
     """Number of the latch to release, as in `RobotState.latch`; null names no latch."""
@@ -500,7 +500,7 @@ class Info(Message, frozen=True):
 
 
 class HardwareInterface(Message, frozen=True):
-    """One line of `ros2 control list_hardware_interfaces`."""
+    """An interface of a joint, as in a line of `ros2 control list_hardware_interfaces`."""
 
     name: str
     kind: Annotated[str, one_of(("command", "state"))]
@@ -533,7 +533,7 @@ class Topics(Message, frozen=True):
 
 
 class WhoAmI(Message, frozen=True):
-    """The caller of the query as the daemon sees it."""
+    """The client that sent the query, as the daemon sees it."""
 
     role: Annotated[str, one_of(ROLES)]
     """The role in the queried key. The access rules show that the caller has at least this role."""

@@ -24,7 +24,7 @@ MAX_SENDER = 64
 """Largest number of characters in a sender id."""
 
 MAX_NAME = 40
-"""Largest number of characters of a public name. The other characters of an id are the secret."""
+"""Largest number of characters of the name in a public name. The rest of an id is the secret."""
 
 DIGITS = 16
 """Number of hexadecimal digits of the hash in a public name.
@@ -79,8 +79,8 @@ def public_name(sender: str, certificate: str = "") -> str:
     """Return the public name of a sender, such as "joystick/0b5d6c1f22a94e37 [laptop]".
 
     It consists of the name before the last "/" of the id, the first 16 hexadecimal digits of the
-    SHA-256 of the whole id, and the common name of the certificate. An id without a name gives the
-    digits alone. A sender without a certificate has no brackets.
+    SHA-256 of the whole id, and the common name of the certificate. If the id has no
+    name, the public name is the digits alone. Without a certificate there are no brackets.
 
     Args:
         sender: the sender id, or the id of a Zenoh session, which signs the timestamps of samples.

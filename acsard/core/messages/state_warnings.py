@@ -47,7 +47,7 @@ class StateWarning(Struct, frozen=True):
     """The details that the robot reports; "" if `brief` already says everything."""
 
     def __str__(self) -> str:
-        """Return all words in one line, printable."""
+        """Return the warning as one printable line."""
         return printable(f"{self.brief}: {self.text}" if self.text else self.brief)
 
 

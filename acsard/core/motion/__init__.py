@@ -1,2 +1,1 @@
-"""Pure package for the motion of the base: kinematics, odometry, choice of command, limits and
-modes."""
+"""The motion of the base, without I/O: kinematics, odometry, choice of command, limits, modes."""

@@ -1,15 +1,19 @@
-"""Chooses one command among many commanders: first the source, then the sender of that source.
+"""Chooses the one command that the robot follows: first the source, then the sender of that source.
 
-- The robot follows the live source of the highest priority. Among sources of equal priority the
-  first one keeps the robot until it falls silent. The same holds for the senders of one source.
-- A source that is not armed yet (`neutral.py`) holds its place with zero, so that no source of a
-  lower priority drives past it.
+A sender is live while its last command is not older than the timeout of its source, and a source is
+live while one of its senders is.
+
+- The robot follows the live source of the highest priority. Among sources of equal priority, the
+  robot follows the first one until that source falls silent. The same rule applies to the senders
+  of one source.
+- A live source that is not armed yet (`neutral.py`) keeps its priority, and the robot stands still.
+  Otherwise a source of lower priority would drive the robot in its place.
 - A source that sends zeros holds the robot still for any length of time, because an operator who
   wants that and a controller that has failed look the same. `state` and the log report such a
   source.
 
-`Objection` has a short name for each reason to refuse a command, and `arbiter_text.py` has the
-sentences for people. `values.Command` explains source, sender and clock.
+`Objection` lists a short name for each reason to refuse a command, and `arbiter_text.py` contains
+the sentences for people. `values.Command` explains source, sender and clock.
 """
 
 from __future__ import annotations
@@ -32,8 +36,8 @@ Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unp
 """The reason to refuse a command, or "" if the arbiter accepts it."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""Durations after which `state` reports that a sender still sends only zeros, or is still not
-armed, s."""
+"""Durations, s. When one of them is over, `state` reports that a sender has sent only zeros, or has
+not been armed, for at least this long."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -41,8 +45,9 @@ NOTHING, COMMAND = Wait("nothing"), Wait("command")
 class Choice(Struct, frozen=True):
     """The choice of the arbiter in one step.
 
-    If a sender may drive, `twist` is the twist to follow, `arrived_ns` is its monotonic arrival,
-    and `source` and `sender` name its origin. Otherwise `twist` is None and `wait` is the reason.
+    If a sender may drive, `twist` is the twist to follow, `arrived_ns` is the monotonic time at
+    which it arrived, and `source` and `sender` name its origin. Otherwise `twist` is None and
+    `wait` is the reason.
     """
 
     source: str = ""
@@ -53,7 +58,7 @@ class Choice(Struct, frozen=True):
 
 
 IDLE = Choice()
-"""The choice while no source is live and no stamps are refused."""
+"""The choice while no source is live and no command is refused because of its stamp."""
 
 
 class _Source:
@@ -92,19 +97,19 @@ class _Source:
         return added
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Return the rank of a sender, to compare it with other ones.
+        """Return a rank that can be compared with the ranks of other senders.
 
-        A sender that is armed and live ranks above one that is only armed, and that one above all
-        others. Among equals, the sender with the later last message ranks higher.
+        A sender that is armed and live ranks highest. A sender that is only armed comes next, and
+        then all others. Among equals, the sender with the later last message ranks higher.
         """
         sender = self.senders[name]
         armed = sender.armed(now_ns)
         return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """Disarm the sender `name` if it was armed by a zero whose stamp was never proven.
+        """Disarm the sender `name` if the zero that armed it came from a clock not proven yet.
 
-        `was_set` means that the clock of the sender was set. The sender must then send a new zero
+        `was_set` means that the clock of the sender was set. Then the sender must send a new zero
         in any case.
         """
         sender = self.senders.get(name)
@@ -116,14 +121,14 @@ class _Source:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """Return the live senders: armed ones before others, then those that came earlier."""
+        """Return the live senders: armed ones before others, and among equals the first to come."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live
         return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
 
     def latest_ns(self) -> int | None:
-        """Return the arrival of the last command that counted, of any sender, ns.
+        """Return the monotonic arrival, ns, of the last command of any sender that counted.
 
         Return None if no command has counted since `require_neutral`.
         """
@@ -145,7 +150,7 @@ class _Source:
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why this source waits if the stamps of its senders are refused, otherwise None."""
+        """Return why this source waits if stamps of its senders do not count, otherwise None."""
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
@@ -182,8 +187,9 @@ class Arbiter:
     def require_neutral(self, since_ns: int = 0) -> None:
         """Forget all commands, and require a zero from each sender before it drives again.
 
-        Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. A zero
-        that was sent before a stop was cleared does not show that its sender commands rest now.
+        Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. For
+        example, a zero from before a stop was cleared does not show that its sender commands rest
+        now.
         """
         self._since_ns = since_ns
         for source in self._ranking:
@@ -208,7 +214,8 @@ class Arbiter:
         if sender is None:
             return "too_many_senders"
         if verdict in ("set", "first"):
-            # A sender has one clock on all its sources, so the doubt concerns all its zeros.
+            # A sender uses one clock for all its sources, so the doubt about this clock concerns
+            # its zeros on every source.
             for other in self._ranking:
                 other.doubt(command.sender, verdict == "set")
         sender.take(command, self._since_ns, verdict)
@@ -217,9 +224,9 @@ class Arbiter:
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
         """Record that a message arrived that could not be decoded or was lost.
 
-        The message may have been a speed, so an earlier zero of its sender does not arm it any
-        more. `sender` is "" if the sender is unknown. The message may then be from any sender of
-        `source`.
+        The message may have been a speed, so an earlier zero of its sender no longer arms this
+        sender. `sender` is "" if the sender is unknown. The message may then come from any sender
+        of `source`.
         """
         known = self._sources.get(source)
         if known is None:
@@ -247,7 +254,8 @@ class Arbiter:
                 and source.priority == first[0].priority
                 and kept.armed(now_ns)
             ):
-                # A sender that came before `kept` may have become armed only now, but `kept` stays.
+                # A sender that came before `kept` may have become armed just now. The robot still
+                # follows `kept`.
                 first = source, kept
                 break
         if first is None:
@@ -268,10 +276,10 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return which other sender sends speeds in vain while the holder sends zeros.
+        """Return whose speeds have no effect because the source `holder` sends zeros.
 
-        That is the name of its source, or words for another sender of the holder; "" if there is
-        none.
+        The result is the name of another source, or words for another sender of `holder`. It is ""
+        if no other sender sends speeds.
         """
         for source in self._ranking:
             senders = (each for each in source.live(now_ns) if each is not self._followed)
@@ -281,7 +289,7 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the delays, ns, that `Freshness` has forgiven foreign clocks."""
+        """Sum, ns, of the rises of foreign clocks' delays that no visible adjustment explains."""
         return self._freshness.forgiven_ns
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
@@ -305,7 +313,7 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """Return the largest of `LASTING_S` that a duration of `ns` has reached, s; 0.0 if none."""
+    """Return the largest value of `LASTING_S`, s, that a duration of `ns` has reached, or 0.0."""
     if ns < LASTING_S[0] * NS_PER_S:
         return 0.0  # as in nearly every step
     return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)

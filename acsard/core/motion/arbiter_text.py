@@ -22,9 +22,9 @@ REFUSED = {
 """The words for each reason to refuse a command."""
 
 MAX_SENDER = 124
-"""Number of characters of a sender's name that an event shows. A public name has up to 57, and 67
-with a certificate. A sender without an attachment is named after its key, which the sender may
-choose."""
+"""Largest number of characters of a sender's name that an event shows. A public name has up to 57
+characters, or 67 with a certificate. A sender without an attachment is named after its key, which
+the sender may choose."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` of a speed never sends one; "After a clear" in deploy/ros2/README.md '
@@ -33,14 +33,14 @@ ROS_NEVER = (
 
 
 def chosen(choice: Choice) -> str:
-    """Return which source the robot follows, or why it follows none."""
+    """Return words that say which source the robot follows, or why it follows none."""
     if choice.wait.what == "command":
         return "waiting for a command: no source has sent one within its timeout"
     return waiting(choice.wait) or f"commanded by {choice.source}"
 
 
 def waiting(wait: Wait) -> str:
-    """Return the sentence for what a source waits for, "" if it waits for nothing."""
+    """Return a sentence that says what a source waits for, "" if it waits for nothing."""
     match wait.what:
         case "nothing":
             return ""
@@ -77,13 +77,13 @@ def waiting(wait: Wait) -> str:
 
 
 def missed(periods: int) -> Event:
-    """Return the event for periods that ended without a step."""
+    """Return the event for `periods` control periods that ended without a step."""
     text = f"{periods} in a row"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 
 def refused(refusal: Refusal) -> Event:
-    """Return the event for a command that was refused, or that waits for the proof of its clock."""
+    """Return the event for a command that was refused, or that came from a clock not proven yet."""
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
@@ -96,12 +96,18 @@ class CommandEvents:
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""
-        """The source that was last logged because its speeds do not move the robot; "" if none."""
+        """The source for which the log last reported speeds without effect; "" without one."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
-        """Return the events for a change of the mode, with the reason `why`, and of the commander.
+        """Return the events for changes of the mode and of the commander.
 
-        The commander is compared with the last one that drove the robot, even if that was long ago.
+        The commander is the source and its sender. It is compared with the last one that drove the
+        robot, even if that was long ago.
+
+        Args:
+            mode: The present mode.
+            choice: The present choice of the arbiter.
+            why: The reason of the mode.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:
@@ -116,7 +122,7 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return one event when a source has sent speeds for a while that do not move the robot."""
+        """Return one event when the speeds of a source have had no effect for a while."""
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

@@ -1,11 +1,11 @@
 """Follows the battery that the board reports, and decides when it stops the robot.
 
-The thresholds in `[battery]` are compared with a mean, because the current of starting motors makes
-the voltage drop for some tenths of a second. `lifecycle.py` keeps the latch of a stop. Nothing
-releases it until the mean has risen above the threshold by `battery.hysteresis`.
+The thresholds in `[battery]` are compared with a mean over time, because the current of starting
+motors makes the voltage drop for some tenths of a second. `lifecycle.py` keeps the latch of a stop.
+Nothing releases this latch until the mean has risen above the threshold by `battery.hysteresis`.
 
-A board that falls silent about its battery does not stop the robot: a robot that stands still in
-the way is the greater danger, and the voltage falls slowly. The level is then "unknown".
+If a board no longer reports its battery, the robot does not stop: a robot that stands still in the
+way is the greater danger, and the voltage falls slowly. The level is then "unknown".
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ TIME_CONSTANT_S = 10.0
 A battery takes minutes from one level to the next, so the robot reacts soon enough."""
 
 SETTLE_S = 3.0
-"""Time after which the mean decides the level, s. It begins again after a silence. A motor start
-within this time lowers the mean by up to a tenth of the drop. A gap between two reports adds at
-most `LONGEST_NS` to this time."""
+"""Time with reports after which the mean decides the level, s. After a silence, this time begins
+again. A motor start within this time lowers the mean by up to a tenth of the voltage drop. A gap
+between two reports counts as at most `LONGEST_NS`."""
 
 SILENT_S = 5.0
-"""Age at which the daemon drops a value, s. A board that reports its battery once a second may lose
-four reports in a row."""
+"""Age at which the daemon drops a value, s. If a board reports its battery once a second, four
+reports in a row may be lost before that."""
 
 LONGEST_NS = 300_000_000
-"""Longest time by which the mean weights one report, ns: the duration of a motor start. A single
-report from the moment of a motor start would otherwise weigh too much after a gap, or if reports
-are rare. If a board reports once a second, its mean is therefore about three times as slow."""
+"""The mean weights each report by the time since the report before, but at most by this time, ns:
+the duration of a motor start. Otherwise one report from the moment of a motor start would weigh too
+much after a gap, or if reports are rare. If a board reports once a second, its mean is therefore
+about three times as slow."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
-"""The levels that a value can have, the best first."""
+"""The levels of a known battery, the best first."""
 
 MISSING = "the board has not reported its battery, but [battery] has thresholds"
 """The sentence for a battery that has thresholds but is never reported."""
@@ -81,18 +82,18 @@ class Battery:
         self.stopped_now = False
         """Whether the level fell to "stop" in the last `look`."""
         self._values: dict[str, tuple[float, int]] = {}
-        """The last values by name, each with its arrival, monotonic ns. Values older than
+        """The last values by name, each with its monotonic time of arrival, ns. Values older than
         `SILENT_S` are removed."""
         self._known: BatteryLevel = "ok"
-        """The last level that was not "unknown". It stays during a silence, which does not end a
-        stop."""
+        """The last level that was not "unknown". It does not change while the board is silent,
+        because silence does not end a stop."""
         self._told: BatteryLevel | None = None
-        """The level of the last event."""
+        """The level in the last event, None before the first one."""
         self._mean: float | None = None
         self._since_ns = self._mean_ns = 0
-        """Monotonic times of the first and the last report since the last silence, ns."""
+        """Monotonic times, ns, of the first and of the last report since the last silence."""
         self._stood_ns = 0
-        """Sum of the times by which the mean weights the reports since the last silence, ns."""
+        """Sum of the weights of the reports in the mean since the last silence, ns."""
 
     @property
     def held(self) -> bool:
@@ -101,7 +102,7 @@ class Battery:
 
     @property
     def why(self) -> str:
-        """Why the robot stops at the level "stop", in words without measured values."""
+        """The reason for the stop at the level "stop", in words without measured values."""
         return f"battery below {_threshold(self._config, 'stop')}"
 
     @property
@@ -111,7 +112,7 @@ class Battery:
         return f"charge it to {_with_unit(config, config.stop_below + config.hysteresis)}"
 
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
-        """Process the status lines since the last step, and return the event if the level is new.
+        """Process the status lines since the last step, and return an event if the level changed.
 
         Args:
             reports: The status lines, each with its monotonic time of arrival, ns.
@@ -150,8 +151,8 @@ class Battery:
             self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
             self._stood_ns = 0
         elif at_ns > self._mean_ns:
-            # During the first `TIME_CONSTANT_S`, this is the plain mean of all reports, weighted by
-            # time.
+            # During the first `TIME_CONSTANT_S`, the result is the time-weighted mean of all
+            # reports. After that, it is an exponential mean.
             stood_ns = min(at_ns - self._mean_ns, LONGEST_NS)
             self._stood_ns += stood_ns
             span_ns = min(TIME_CONSTANT_S * NS_PER_S, self._stood_ns)

@@ -1,15 +1,14 @@
 """Follows the bumpers that the board reports, and decides which motion they allow.
 
-A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"` it latches a stop,
-as the emergency stop does. With "away" it latches nothing, but each sender must send a zero before
-the robot moves again. Until the bumper is released, the robot drives only straight away from it, at
-most at `AWAY_SPEED`. No turn is allowed until then, because a corner of the robot could sweep into
-the obstacle. A robot with four wheels cannot move sideways, so no motion leads away from the left
-or the right.
+A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"`, the press also
+latches a stop, as the emergency stop does. With "away", the press latches nothing, but each sender
+must send a zero before the robot moves again. Until the bumper is released, the robot drives only
+straight away from it, at `AWAY_SPEED` or less. No turn is allowed until then, because a corner of
+the robot could sweep into the obstacle. A robot with four wheels cannot move sideways, so no motion
+leads away from a bumper at the left or the right.
 
-If a board has reported bumpers and falls silent about them, a stop is latched in both cases. A
-bumper is not a safety function, just as the emergency-stop input is not: the status line may be
-lost or late.
+If a board has reported bumpers and no longer does, a stop is latched with either setting. Like the
+emergency-stop input, a bumper is not a safety function: the status line may be lost or late.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ AWAY_SPEED = 0.1
 """Highest speed away from a pressed bumper, m/s."""
 
 DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
-"""Sign of the linear speeds that lead away from a bumper at this place, 0 if none does."""
+"""Sign of the linear speeds that lead away from a bumper at each place; 0 if no speed does."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
@@ -59,10 +58,10 @@ def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
 
 
 class Bumpers(BoardInput):
-    """The state of all bumpers."""
+    """The state of all bumpers of one robot."""
 
-    # In contrast to `TABLE`, silence counts even while a bumper is pressed, because a silent board
-    # cannot report that another one is pressed.
+    # In contrast to `TABLE`, silence changes the state even while a bumper is pressed, because a
+    # silent board cannot report the press of another bumper.
     table = TABLE | {("pressed", "silence"): "silent"}
     silent, events = SILENT, ("bumper_pressed", "bumper_released")
 
@@ -72,7 +71,7 @@ class Bumpers(BoardInput):
         self._places = safety.bumpers
         self._away = safety.bumper == "away" and len(safety.bumpers) > 0
         self._count = 0
-        """Number of bumpers in the last status line with bumpers."""
+        """Number of bumpers in the last status line that reported any."""
 
     @property
     def limiting(self) -> bool:
@@ -86,14 +85,14 @@ class Bumpers(BoardInput):
 
     @property
     def held(self) -> str:
-        """The reason for which `clear` must not release a stop, in words; "" if there is none."""
+        """Why the call `clear` must not release a stop now, in words; "" if it may."""
         return self.why if self.latching else ""
 
     def away(self, twist: Twist) -> Twist | None:
         """Return the part of a twist that the pressed bumpers allow, None if they allow none of it.
 
-        For rest that is rest. For a twist that leads away from every pressed bumper, it is the
-        straight part, limited to `AWAY_SPEED`. Every other twist is forbidden.
+        Rest is always allowed. Of a twist that leads away from every pressed bumper, only the
+        straight part is allowed, up to `AWAY_SPEED`. Every other twist is forbidden.
         """
         if twist == REST:
             return REST
@@ -101,7 +100,7 @@ class Bumpers(BoardInput):
         return Twist(self._direction() * min(speed, AWAY_SPEED)) if speed > 0.0 else None
 
     def note(self) -> str:
-        """Return a sentence: which bumpers are pressed, and which motion they still allow."""
+        """Return a sentence with the pressed bumpers and the motion that they still allow."""
         allowed = ALLOWED.get(self._direction())
         if allowed is None:
             return f"{self.why}: no motion leads away, so the robot stands until the release"
@@ -110,9 +109,9 @@ class Bumpers(BoardInput):
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return whether each bumper is pressed according to a status line.
 
-        Return None if the line has no bumpers, or has the wrong number of them. Such a line may
-        have lost a pressed one, so it must not release any. Without configured places, a line with
-        a pressed bumper is accepted with any number.
+        Return None if the line reports no bumpers, or the wrong number of them. The report of a
+        pressed bumper may be missing from such a line, so the line must not release any bumper.
+        If no places are configured and a bumper is pressed, the line may report any number.
         """
         bumpers = status.bumpers
         if bumpers is None:
@@ -128,7 +127,7 @@ class Bumpers(BoardInput):
         return pressed_words(self._places, self.pressed or ())
 
     def advice(self) -> str:
-        """Return what the robot does or the operator must do after a press, for the log."""
+        """Return words for the log: what the robot or the operator can do after a press."""
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:

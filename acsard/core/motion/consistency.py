@@ -1,17 +1,17 @@
 """Compares the wheels with each other, with their commands and with a gyro.
 
-`ConsistencyChecks` is the one interface of these checks. For each feedback line it reports to the
+`ConsistencyChecks` is the only interface to these checks. For each feedback line, it reports to the
 odometry which wheels to believe, whether they slip, and by how much the robot turned according to
-the gyro:
+the gyro. It uses three modules:
 
 - `wheel_faults.py` compares the two wheels of each side with each other and with their command. It
   ignores a wheel whose encoder is proved faulty. If the contradiction lasts, it reports a fault,
   which stops the robot.
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the believed wheels.
-- `learned_track.py` chooses the effective track by which the wheels turn the robot; the comparison
-  with a gyro teaches it.
+- `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
+  come out right): the configured one, or one learned from the comparison with a gyro.
 
-Each check uses the findings of another one, and only this module knows their order.
+Each check uses the results of another one, and only this module knows the order of the checks.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from acsard.core.values import Event, GyroSample, GyroStatus
 
 
 class ConsistencyChecks:
-    """All checks of one robot. For each line call `look`, and then `learn`."""
+    """All checks of one robot. The caller calls `look` and then `learn` for each feedback line."""
 
     def __init__(
         self,
@@ -41,8 +41,8 @@ class ConsistencyChecks:
         """Start.
 
         Args:
-            odometry: The table `[odometry]`, which says whether there is a gyro and whether it
-                teaches the track.
+            odometry: The table `[odometry]`, which says whether there is a gyro, and whether the
+                effective track is learned from it.
             kinematics: The kinematics of the base.
             encoder_counts: Counts per wheel turn, 0 if unknown.
             feedback: The table `[feedback]` with the wheels' response time and fault time.
@@ -53,11 +53,13 @@ class ConsistencyChecks:
         multiplier = kinematics.multipliers[2]
         self._track = LearnedTrack(multiplier) if odometry.learned_track else None
         self._by_wheels = 0.0
-        """Turn of the last line according to the wheels, rad."""
+        """Turn of the robot in the last line according to the wheels, rad."""
         self.turn: Turn | None = None
-        """Turn of the last line according to the gyro; None if the wheels provide the turn."""
+        """Turn of the robot in the last line according to the gyro; None if the odometry must use
+        the wheels instead."""
         self.on_trial = False
-        """Whether the gyro will correct the wheels' turn of the last line once it is proven."""
+        """Whether the wheels provided the turn of the last line, and the gyro will correct it when
+        the gyro is proven to work."""
         self.slips = False
         """Whether the wheels slip: they contradict each other or the gyro."""
         self.events: list[Event] = []
@@ -65,7 +67,7 @@ class ConsistencyChecks:
 
     @property
     def gyro_status(self) -> GyroStatus:
-        """The state of the gyro, and the use of the track that it teaches."""
+        """The state of the gyro, and the use of the effective track that was learned from it."""
         status = GyroStatus() if self.gyro is None else self.gyro.status
         return status if self._track is None else replace(status, track_use=self._track.use)
 
@@ -80,10 +82,10 @@ class ConsistencyChecks:
             self.gyro.forgive()
 
     def look(self, line: Feedback, rolled: Rolled) -> bool:
-        """Check a feedback line and `rolled`, the turns of the wheels since the line before it.
+        """Check a feedback line and `rolled`, the wheel angles since the line before it.
 
-        Return whether a wheel has proved faulty. The caller must then recompute the earlier lines
-        without this wheel.
+        Return whether a wheel is now known to be faulty. The caller must then recompute the earlier
+        lines without this wheel.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -101,9 +103,9 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Record that the wheels' turn during the gyro's trial was corrected by `turn` rad.
+        """Record that the caller corrected the wheels' turn during the gyro's trial by `turn` rad.
 
-        Return the part of this correction that the gyro has already made, rad.
+        Return the part of this correction that the gyro has already applied to the pose, rad.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 

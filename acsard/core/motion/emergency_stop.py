@@ -1,13 +1,12 @@
 """Follows the safety inputs that the board reports, and decides when one of them counts as pressed.
 
-`BoardInput` has the common mechanism. `EmergencyStop` uses it for the emergency stop, and
-`bumpers.py` uses it for the bumpers. A board that has reported an input once must go on: if it is
-silent about it for `SILENT_S`, the input counts as pressed. A cable may be cut, or the emergency
-stop may have cut the board's own supply. `lifecycle.py` keeps the latch, which only `clear`
-releases.
+`BoardInput` is the common base class of `EmergencyStop` and of the bumpers (`bumpers.py`). A board
+that has reported an input once must continue to report it. If it does not report it for `SILENT_S`,
+the input counts as pressed: a cable may be cut, or the emergency stop may have cut the board's own
+supply. `lifecycle.py` keeps the latch of the stop, which only the call `clear` releases.
 
-The emergency stop here is not the safety function. The hardware emergency stop cuts the motors by
-itself. The daemon is only informed of that, commands zeros, and keeps the robot stopped after the
+This software is not the safety function. The hardware emergency stop cuts the power of the motors
+by itself. The daemon only learns of that, commands zeros, and keeps the robot stopped after the
 button is released.
 """
 
@@ -33,36 +32,40 @@ TABLE: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "ok"): "released",
     ("silent", "pressed"): "pressed",
 }
-"""Maps (state, sign) to the next state. For a pair without an entry, the state does not change."""
+"""Maps (state, sign) to the next state, where the sign is the news from the board: the input is not
+pressed (`ok`), is pressed, or was not reported (`silence`). A pair without an entry does not change
+the state."""
 
 SILENT_S = 0.5
 """Seconds without a report of the input after which it counts as pressed. A board reports the input
 ten times a second, so five lines in a row are lost by then."""
 
 LATE_NS = 150_000_000
-"""Time between two steps above which this computer was late, ns. The longest period that can be
-configured is 100 ms."""
+"""If two steps are further apart than this time, ns, this computer was late. The longest control
+period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
-"""Further time, ns, in which the daemon reads the lines that arrived while this computer was late,
-before it calls the board silent. It grants this time only once between two reports, so a computer
-that is always late does not delay the stop forever."""
+"""Extra time, ns, before the board counts as silent after this computer was late. The daemon reads
+the lines that arrived in the meantime. It grants the extra time only once between two reports, so a
+computer that is always late does not delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = f"the board reported no emergency-stop input for {SILENT_S:g} s, which counts as pressed"
 
 RELEASE, CHECK = "release it there", "check the board and its cable"
-"""What to do before `clear` if an input is pressed, and if the board is silent about it."""
+"""What the operator must do before the call `clear`: if an input is pressed, and if the board does
+not report it."""
 
 MISSING = (
     'safety.estop = "required", but the microcontroller has not reported an emergency-stop input: '
     "does its firmware send status lines with `estop=`?"
 )
-"""The sentence if the robot does not become ready because the board never reported the input."""
+"""The sentence for a robot that is not ready because the board has never reported the input."""
 
 DRIVER_FAULT = "the board reports a fault of a motor driver"
 DRIVER_MEND = "mend it, or switch the robot off and on"
-"""Reason of the fault that the board reports with `driver=fault`, and what to do before `clear`."""
+"""`DRIVER_FAULT` is the reason of the fault that the board reports with `driver=fault`, and
+`DRIVER_MEND` is what the operator must do before the call `clear`."""
 
 
 class BoardInput(ABC):
@@ -70,7 +73,7 @@ class BoardInput(ABC):
 
     table = TABLE
     silent: str
-    """The sentence for a robot that is stopped because the board is silent about the inputs."""
+    """The sentence for a robot that is stopped because the board does not report the inputs."""
     events: tuple[EventName, EventName]
     """The names of the events of a press and of a release."""
 
@@ -81,7 +84,7 @@ class BoardInput(ABC):
         self.pressed: tuple[bool, ...] | None = None
         """Whether each input counts as pressed, None if the board has never reported them."""
         self.pressed_now = ""
-        """The reason if an input began to count as pressed in the last `look`, otherwise ""."""
+        """Why an input began to count as pressed in the last `look`, in words; "" if none did."""
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
@@ -94,7 +97,7 @@ class BoardInput(ABC):
 
     @property
     def mend(self) -> str:
-        """What to do before `clear` while an input counts as pressed."""
+        """What the operator must do before the call `clear` while an input counts as pressed."""
         return CHECK if self.state == "silent" else RELEASE
 
     @property
@@ -135,7 +138,7 @@ class BoardInput(ABC):
 
     @abstractmethod
     def words(self) -> str:
-        """Return words that say which inputs are pressed, as the reason of a stop."""
+        """Return words that say which inputs are pressed, for use as the reason of a stop."""
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
@@ -167,7 +170,7 @@ class EmergencyStop(BoardInput):
     silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether a status line reports a press, as a tuple of one.
+        """Return whether a status line reports a press, as a tuple with one element.
 
         Return None if the line does not report the input.
         """

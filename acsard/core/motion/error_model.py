@@ -1,25 +1,27 @@
-"""The error model of the odometry: the noise of a step, the errors of parameters, and of the twist.
+"""The error model of the odometry: noise of a step, errors of parameters, and errors of the twist.
 
-In a step the sides of the robot roll the distances dl and dr, m. Their errors are independent and
-have the variances k |dl| and k |dr| (Siegwart, Nourbakhsh & Scaramuzza, Introduction to Autonomous
-Mobile Robots, 5.2.4), where k is in m. The step has the distance d = (dl + dr) / 2 and the turn
-dyaw = (dr - dl) / L, where L is the effective track, m. Its errors are therefore
+In a step, the left and the right side of the robot roll the distances dl and dr, m. The errors of
+these distances are independent and have the variances k |dl| and k |dr|, where k is in m (Siegwart,
+Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2.4). The step has the distance
+d = (dl + dr) / 2 and the turn dyaw = (dr - dl) / L, where L is the effective track, m. The errors
+of these two are therefore
 
     var(d) = k (|dl| + |dr|) / 4
     var(dyaw) = k (|dl| + |dr|) / L^2
     cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
 
-The settings allow more than these equations. If the sides were the only cause of errors,
+The settings can describe more errors than these. If the sides were the only cause of errors,
 `distance_variance_per_metre` D would be k / 2, and `yaw_variance_per_metre` Y would be 2 k / L^2.
 The model uses k = min(2 D, Y L^2 / 2) for the sides. The remaining part of D or Y is an error of
 the robot as a whole. In addition, skidding gives each turn the variance `yaw_variance_per_radian`.
 
 The errors of the parameters do not average out, so they are not noise (Borenstein & Feng,
-Measurement and Correction of Systematic Odometry Errors in Mobile Robots, 1996). `columns` gives
-the effect of each parameter on a step if the parameter is off by one standard deviation.
+Measurement and Correction of Systematic Odometry Errors in Mobile Robots, 1996). `columns` returns
+one column for each parameter: the error of a step if this parameter is off by one standard
+deviation.
 
-`ErrorModel` has the noise and the columns for the settings and the track in use. The covariance of
-the pose (`uncertainty.py`) and that of the twist (`TwistUncertainty`) use both.
+`ErrorModel` holds the noise and the columns for the settings and the track in use. The covariance
+of the pose (`uncertainty.py`) and that of the twist (`TwistUncertainty`) use both.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ A single period means little, because several lines may be read at the same time
 
 
 class Noise:
-    """The noise of a step."""
+    """The variances of the noise of a step."""
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
         """Compute the noise for these settings and this effective track, m."""
@@ -95,7 +97,7 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of a step and the effects of the parameters, for the settings and track in use."""
+    """The noise of a step and the columns of the parameters, for the settings and track in use."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
         """Start with the configured track."""
@@ -108,7 +110,7 @@ class ErrorModel:
     def use(self, odometry: OdometryConfig) -> None:
         """Use the noise of these settings from now on.
 
-        The uncertainty of the parameters stays that of the settings at the start.
+        The uncertainty of the parameters stays as it was configured at the start.
         """
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
@@ -124,13 +126,13 @@ class ErrorModel:
 def columns(
     odometry: OdometryConfig, kinematics: Kinematics, learned: Track | None = None
 ) -> tuple[Column, ...]:
-    """Return the effect of each uncertain parameter if it is off by one standard deviation.
+    """Return the error of a step for each parameter that is off by one standard deviation.
 
     The parameters are the multipliers m_l, m_r and m_L in
 
         dl = r m_l phi_l,   dr = r m_r phi_r,   dyaw = (dr - dl) / (m_L b)
 
-    the ratio m_r / m_l, a scale that multiplies all lengths, and the share of each distance that
+    the ratio m_r / m_l, a scale that multiplies all lengths, and the fraction of each distance that
     the wheels lose by slip. r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are
     the wheel angles. A parameter with a standard deviation of 0 has no column.
 
@@ -174,25 +176,25 @@ class TwistUncertainty:
     - q is the quantization step of the wheel speeds. Each wheel has the variance q^2 / 12. a_v and
       a_w follow from the kinematics, with two wheels on each side.
     - T is the mean period of the feedback lines. A line reports the mean speed over one period.
-    - var(d) and var(dyaw) are the noise of one period. Integrating the twists gives the noise of
-      the pose.
+    - var(d) and var(dyaw) are the noise of one period. Therefore the integral of the twists has the
+      noise of the pose.
     - The sums are over the parameters, and c_1 to c_4 are the numbers of a column (`columns`).
 
     If the wheels slip, the variances are multiplied by `SLIPPING`. If the robot rests, only a
-    motion that the encoders could not show remains uncertain.
+    motion that is too small for the encoders remains uncertain.
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
         """Start. `counts` are the encoder counts per wheel turn, 0 if unknown."""
         self._model = model
         self._count = math.tau / counts if counts else 0.0
-        # The errors of the four wheels are independent, and each side is the mean of two.
+        # The errors of the four wheels are independent, and each side is the mean of two wheels.
         self._to_linear = model.radius**2 / 4 / 12
         self._period = PERIOD
         self.bend()
 
     def bend(self) -> None:
-        """Use the present track of the model from now on."""
+        """Use the track that the model uses now, from now on."""
         self._to_angular = self._model.radius**2 / self._model.track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
@@ -247,6 +249,6 @@ class TwistUncertainty:
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
         """Return the variances if a gyro measures the turn rate.
 
-        `angular` is the variance of the turn rate by the gyro, rad2/s2.
+        `angular` is the variance of the gyro's turn rate, rad2/s2.
         """
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -2,8 +2,8 @@
 number of events.
 
 At first a few lines of one name may be written at once, and after that one per second. The throttle
-counts the events in between and reports them with the next line. So neither a client that floods
-the bus nor a wire that flaps can flood the log.
+counts the events in between and reports their number with the next line. So neither a client that
+floods the bus nor a serial line with a loose contact can flood the log.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from typing import get_args
 from acsard.core.values import NS_PER_S, Event, EventName, Level
 
 BURST = 5
-"""Lines of one name that may be written at once: as fast as people press buttons."""
+"""Number of lines of one name that may be written at once: enough for a person who presses
+buttons."""
 
 MOST = 8
-"""Number of kinds, and of senders' names, that one line distinguishes. Any client may send under
-any number of names."""
+"""Largest number of kinds, and of clients' names, that one line lists. The limit is needed because
+a client may use any number of names."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -41,7 +42,7 @@ class _Held:
         _count(self._by, event.by, event.count)
 
     def line(self) -> Event:
-        """Return the waiting events as one, with their worst level and the text of the last."""
+        """Return one event for all waiting ones, with the worst level and the text of the last."""
         last, what = self.last, _numbered(self._kinds)
         if self.count > last.count and last.text:
             what = f"{what or f'{self.count} times'}; the last"
@@ -56,11 +57,11 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._free_ns: dict[EventName, int] = {}
-        """Monotonic time at which the lines of a name that were written so far would be finished at
-        one per second, ns."""
+        """For each name, the monotonic time, ns, at which the lines so far would end if they were
+        written one per second."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Add new events; return the events to log now, both new and waiting ones."""
+        """Add new events, and return the events to log now, which may include older ones."""
         if not (events or self._held):
             return ()
         for event in events:
@@ -69,10 +70,10 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line of this name may be written now. If so, count it as written.
+        """Return whether a line of this name may be written now, and if so, count it as written.
 
-        `news` says whether a waiting event is marked as news. If none is, only one line may be
-        written at a time.
+        `news` is whether any of the waiting events is marked as news. If none is, lines may not be
+        written in a burst.
         """
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
@@ -86,7 +87,10 @@ NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
 
 
 def together(before: Event, line: Event) -> Event:
-    """Merge two lines of one event name: the result has the total number and the last text."""
+    """Merge `before` and the later `line` of the same event name into one line.
+
+    The result contains the total number of events and the text of `line`.
+    """
     count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))

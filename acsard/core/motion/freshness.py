@@ -1,16 +1,18 @@
-"""Decides whether a stamped command is fresh. The sender's clock is not synchronized with ours.
+"""Decides whether a stamped command is fresh, although the sender's clock is not synchronized.
 
-The arrival by our clock minus the stamp by the sender's clock is the delay plus an unknown offset.
-The offset cancels out if each delay is compared with the minimum of all delays. A command is stale
-if its delay exceeds the minimum by more than its timeout, or if its stamp lies before that of an
-accepted command. A clock is in one of two states:
+The stamp is the time of sending by the sender's clock. The arrival by our clock minus the stamp is
+the delay plus an unknown offset, which is here called the delay too. The offset cancels out if each
+delay is compared with the minimum of all delays. A command is stale if its delay exceeds the
+minimum by more than the timeout of its source, or if its stamp is earlier than that of an accepted
+command. The clock of a sender is in one of two states:
 
-    new      the minimum is not known: a proof must first show that the delays no longer fall, as
-             they do while a backlog arrives
+    new      the minimum is not known: a test of several commands, the proof, must first show that
+             the delays no longer fall, as they do while a backlog arrives
     known    the minimum is trusted, until a proof shows another one
 
 There are two kinds of clocks. A *steady* clock is never adjusted. Our client, tools and web page
-declare that with `"steady": true`. If its command looks late, it is late and stays refused.
+declare that with `"steady": true`. If a command with such a stamp looks late, the command is really
+late, and it stays refused.
 
 A *foreign* clock may be set or slewed, which looks like a change of the delay. If the new delay
 proves constant, it is trusted, and the sender must return to neutral. A congested network can look
@@ -30,27 +32,28 @@ from typing import Literal
 from acsard.core.values import NS_PER_S, Command
 
 DRIFT = 5000
-"""Largest drift between the two clocks: less than one part in 5000, twice the error of a bad
-crystal."""
+"""Bound on the drift between the two clocks: they differ by less than one part in 5000, twice the
+error of a bad crystal."""
 
 FORGET_NS = 250 * NS_PER_S
-"""Pause after which the clock is new again, because the drift may be 50 ms by then, ns. The stamps
-must show the pause too. If only the arrivals show it, a network held the commands back, and the
-clock stays known."""
+"""Pause, ns, after which a clock is new again, because it may have drifted by 50 ms. Both the
+arrivals and the stamps must show the pause. If only the arrivals show it, a network held the
+commands back, and the clock stays known."""
 
 KEEP_NS = 3600 * NS_PER_S
 """Silence after which a clock is forgotten to save memory, ns."""
 
 EARLY_NS = NS_PER_S // 20
-"""A fall of the delay by more than this is not jitter: a backlog arrives, or the clock was set."""
+"""A fall of the delay by more than this, ns, is a backlog or a clock that was set, not jitter."""
 
 WAVER_NS = NS_PER_S
-"""A rise of the delay by more than this is not jitter, ns: the network held commands back."""
+"""A rise of the delay by more than this, ns, is not jitter: the network held commands back."""
 
 EVEN, CREPT = 200, 20
 """A proof compares the minimum delays of its two halves. They may differ by the duration of the
-proof divided by `EVEN`, or by `CREPT` for a clock that crept away. The centres of the halves are
-half a duration apart, so the allowed slopes are 1 % and 10 %. NTP slews a clock by up to 8.3 %."""
+proof divided by `EVEN`. If the delay creeps (see `CREEP`), they may differ by the duration divided
+by `CREPT`. The centres of the halves are half a duration apart, so the allowed slopes are 1 % and
+10 %. NTP slews a clock by up to 8.3 %."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if its change between two commands is at most the time between them divided by
@@ -60,26 +63,26 @@ LONGEST_PROOF_NS = 2 * NS_PER_S
 """Longest duration of a proof, ns. A proof takes the timeout of the source if that is shorter."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Least duration of the proof after a jump of the delay, ns. The jump is more likely a backlog that
-arrives in bursts than a clock that was set."""
+"""Shortest duration of a proof after a jump of the delay, ns. Such a jump more likely comes from a
+backlog that arrives in bursts than from a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
 """Silence that ends a proof, ns. If both the stamps and the arrivals show a pause of this length, a
-foreign clock may have been set by any amount meanwhile. Sequence numbers distinguish a pause from
-lost commands."""
+foreign clock may have been set by any amount during the pause. Sequence numbers distinguish a pause
+from lost commands."""
 
 STANDS_NS = 10_000
-"""Largest difference of two stamps that shows a clock set back, ns, if the two commands did not
-arrive together. The clock was then set back by the time between the arrivals. Zenoh's own clock
-never goes back: it advances by a fraction of a microsecond for each message until the wall clock
-has caught up."""
+"""If the stamps of two successive commands differ by at most this, ns, but the commands did not
+arrive together, the clock was set back by about the time between the arrivals. The second stamp
+need not be the earlier one: Zenoh's own clock never goes back, but advances by a fraction of a
+microsecond for each message until the wall clock has caught up."""
 
 APART_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other may have been sent together, ns."""
 
 TOGETHER_NS = NS_PER_S // 2000
-"""Commands that arrive within this time of each other come out of one queue, the oldest first, ns.
-A proof evaluates a half only when the last of them has arrived. No sender may send more than 1000
+"""Commands that arrive within this time of each other, ns, come from one queue, the oldest first. A
+proof evaluates a half only after the last of them has arrived. No sender may send more than 1000
 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
@@ -87,29 +90,29 @@ FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 number of seconds that refill it by one second."""
 
 MAX_CLOCKS = 1024
-"""Number of clocks that are remembered. Above it, the clock that was silent for longest is usually
-forgotten first. A client would have to use this many names within 0.05 s before the clock of a
-sender at 20 Hz is forgotten."""
+"""Largest number of clocks that are remembered. If there are more, usually the clock that was
+silent for longest is forgotten. A client would have to use this many names within 0.05 s to make
+the daemon forget the clock of a sender at 20 Hz."""
 
 State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 """The verdict on a command. A `fresh` command counts, and a `stale` one does not. An `unproven` one
-does not count yet, and neither does the `first` one, with which a proof begins. After a `set` the
-command counts, but the sender must return to neutral."""
+does not count yet, and neither does a `first` one, with which a proof begins. A command with the
+verdict `set` counts, but its clock seems to have been set, so the sender must return to neutral."""
 
 
 class _Proof:
     """A test whether the delays have become constant, starting with one command.
 
-    The test compares the minimum delays of halves of the proof time. Minima differ less than single
-    delays, which have jitter.
+    The test divides the time into halves, each of which is half of the nominal duration of a proof.
+    It compares the minimum delays in them, because minima have less jitter than single delays.
 
     - For a known clock (`again`), the test compares the first half with the second. If it fails, it
       begins again with its second half.
     - For a new clock, it compares the first two halves. If they differ, it compares the last eight
       halves in four pairs. The minima of the pairs must be as even as those of two halves, or
-      differ by at most `EARLY_NS` without a trend. They fall while a backlog arrives, and rise
-      while a queue grows.
+      differ by at most `EARLY_NS` without a trend. The minima fall while a backlog arrives, and
+      rise while a queue grows.
     """
 
     def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
@@ -120,10 +123,15 @@ class _Proof:
         """Start of each of the last halves, monotonic ns, and the minimum delay in it, ns."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
-        """Add a command with its delay, ns; return "failed" if the proof must begin again with it.
+        """Add a command and return the state of the proof.
 
-        A command cannot complete the proof if its delay exceeds the least one by more than the
-        timeout.
+        "failed" means that a new proof must begin with this command. A command cannot complete the
+        proof if its delay exceeds the lowest delay of the proof by more than the timeout.
+
+        Args:
+            delay: Delay of the command, ns.
+            at_ns: Monotonic time at which the command arrived, ns.
+            timeout_ns: Timeout of the command's source, ns.
         """
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
@@ -160,25 +168,25 @@ class _Proof:
 
 
 class _Clock:
-    """One clock. The class estimates its minimum delay from the commands that it stamped."""
+    """One clock of a sender, and the estimate of the minimum delay of the commands it stamped."""
 
     def __init__(self, at_ns: int) -> None:
         self.state: State = "new"
         self.at_ns = at_ns
         """Arrival of the last command, monotonic ns."""
         self.forgiven_ns = 0
-        """Rise of the delay at the last `set` that no visible adjustment explains, ns."""
+        """Rise of the delay at the last `set` beyond the visible adjustments of the clock, ns."""
         self._stamp_ns = 0
         self._delay = 0
         self._number: int | None = None
         """Sequence number of the last command."""
         self._least = 0
-        """The minimum of the trusted delays, ns. It rises with the largest possible drift."""
+        """Minimum of the trusted delays, ns. It rises over time by the largest possible drift."""
         self._early = 0
         """Amount by which the minimum has fallen recently, ns."""
         self._floor: int | None = None
-        """Lowest delay of a steady clock, ns, which rises with the largest possible drift. None for
-        a foreign clock."""
+        """Lowest delay of a steady clock, ns. It rises over time by the largest possible drift.
+        None for a foreign clock."""
         self._before: int | None = None
         """Delay before the first visible adjustment since a command was last on time, ns; None
         without one."""
@@ -198,7 +206,7 @@ class _Clock:
 
     @property
     def was_known(self) -> bool:
-        """Whether a command of this clock was accepted: its lowest delay and order are known.
+        """Whether a command of this clock was accepted, so lowest delay and order are known.
 
         This stays true if a proof begins again.
         """
@@ -229,9 +237,9 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """Return whether a newer command was accepted than the one with this stamp and number.
+        """Return whether a command newer than the one with this stamp and number was accepted.
 
-        Of two commands with equal stamps and without numbers, none is newer.
+        Of two commands with equal stamps and without sequence numbers, neither is newer.
         """
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
@@ -248,9 +256,13 @@ class _Clock:
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int | None) -> None:
         """Record a pause of the sender, or an adjustment: stamps that go back or stand still.
 
-        The next command must confirm the adjustment: its stamp goes back too, stands still, or has
-        not caught up yet. Nothing is recorded if the numbers show that commands were lost.
-        `silence` is the time since the command before, ns.
+        The next command must confirm the adjustment: its stamp also goes back, stands still, or has
+        not caught up yet. Nothing is recorded if the sequence numbers show that commands were lost.
+
+        Args:
+            stamp_ns: Stamp of this command, ns.
+            silence: Time between the arrivals of the previous command and of this one, ns.
+            number: Sequence number of this command, None without one.
         """
         doubted, self._doubted = self._doubted, None
         if number is not None and self._number is not None and number != self._number + 1:
@@ -304,9 +316,10 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
-        """Trust the proven delay, if something allows it, and return the verdict.
+        """Trust the delay that the proof has shown, if that is allowed, and return the verdict.
 
-        A visible adjustment, a pause of the sender or the rest of the budget allows a larger delay.
+        A larger delay is allowed by a visible adjustment of the clock, by a pause of the sender, or
+        by the rest of the budget.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -319,7 +332,7 @@ class _Clock:
         return self._believe(proof, "set")
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Let the budget grow with the time, up to `most_ns`."""
+        """Increase the budget by the time since the last call / `FORGIVE_RATE`, up to `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -342,11 +355,11 @@ class Freshness:
         """Foreign clocks of which no command was accepted yet. After a silence of `GAP_NS` they are
         forgotten."""
         self._unproved: dict[str, _Clock] = {}
-        """Steady clocks of which no command was accepted yet. They are kept over a silence, because
+        """Steady clocks of which no command was accepted yet. They are kept for `KEEP_NS`, because
         their lowest delay is valid from the first command on."""
         self._numbers: dict[str, tuple[int, int]] = {}
-        """Number and arrival, ns, of the last command of each sender that sends numbers without
-        stamps."""
+        """Sequence number and arrival, ns, of the last command of each sender whose commands have
+        numbers but no stamps."""
         self.forgiven_ns = 0
         """Sum of all rises of foreign clocks' delays that no visible adjustment explains, ns."""
 
@@ -374,7 +387,7 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command) -> Verdict:
-        """Return the verdict on a command without a stamp, by its sequence number.
+        """Return the verdict on a command without a stamp according to its sequence number.
 
         After a pause of `GAP_NS` the sender may start again with lower numbers.
         """
@@ -393,9 +406,9 @@ class Freshness:
     def _forget(self, now_ns: int) -> None:
         """Forget clocks that were silent for long, and one more if there are over `MAX_CLOCKS`.
 
-        That one is a steady clock without an accepted command that was silent for `GAP_NS`, or else
-        the clock that was silent for longest. The number is limited because a recording begins with
-        all clocks, which the loop writes in one step.
+        The latter is a steady clock without an accepted command that was silent for `GAP_NS`, or
+        else the clock that was silent for longest. The number of clocks is limited because a
+        recording begins with all of them, and the control loop writes them in one step.
         """
         limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
         for held, silent_ns in limits:

@@ -1,11 +1,12 @@
-"""Fills gaps in the feedback: it estimates the wheel angles in a gap, and their uncertainty.
+"""Fills gaps in the feedback: estimates the wheel angles in a gap, and their uncertainty.
 
 `Rolling` computes the wheel angles since the last plausible feedback line. It uses the first of
-these sources that exists: the encoder counts of the line, whole counts that its speeds show, speed
-times time. Each moment and each count is used exactly once. In a time that no line covers, the
-speed before it is assumed for the first half and the speed after it for the second half. If the
-daemon has commanded rest during the silence, the speed before it is assumed only until that
-command. The motion during implausible lines is computed with the next plausible line.
+these sources that exists: the encoder counts in the line, whole counts that are recovered from its
+speeds, or its speeds times the time. It uses each moment and each count exactly once. In a gap that
+no line covers, it assumes the speed before the gap for the first half of the gap, and the speed
+after the gap for the second half. If the daemon commanded rest during the gap, it assumes the speed
+before the gap only until that command. The motion during implausible lines is computed with the
+next plausible line.
 
 `Gaps` estimates how much the true motion in a gap differs from a constant acceleration between the
 two known speeds.
@@ -22,15 +23,16 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Limits for implausible lines in a row over which the robot is assumed to have kept its speed:
-either at most `MAX_LOST_S` s in all, or at most `MAX_LOST` lines of any duration."""
+"""Limits of an implausible stretch during which the robot is assumed to have kept its speed. Either
+the implausible lines in a row last at most `MAX_LOST_S` s together, or there are at most `MAX_LOST`
+of them, of any duration."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 GUESS = Twist(0.125, 0.5)
 """Standard deviation of the acceleration that is assumed before any measurement, m/s2 and rad/s2.
 
-It is an eighth of the default limits. Random driving with these limits rarely exceeds it.
+It is an eighth of the default acceleration limits. Random driving rarely exceeds it.
 """
 
 SPAN = 0.2
@@ -41,7 +43,7 @@ FIRST, MOST = 4.0, 300.0
 driving."""
 
 GROWTH = 5
-"""Power of the time with which the variance in a gap grows (`Gaps`)."""
+"""Exponent in the growth of a gap's variance with the duration of the gap (`Gaps`)."""
 
 
 class Rolled(Struct, frozen=True, gc=False):
@@ -51,13 +53,14 @@ class Rolled(Struct, frozen=True, gc=False):
     """The angles that follow from speeds, in the order of time. Each piece becomes an arc of the
     path. No piece is zero for all wheels."""
     turned: Motors
-    """The angles by encoder counts. In time they lie before `pieces`."""
+    """The angles according to encoder counts. In time, they come before `pieces`."""
     seen: Motors
-    """The angles in `seconds` by the speeds or counts of this line, with their rounding errors."""
+    """The angles during `seconds` according to the speeds or counts of this line, with their
+    rounding errors."""
     seconds: float
     """Duration of `seen`, s."""
     bridged: float
-    """Part of `seconds` that no line covers and gap filling has filled, s."""
+    """Part of `seconds` that no line covers, and for which the speeds were assumed, s."""
     unknown: float
     """Further time, in addition to `seconds`, in which the motion of the robot is unknown, s."""
     known: float
@@ -65,14 +68,14 @@ class Rolled(Struct, frozen=True, gc=False):
 
 
 class Rolling:
-    """Computes wheel angles from plausible lines, and remembers the implausible lines before."""
+    """Computes wheel angles from plausible lines, and remembers the implausible ones before."""
 
     def __init__(self, quiet: float = math.inf) -> None:
         """Start. After `quiet` s without feedback the daemon commands rest."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
-        """Three durations, s: that of implausible lines without counts, that of the gaps before
-        these lines, and that of implausible lines with counts."""
+        """Three sums of durations, s: of implausible lines without counts, of the gaps before these
+        lines, and of implausible lines with counts."""
         self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:
@@ -88,7 +91,7 @@ class Rolling:
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
         """Return the angles up to a plausible line, and forget the implausible lines before it.
 
-        `before` has the wheel speeds of the last plausible line, rad/s.
+        `before` contains the wheel speeds of the last plausible line, rad/s.
         """
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
@@ -138,15 +141,15 @@ class Gaps:
     """Estimates the variances of the motion in gaps.
 
     Let s be the standard deviation of the acceleration, m/s2 or rad/s2. After t s without lines,
-    the motion deviates by s t^2 / 2 from that at the known speeds, so its variance is s^2 t^4 / 4.
-    The robot may change its acceleration at any time, so s^2 itself grows with t, and the variance
-    with t^5 (`GROWTH`).
+    the true motion deviates by s t^2 / 2 from the motion at the known speeds, so the variance of
+    the motion is s^2 t^4 / 4. The robot may change its acceleration at any time, so s^2 itself
+    grows with t, and the variance grows with t^5 (`GROWTH`).
 
     `follow` measures s while lines arrive without gaps. In each span of a fifth of a second, it
-    compares the motion with that at the mean of the first and the last speed. The configured
+    compares the motion with the motion at the mean of the first and the last speed. The configured
     acceleration limits are not used, because few drives come near them.
 
-    The deviation is never larger than the motion at the faster of both speeds. A robot that stood
+    The deviation is limited to the motion at the faster of the two known speeds. A robot that stood
     before and after a gap has therefore not moved.
     """
 

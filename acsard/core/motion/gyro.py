@@ -10,8 +10,9 @@ corrects it afterwards. A gyro that reads the opposite sign, degrees or zero is 
 used (`gyro_trial.py`). If a gyro is silent, or its rate is out of all proportion to the wheels, the
 heading comes from the wheels.
 
-The module remembers the angle that it has returned, not the time. A sample that arrives late, or is
-held back for a moment, is included in the turn of the next line, so such errors do not add up.
+The module remembers the angle that it has returned so far, not the time of its last result. So the
+turn of the next line includes a sample that arrives late or is held back for a moment, and such
+errors do not add up.
 """
 
 from __future__ import annotations
@@ -32,17 +33,20 @@ REST_S = 0.2
 """Time for which all four wheels must report zero speed before the robot counts as standing, s."""
 
 SILENT_NS = NS_PER_S // 5
-"""Age of the last sample at which the gyro is silent, ns. Until then its last rate continues."""
+"""Age of the last sample, ns, from which on the gyro counts as silent. Until then, the rate of the
+last sample is assumed to continue."""
 
 LATEST_NS = NS_PER_S // 4
-"""Delay of a sample above which its sender's clock is assumed to have been set, ns."""
+"""If the delay of a sample exceeds this, ns, the clock of its sender must have been set."""
 
 SET_BACK_NS = NS_PER_S // 50
-"""Step back from one stamp to the next above which the sender's clock was set, ns. Samples come in
-order, but a driver may swap two of them or measure their times with some jitter."""
+"""If a stamp is earlier than the previous one by more than this, ns, the clock of the sender was
+set. Samples arrive in order, but a driver may swap two of them or measure their times with some
+jitter.
+"""
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
-"""Least and greatest delay of the gyro against the wheels, ns."""
+"""Least and greatest delay of the gyro relative to the wheels, ns."""
 
 LEAST_DELAY_S = 0.002
 """Smallest correction of the delay that is applied, s."""
@@ -55,7 +59,8 @@ MOST_SLIP_S = 5.0
 a gyro."""
 
 ENOUGH_BLOCKS = 20.0
-"""Number of blocks of turning (`gyro_match.py`) after which the ratio to the wheels is believed."""
+"""Number of blocks of turning (`gyro_match.py`) from which on the ratio of the gyro's turn to the
+wheels' turn is trusted."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
@@ -94,15 +99,15 @@ class Turn(Struct, frozen=True, gc=False):
 
 
 class Gyro:
-    """One gyro. The caller passes its samples to `hear`, and calls `turn` for each line."""
+    """One gyro. The caller passes samples to `hear`, and calls `turn` for each feedback line."""
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
-        """The effective track that an earlier gyro has shown, None without one."""
+        """The effective track that was learned from an earlier gyro, None without one."""
         self.owes = False
-        """Whether the turn of the last line came from the wheels, and the gyro will correct it once
-        it is proven."""
+        """Whether the turn of the last line came from the wheels, and the gyro will correct it as
+        soon as the gyro is proven."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Events of the last `turn`, for the log."""
@@ -112,7 +117,7 @@ class Gyro:
         """Start over with a gyro whose bias, delay and direction are unknown."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples that are later than the last line, each with its time, monotonic ns."""
+        """Samples that were measured after the last line, each with its monotonic time, ns."""
         self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
@@ -120,8 +125,8 @@ class Gyro:
         """Time of the last sample in `_angle`, monotonic ns; None before the first one."""
         self._rate = 0.0
         self._angle = self._given = 0.0
-        """Angle of all samples until the last line, and the part of it that `turn` has returned,
-        rad."""
+        """Angle of all samples until the last line, and the part of this angle that `turn` has
+        returned, rad."""
         self._variance = 0.0
         """Variance of the angle that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
@@ -140,7 +145,7 @@ class Gyro:
 
     @property
     def learned(self) -> Track | None:
-        """The effective track that the gyro shows; None until the robot has turned for a while."""
+        """The effective track learned from the gyro; None until the robot has turned enough."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
             return self._learned
@@ -157,13 +162,13 @@ class Gyro:
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the turn from the last line until this one, None if the wheels must provide it.
+        """Return the robot's turn since the last line, None if the wheels must provide it.
 
         Args:
             at_ns: Monotonic time of this line, ns.
             dt: Time since the last line, s; 0 after a gap. The result then covers the whole gap.
             wheels: The turn in `dt` according to the wheels, rad.
-            still: Whether all four wheels stood.
+            still: Whether all wheels that are not ignored report zero speed.
         """
         self.events, self.owes = [], False
         self._rest_s = self._rest_s + dt if still else 0.0
@@ -174,8 +179,8 @@ class Gyro:
         held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + held - self._given, self._variance
         self._given, self._variance = self._angle + held, 0.0
-        # The wheels have provided the turn of a silence, and the samples that end it cover that
-        # turn again. So the turn of the line after a silence comes from the wheels too.
+        # During a silence of the gyro the wheels provide the turn. The samples that end the silence
+        # cover that turn again, so the wheels also provide the turn of the line after it.
         lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         # The error of the bias does not average out.
@@ -202,9 +207,9 @@ class Gyro:
         the wheels' turn, rad, and its variance, rad2. It is applied if the gyro is proven."""
 
     def taken_back(self, turn: float) -> float:
-        """Record that the wheels' turn of lines that this gyro `owes` has changed by `turn` rad.
+        """Record that the caller changed the wheels' turn in lines that this gyro `owes`.
 
-        Return the part of this change that the gyro has already corrected, rad.
+        `turn` is the change, rad. Return the part of it that the gyro has already corrected, rad.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -216,7 +221,7 @@ class Gyro:
     def _time_of(self, sample: GyroSample) -> int:
         """Return when a sample was measured, in ns of our monotonic clock plus a constant.
 
-        The sample's stamp improves its time of arrival, because the stamp has no jitter.
+        The result is the time of arrival, corrected by the sample's stamp, which has no jitter.
         """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
@@ -228,7 +233,7 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _take(self, until_ns: int, resting: bool) -> None:
-        """Add the samples until `until_ns` to the angle. At rest they update the bias instead."""
+        """Add the samples until `until_ns` to the angle, or learn the bias from them at rest."""
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
         while heard and heard[0][0] <= until_ns:
@@ -252,8 +257,8 @@ class Gyro:
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
         """Test the gyro if it is not proven yet; return whether the wheels provide this turn.
 
-        While the gyro is not proven, they do, except at rest: the wheels do not show that a person
-        turns the robot.
+        The wheels provide the turn while the gyro is not proven, except at rest: then they do not
+        show whether a person turns the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:

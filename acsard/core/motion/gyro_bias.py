@@ -1,7 +1,7 @@
 """Learns the bias of a gyro, which is its reading while the robot stands (zero-velocity update).
 
-The bias drifts between rests. The estimate is a scalar Kalman filter of a random walk, so a rest
-has more weight if the rest before was long ago. The first estimate is the mean of the samples.
+The bias drifts between rests. A scalar Kalman filter estimates it as a random walk, so a rest has
+more weight if the previous rest was long ago. The first estimate is the mean of the samples.
 """
 
 from __future__ import annotations
@@ -12,25 +12,26 @@ KNOWN_S = 0.5
 """Time at rest after which the bias is known, s."""
 
 MAX_BIAS = 0.2
-"""Largest plausible bias, rad/s. A higher rate means that a person turns the robot."""
+"""Largest plausible bias, rad/s. A higher rate at rest means that a person turns the robot."""
 
 WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""Number of standard deviations from the bias above which a sample is not noise."""
+"""If a sample differs from the bias by more standard deviations than this, it is not noise."""
 
 SLACK = 0.01
-"""Additional allowed deviation, rad/s, because a robot that stands may vibrate."""
+"""Further allowed difference from the bias, rad/s, because a robot that stands may vibrate."""
 
 LEAST_NOISE = 1e-5
-"""Smallest standard deviation of a sample, rad/s. A gyro that repeats one value is coarse."""
+"""Smallest assumed standard deviation of a sample, rad/s. A gyro that repeats one value is not free
+of noise, but coarse."""
 
 ANEW_S = 1.0
-"""Time at rest with another constant reading after which that reading becomes the bias, s.
+"""Time at rest with a different but constant reading, s, after which this reading becomes the bias.
 
-The gyro has then restarted or become warm, or the robot was turned while the first bias was
-learned.
+Possible causes are a restart of the gyro, a change of its temperature, or a robot that was turned
+while the first bias was learned.
 """
 
 LEARNING = 0.02
@@ -101,7 +102,7 @@ class Bias:
     def _average(self, rate: float, variance: float, dt: float) -> bool:
         """Update the mean and the variance of the first samples by Welford's method.
 
-        Returns False if the sample shows a turn.
+        Return False if the sample shows a turn.
         """
         if abs(rate) > MAX_BIAS:
             return False

@@ -5,12 +5,12 @@ ratio of the configured effective track to the true one, and T the delay of the 
 
     g(t) = a w(t - T), which is about a w(t) - a T dw/dt for a small T
 
-A least-squares fit finds the coefficients a and -a T from means over a tenth of a second. It
-forgets old data only while the robot turns.
+A least-squares fit finds the coefficients a and -a T from means over blocks of a tenth of a second.
+The fit forgets old data only while the robot turns.
 
-The change of the wheels' rate has the same error as the rate itself. On a straight drive with
-coarse encoder counts that would look like a delay of half a block, so a change counts as 0 unless
-the gyro's rate changes too, within the longest delay.
+An error of the wheels' rate is also an error of the change of this rate. On a straight drive with
+coarse encoder counts, such errors would look like a delay of half a block. Therefore a change
+counts as 0 unless the gyro's rate also changes, within the longest delay of a gyro.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ The delay of the gyro hardly matters over such a turn.
 """
 
 KEPT, PRIOR = 0.9, 0.1
-"""Factor by which each new stretch reduces the weight of the earlier ones, and weight of the
-assumption `ROUGH` in stretches."""
+"""Factor by which each new stretch reduces the weight of the earlier ones, and the initial weight
+of `ROUGH` as a number of stretches."""
 
 DELAY_S = 0.2
 """Standard deviation of the delay before any data, s."""
@@ -57,29 +57,30 @@ NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
 """Initial values of the three least-squares sums that contain the delay."""
 
 BEFORE, BEHIND = 2, 3
-"""Blocks before and behind a block in which the gyro's rate may show the change of the wheels' rate
-in this block. The gyro is 0.1 s early to 0.3 s late (`gyro.DELAYS_NS`)."""
+"""Numbers of blocks before and after a block in which the gyro's rate may show the change of the
+wheels' rate in this block. The gyro is 0.1 s early to 0.3 s late (`gyro.DELAYS_NS`)."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""Standard deviation of a block's mean rate: a constant in rad/s, and a share of the rate."""
+"""Standard deviation of a block's mean rate: a constant in rad/s, plus a fraction of the rate."""
 
 LAG_S = 0.05
-"""Delay of the gyro that causes no contradiction until the delay is known, s."""
+"""Uncertainty of the gyro's delay in the test for a contradiction until the delay is known, s."""
 
 CERTAIN_S = 0.004
-"""Standard deviation of the delay below which it is reported, s."""
+"""If the standard deviation of the delay is below this, s, the delay is reported."""
 
 WINDOW_S = 0.2
 """Time over which the turns of wheels and gyro are compared for a contradiction, s."""
 
 LEAST_SLIP = 0.015
-"""Difference of the turns over `WINDOW_S` that is never a contradiction, rad.
+"""Standard deviation, rad, of the difference of the turns over `WINDOW_S` in normal operation.
 
 Encoder counts and vibration can cause it.
 """
 
 CERTAIN = 3.0
-"""Number of standard deviations from which the difference is a contradiction."""
+"""If the difference of the turns exceeds this number of standard deviations, it is a contradiction.
+"""
 
 
 class Block(Struct, frozen=True, gc=False):
@@ -120,13 +121,13 @@ class Match:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the ratio between stretches."""
+        """Standard deviation of the ratio from one stretch to the next."""
         return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
-        """Return the delay of the gyro minus the assumed one, s, or None if it is uncertain.
+        """Return the delay of the gyro minus the assumed delay, s, or None if it is uncertain.
 
-        If it is a number, the caller must assume the new delay from then on.
+        If the result is a number, the caller must add it to the assumed delay.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
@@ -188,7 +189,7 @@ class Match:
             sums[2] -= old[2]
 
     def _learn(self) -> None:
-        """Learn from a block when the blocks behind it are known."""
+        """Learn from the block before the last `BEHIND` blocks."""
         block = self._blocks[BEFORE]
         wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
         rates = [one.gyro / one.time for one in self._blocks]

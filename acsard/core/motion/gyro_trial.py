@@ -11,23 +11,23 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate according to the wheels, rad/s. If a line has at least this rate to the other side, a
-new turn begins. A slower one may only be a difference of one encoder count."""
+"""Turn rate according to the wheels, rad/s. If a line shows at least this rate to the other side, a
+new turn begins. A lower rate may come from a single encoder count."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
-"""Smallest mean turn rate according to the wheels, rad/s, and the time of the mean, s. A slower
-motion is not a turn. With unequal tyres the wheels report a turn while the robot drives straight.
-Therefore a gyro that reads zero is called dead only above `LEAST_RATE`."""
+"""Smallest mean turn rate according to the wheels, rad/s, and the time over which the mean is
+taken, s. A slower motion is not a turn. With unequal tyres the wheels report a turn while the robot
+drives straight. Therefore a gyro that reads zero is called dead only above `LEAST_RATE`."""
 
 PROPORTIONS = (0.25, 2.5)
 """Range of the robot's true turn divided by the turn according to the wheels, on any floor."""
 
 PROVED, REFUTED = 0.1, 0.4
-"""Turn to one side according to the wheels, rad, in which a gyro is proven or refuted. Refuting
-takes more, because the gyro may be late."""
+"""Turn to one side according to the wheels, rad, after which a gyro is proven or refuted. Refuting
+takes a larger turn, because the gyro may be late."""
 
 REFUTED_S = 0.3
-"""Least time of turning before a gyro is refuted, s. No gyro has so long a delay."""
+"""Least time of turning before a gyro is refuted, s. No gyro has a delay as long as this."""
 
 DEGREES = (15.0, 150.0)
 """Range of the ratio to the wheels for a gyro that reads degrees. The ratio is about 57.3 times
@@ -74,7 +74,7 @@ class Trial:
                 self._fast_gyro += self._stretch_gyro
             self._stretch = self._stretch_s = self._stretch_gyro = 0.0
         if wheels * self._wheels < 0.0 and abs(wheels) >= LEAST_RATE * dt:
-            # At the start of a turn to the other side, a late gyro still reports the turn before.
+            # At the start of a turn to the other side, a late gyro still reports the previous turn.
             self._begin()
             return
         self._wheels += wheels

@@ -40,14 +40,14 @@ class Kinematics:
         return (self._left_radius + self._right_radius) / 2
 
     def wheel_speeds(self, twist: Twist) -> WheelSpeeds:
-        """Return the wheel speeds that cause this twist, by equations (1) to (3)."""
+        """Return the wheel speeds that cause this twist, according to equations (1) to (3)."""
         half = twist.angular * self.track / 2
         left = (twist.linear - half) / self._left_radius
         right = (twist.linear + half) / self._right_radius
         return WheelSpeeds(right, left, left, right)
 
     def twist(self, speeds: WheelSpeeds) -> Twist:
-        """Return the twist that these wheel speeds cause, by equations (1) to (3)."""
+        """Return the twist that these wheel speeds cause, according to equations (1) to (3)."""
         linear, angular = self.moved(speeds.as_tuple())
         return Twist(linear, angular)
 
@@ -64,10 +64,11 @@ class Kinematics:
         return (right + left) / 2, (right - left) / self.track
 
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
-        """Return the wheel angle that each side has if the other side and the turn are right, rad.
+        """Return the wheel angle of each side that follows from the other side and the turn, rad.
 
-        The first result is for the left side and follows from `right` and `turn`. The second is for
-        the right side and follows from `left` and `turn`. This is equation (3) for angles.
+        The first result is the angle of the left side, computed from `right` and `turn`. The second
+        is the angle of the right side, computed from `left` and `turn`. This is equation (3) for
+        angles. `left` and `right` are wheel angles, rad, and `turn` is the turn of the base, rad.
         """
         across = turn * self.track
         return (

@@ -1,4 +1,4 @@
-"""Chooses the effective track for turns that only the wheels measure: configured, or learned.
+"""Chooses the effective track for turns that only the wheels measure: configured or learned.
 
 While a gyro measures the heading, each turn shows the true effective track (`gyro_match.py`). When
 the gyro is silent, this learned track is better than the configured one, which may come from
@@ -13,14 +13,13 @@ from msgspec import Struct
 from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
-"""Smallest relative standard deviation, because the next floor and turn rate may differ.
-
-It is half of `gyro_match.FINE`, the error of a single moment, because a drive has many moments.
-"""
+"""Smallest relative standard deviation of a learned track. It is not 0, because the floor and the
+turn rate may change. It is half of `gyro_match.FINE`, the error at a single moment, because a drive
+consists of many moments."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
-"""Relative standard deviation below which the track becomes known, and the one above which it
-becomes unknown."""
+"""Relative standard deviations of the learned track: below the first, an uncertain track becomes
+certain, and above the second, a certain track becomes uncertain."""
 
 BOUNDS = (0.5, 2.5)
 """Range of the learned track, divided by the configured one.
@@ -44,7 +43,7 @@ NOTES: dict[TrackUse, str] = {
 
 
 class Track(Struct, frozen=True):
-    """An effective track."""
+    """An effective track, relative to the configured one."""
 
     share: float = 1.0
     """The track divided by the configured one."""
@@ -69,7 +68,7 @@ class LearnedTrack:
         self.used = CONFIGURED
         """The track in use."""
         self.event: Event | None = None
-        """The event if the last `look` changed the use, otherwise None."""
+        """The event if the last `look` changed `use`, otherwise None."""
 
     def look(self, learned: Track | None) -> None:
         """Choose the track to use. `learned` is the track learned so far, None without one."""

@@ -1,4 +1,4 @@
-"""Holds the latches and the other facts, and derives the mode from both.
+"""Holds the latches and the other facts that determine the mode, and derives the mode from them.
 
 A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
 time, and only `activate` releases `inactive`. Neither request may release a stop or a `deactivate`
@@ -28,15 +28,15 @@ from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, re
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0
-"""Seconds after a stop, a `deactivate` or the start in which a request must name the number of the
-latch. The network seldom takes longer to deliver a packet."""
+"""For this many seconds after a stop, a `deactivate` or the start of the daemon, a request must
+name the number of the latch. The network seldom takes longer to deliver a packet."""
 
 LONG_AGO_NS = -(2**62)
 """Monotonic time before every other one, ns."""
 
 _DAYS_TO_1970 = 719_468
-"""Days from 0000-03-01 to 1970-01-01. The calculation starts years in March, so the leap day is the
-last."""
+"""Days from 0000-03-01 to 1970-01-01. The calculation starts each year in March, so the leap day is
+the last day of a year."""
 
 _DAYS_PER_400_YEARS = 146_097
 
@@ -45,16 +45,15 @@ class Lifecycle:
     """Latches and mode of one robot. A request that is not allowed raises `RefusedError`."""
 
     def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start with these latches, of which an earlier run may have kept some.
+        """Start with these latches, which may come from an earlier run of the daemon.
 
-        If `active` is False, the robot is also switched off until the first `activate`.
+        If `active` is False, the robot is also switched off until the first call `activate`.
         """
         self.latches = latches
         self.mode = Mode.WAITING
         self._shutting_down = self._linked = self._commanded = False
         self._dormant = not active
-        """Whether the robot still waits for its first `activate` (`control.auto_activate = false`).
-        """
+        """Whether the robot waits for its first call `activate` (see `control.auto_activate`)."""
         found = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in found if latch is not None], default=0)
         self._numbered = False
@@ -63,18 +62,18 @@ class Lifecycle:
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
         """Monotonic times at which the last stop and the last fault were latched, ns."""
         self._cleared_ns = LONG_AGO_NS
-        """Monotonic time at which a fault was last cleared, ns. A stop may have been latched beside
-        it."""
+        """Monotonic time at which a fault was last cleared, ns. A stop may have been latched in
+        addition to this fault."""
         self._stop_asked_ns = LONG_AGO_NS
         """Monotonic time at which the request for the last stop arrived, ns."""
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off, ns."""
         self._held = self._mend = ""
-        """Why `clear` may release nothing, in words, and what the operator must do about it. Both
-        are "" if the reports of the board forbid no clear."""
+        """Why the call `clear` may release nothing, in words, and what the operator must do about
+        it. Both are "" while the reports of the board permit the call."""
         self._freed_ns = LONG_AGO_NS
-        """Monotonic time of the step in which the reports of the board last began to permit a
-        clear, or in which the cause of a fault came again, ns. No earlier clear is obeyed."""
+        """Monotonic time, ns, of the step in which the board's reports last began to permit the
+        call `clear`, or in which the cause of a fault occurred again. Earlier calls are refused."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, ns; None before that step."""
         self._derive()
@@ -82,7 +81,7 @@ class Lifecycle:
     # facts
 
     def begin(self, now: Instant) -> None:
-        """Record the time `now` as the start of the first step. Later calls change nothing."""
+        """Record `now` as the time of the first step. Later calls of this method change nothing."""
         if self._began_ns is None:
             self._began_ns = now.mono_ns
 
@@ -119,9 +118,10 @@ class Lifecycle:
         self._held, self._mend = why, mend
 
     def caused_again(self, now_ns: int) -> None:
-        """Record that the cause of a fault that is latched already came again in this step.
+        """Record that the cause of a fault, which is latched already, occurred again in this step.
 
-        No clear that arrived before that releases the fault. `now_ns` is monotonic.
+        A call `clear` that arrived before this step does not release the fault. `now_ns` is the
+        monotonic time of this step, ns.
         """
         self._freed_ns = now_ns
 
@@ -131,7 +131,10 @@ class Lifecycle:
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault for the reason `why`; return False and keep an earlier one."""
+        """Latch a fault for the reason `why`, and return True.
+
+        If a fault is latched already, keep that one and return False.
+        """
         if self.latches.fault is not None:
             return False
         self._faulted_ns = now.mono_ns
@@ -143,11 +146,11 @@ class Lifecycle:
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
         """Latch a stop under a new number, and return the answer for the client.
 
-        If the latched stop was requested at the same time or later, that stop stays.
+        If a stop that was requested at the same time or later is latched, that stop stays instead.
 
         Args:
             by: Name of the client, "" if unknown.
-            asked_ns: Monotonic time at which the request arrived.
+            asked_ns: Monotonic time at which the request arrived, ns.
             now: Both clocks at this step.
         """
         repeated = self.latches.stop is not None and asked_ns <= self._stop_asked_ns
@@ -165,7 +168,7 @@ class Lifecycle:
 
         Args:
             number: Number of the latch that the sender has seen, None if the request has none.
-            asked_ns: Monotonic time at which the request arrived.
+            asked_ns: Monotonic time at which the request arrived, ns.
             now: Both clocks at this step.
         """
         require_allowed(self.mode, "clear")
@@ -175,8 +178,8 @@ class Lifecycle:
         if latch is None:
             return ""
         if asked_ns <= self._freed_ns:
-            # This call may have arrived before the release, and the press may have been shorter
-            # than a step.
+            # This call may have arrived before the button was released, because a press may be
+            # shorter than a step.
             raise RefusedError("this call came before the release: call srv/clear again")
         if number is None:
             self._require_seen_stop(asked_ns)
@@ -205,7 +208,7 @@ class Lifecycle:
         Args:
             number: The number of the latch that the sender has seen; None if the request has none.
                 0 stands for a robot that is off only because `auto_activate` is False.
-            asked_ns: Monotonic time at which the request arrived.
+            asked_ns: Monotonic time at which the request arrived, ns.
             now: Both clocks at this step.
         """
         require_allowed(self.mode, "activate")
@@ -237,7 +240,10 @@ class Lifecycle:
         return "inactive: ramping to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
-        """Record beside the latches the limits that `set` lowered below the configuration file."""
+        """Record the limits that `set` made lower than in the configuration file, with the latches.
+
+        `limits` contains their values by key.
+        """
         if limits != self.latches.lowered:
             self.latches = replace(self.latches, lowered=limits)
 
@@ -293,7 +299,7 @@ class Lifecycle:
     def _require_seen_stop(self, asked_ns: int) -> None:
         """Raise `RefusedError` if the sender of a clear may not know the latched stop.
 
-        `asked_ns` is the monotonic arrival of the request.
+        `asked_ns` is the monotonic time at which the request arrived, ns.
         """
         stop = self.latches.stop
         if stop is None:
@@ -311,8 +317,8 @@ class Lifecycle:
 
         Args:
             latch: The latch that the request would release.
-            set_ns: Monotonic time at which this run set it; long ago if an earlier run did.
-            asked_ns: Monotonic time at which the request arrived.
+            set_ns: Monotonic time at which this run set it, ns; long ago if an earlier run did.
+            asked_ns: Monotonic time at which the request arrived, ns.
             call: Name of the service, for the message.
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
@@ -334,10 +340,10 @@ class Lifecycle:
 def number_after_restart(kept: int, now: Instant) -> int:
     """Return a number for a new latch that no earlier run of the daemon gave to another latch.
 
-    The latch file does not contain latches that were released. If the wall clock went back, a
-    number just above the kept ones may be that of a released latch. A late `clear` of that latch
-    would then release the new one. Adding the time since the computer started makes the two numbers
-    differ.
+    The latch file does not contain latches that were released. If the wall clock was set back, a
+    number just above the stored ones may be the number of a released latch. A late call `clear` of
+    that latch would then release the new one. To make the two numbers differ, the time since the
+    computer started is added.
 
     Args:
         kept: The largest number of the latches in the latch file, or less than 1 without any.

@@ -1,9 +1,9 @@
 """Limits a requested twist: speed, wheel saturation, acceleration, deceleration and jerk.
 
-There are two ways to move. `follow` obeys a commander and limits each axis by itself. `coast`
-brings the robot to rest without a commander. It reduces both axes in the same proportion, so that
-no wheel speeds up in the process (invariant 2 of the package `acsard`). The jerk limit applies only
-to speeding up, because comfort must not delay braking.
+There are two ways to move. `follow` obeys a command and limits each axis, linear and angular, by
+itself. `coast` brings the robot to rest without a command. It reduces both axes in the same
+proportion, so that no wheel speeds up in the process (rule 2 of `acsard/README.md`). The jerk limit
+applies only to speeding up, because comfort must not delay braking.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Limiter:
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self.state = _State(REST, 0.0, 0.0)
-        """All that the limiter remembers of earlier steps. The daemon restores an earlier value to
-        undo a step whose command line was not written to the port."""
+        """Everything that the limiter remembers from earlier steps. `Robot` restores an earlier
+        value to undo a step whose command line was not written to the port."""
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:
@@ -82,8 +82,8 @@ class Limiter:
         angular, slope_w = _approach(
             now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
         )
-        # Each axis moves at its own rate. On the way both together may need a faster wheel than at
-        # the start or at the goal.
+        # Each axis changes at its own rate. In between, both axes together may need a faster wheel
+        # than at the start or at the goal.
         twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)
         self.state = _State(twist, slope_v, slope_w)
         return twist
@@ -105,7 +105,7 @@ class Limiter:
         return fallen
 
     def cut(self) -> Twist:
-        """Come to rest at once. Without a link the daemon cannot ramp."""
+        """Set the twist to rest at once, without a ramp, and return it."""
         self.state = _State(REST, 0.0, 0.0)
         return REST
 

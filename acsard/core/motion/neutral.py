@@ -1,16 +1,18 @@
 """The neutral-first rule for one sender: whether it may drive, decided by the commands that it has
 sent.
 
-A zero arms a sender, and a pause never does. The sender stays armed until `require_neutral`:
+Only a zero, which is a command to rest, arms a sender. Silence alone never does. An armed sender
+stays armed until `require_neutral` is called.
 
-- If no other program shares the sender's identity, a zero arms it at once, even directly after
-  speeds.
+- If no other program shares the sender's identity, a zero arms the sender at once, even directly
+  after speeds.
 - Several programs may share an identity (a bridge, a plain key). Then a zero arms the identity only
-  if no speed follows for `commands.neutral_pause`. Further zeros and silence do not change this
+  if no speed follows for `commands.neutral_pause`. Further zeros and silence do not restart this
   time. Without the pause, the zero of one program would arm another program that never stopped.
 
-This module holds one sender's last command and its arming. `arbiter.py` decides which sender is
-followed and when a sender must be armed again. `freshness.py` decides whether a command counts.
+This module holds one sender's last command, and whether the sender is armed. `arbiter.py` decides
+which sender is followed and when a sender must be armed again. `freshness.py` decides whether a
+command counts.
 """
 
 from __future__ import annotations
@@ -27,21 +29,21 @@ class Sender:
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Arrival of a zero of a shared identity after which no speed has come yet, ns; None
-        without one."""
+        """Monotonic arrival, ns, of a zero of a shared identity after which no speed has arrived
+        yet; None without one."""
         self._proven_zero_ns: int | None = None
         self.name = ""
         self.twist = REST
         self.arrived_ns: int | None = None
-        """Arrival of the last command that counted, ns; None without one since `require_neutral`.
-        """
+        """Arrival of the last command that counted since `require_neutral`, ns; None without
+        one."""
         self.came_ns = 0
         """Arrival of the command that ended the sender's last silence, ns. The arbiter prefers the
         sender that came first."""
         self.zeros_ns: int | None = None
         """Arrival of the first zero since the last speed, ns; None if a speed came last."""
         self.ros = False
-        """Whether the last command came from ROS."""
+        """Whether the last command came from ROS, whose tools send no zero by themselves."""
         self.shared = False
         """Whether several programs may share this identity."""
         self.noticed_ns = 0
@@ -51,11 +53,11 @@ class Sender:
         """The verdict on the stamp of the last command that did not count."""
 
     def use(self, timeout_ns: int, pause_ns: int) -> None:
-        """Apply this command timeout and this `commands.neutral_pause` from now on."""
+        """Apply this command timeout and this `commands.neutral_pause`, both in ns, from now on."""
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
 
     def live(self, now_ns: int) -> bool:
-        """Return whether the last command is no older than the timeout of its source."""
+        """Return whether the last command is not older than the timeout of its source."""
         return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns
 
     def doubtful(self, now_ns: int) -> bool:
@@ -80,16 +82,16 @@ class Sender:
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def notice(self, at_ns: int) -> None:
-        """Record that a message arrived at `at_ns` that does not count.
+        """Record a message that does not count, but that may have been a speed.
 
-        It may have been a speed.
+        `at_ns` is its monotonic time of arrival, ns.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
         self.noticed_ns = at_ns
 
     def missed(self) -> None:
-        """Record that messages were lost before they were read. Each may have been a speed."""
+        """Record that unread messages of this sender were lost. Each may have been a speed."""
         self._zero_ns = self._proven_zero_ns = None
 
     def refuse(self, command: Command, why: Verdict) -> None:
@@ -100,9 +102,9 @@ class Sender:
     def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
         """Accept a command that counts, or that will count once the clock of its stamps is proven.
 
-        A zero that arrived before `since_ns`, the time of the last `require_neutral`, does not arm.
-        A zero of an unproven clock arms once that clock is proven, unless `unlearn` is called
-        before.
+        A zero that arrived before `since_ns`, the time of the last `require_neutral`, does not arm
+        the sender. A zero of an unproven clock arms the sender as soon as that clock is proven,
+        unless `unlearn` is called before that.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
@@ -116,8 +118,9 @@ class Sender:
             self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
             if zero and unarmed:
-                # This zero must not make an earlier speed count. Another program of a shared
-                # identity may have sent that speed, and its source keeps its priority.
+                # The sender is armed now, but an earlier speed must not count. With a shared
+                # identity, another program may have sent that speed, and the source keeps its
+                # priority.
                 if command.shared:
                     self.twist = REST
                 else:

@@ -1,15 +1,16 @@
 """Integrates wheel speeds into pose, twist and covariance of base_link in odom.
 
-One step of dt, with left and right the mean wheel speeds of a side (kinematics, equation 1):
+The equations of one step of dt s, where left and right are the mean wheel speeds of the two sides
+(`kinematics.py`, equation 1), are
 
     (4)  d_left = r_l left dt            (5)  d_right = r_r right dt
     (6)  d = (d_right + d_left) / 2      (7)  dyaw = (d_right - d_left) / L
     (8)  x += d cos(yaw)                 (9)  y += d sin(yaw)
     (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
 
-Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. They
-agree as dyaw -> 0. `uncertainty.py` computes the errors of the pose, and `error_model.py` those
-of the twist.
+Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. Both
+agree in the limit dyaw -> 0. `uncertainty.py` computes the errors of the pose, and `error_model.py`
+those of the twist.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Step(Struct, frozen=True, gc=False):
     turn: float
     """Change of the heading by the line, rad."""
     on_trial: bool
-    """Whether a gyro on trial will correct the turn when the gyro is proven."""
+    """Whether a gyro that is still on trial will correct the turn as soon as it is proven."""
     share: float = 1.0
     """The effective track in use, divided by the configured one."""
 
@@ -119,7 +120,7 @@ class Odometry:
     def use(self, odometry: OdometryConfig) -> None:
         """Use the variances of these settings from now on.
 
-        The variances of the start take effect at the next `set_pose`.
+        The variances of the initial pose take effect at the next `set_pose`.
         """
         self._errors.use(odometry)
 
@@ -132,7 +133,7 @@ class Odometry:
             self._twist_uncertainty.bend()
 
     def set_pose(self, pose: Pose) -> None:
-        """Set the pose of base_link in odom, as certain as at the start.
+        """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
         The wheel angles do not change.
         """
@@ -156,21 +157,21 @@ class Odometry:
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
-        """Store an impossible line without using it; the next possible line includes its motion.
+        """Remember an impossible line, so that the next possible line includes the motion in it.
 
-        Counts are cumulative, so none is lost. Without counts only the duration of the line is
-        kept.
+        The counts of the line are kept, so none is lost. Of a line without counts, only the
+        duration is kept.
         """
         self._rolling.skip(feedback)
 
     def fold(self, feedback: Feedback) -> Estimate:
         """Advance the pose by one feedback line, and return the new estimate.
 
-        The wheel angles come from the counts of the line, otherwise from its speeds times dt. After
-        a gap without counts only the uncertainty grows. At rest a single count is added only when
-        its direction is clear. If a gyro provides the turn since the line before, the wheels
-        provide only the distance. If a wheel proves faulty, the other wheel of its side replaces
-        it, also in the earlier lines in which it was wrong.
+        The wheel angles come from the counts of the line if it has any, otherwise from its speeds
+        times dt. After a gap without counts only the uncertainty grows. At rest a single count is
+        added only when its direction is clear. If a gyro provides the turn since the line before,
+        the wheels provide only the distance. If a wheel proves faulty, the other wheel of its side
+        replaces it, also in the earlier lines in which the faulty wheel was wrong.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
@@ -210,9 +211,9 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles by which to advance the pose, rad.
+        """Return the wheel angles of `rolled` by which to advance the pose, rad.
 
-        At rest, hold counts back until their direction is clear.
+        If the robot is at rest, hold counts back until their direction is clear.
         """
         turned = rolled.turned
         if self._held != NOWHERE:
@@ -229,7 +230,8 @@ class Odometry:
     def _take_back(self) -> None:
         """Recompute the pose from the recent lines in which a wheel, now found faulty, was wrong.
 
-        The pose jumps by the error, except for the part that a gyro has corrected or will correct.
+        The pose jumps by the error that this wheel caused, except for the part that a gyro has
+        corrected or will correct.
         """
         was_faulty = self.checks.wheels.was_faulty
         wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
@@ -268,10 +270,10 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose by wheel angles in rad, and return its turn, rad.
+        """Advance the pose by wheel angles, and return the turn of the pose, rad.
 
         Args:
-            pieces: The wheel angles, one set for each arc.
+            pieces: The wheel angles, rad, one set for each arc.
             turn: The turn that a gyro measured, None if the wheels provide it.
             speeds: The wheel speeds in the line, rad/s.
             slips: Whether the wheels slip.

@@ -16,24 +16,25 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import WHEELS, Event, WheelSpeeds
 
 REPEATED = 3
-"""Impossible lines in a row that make a fault: 30 ms at 100 Hz."""
+"""Number of impossible lines in a row that latch a fault: 30 ms at 100 Hz."""
 
 WINDOW = 1000
-"""Lines in which the impossible ones are counted: 10 s at 100 Hz."""
+"""Number of lines in a window, in which the impossible ones are counted: 10 s at 100 Hz."""
 
 SHARE = 0.01
-"""Share of a window's lines that causes a warning if they are impossible, once per window."""
+"""If more than this share of a window's lines is impossible, a warning is logged once."""
 
 SLACK = 2.0
-"""rad/s. Below this, coarse encoders and a robot at rest look like any fault."""
+"""Allowed change of a speed, rad/s, beyond `feedback.wheel_acceleration`. Coarse encoders and a
+robot at rest can cause changes of this size."""
 
 STEPS = 2
-"""Counts by which two reports may differ without a motion of the wheel: each may be off by one
-count."""
+"""Number of encoder counts by which two reports may differ although the wheel moves steadily: each
+report may be wrong by one count."""
 
 SHORTEST_S = 0.004
-"""Shortest time between two lines, s: that of a host that catches up after a stall. A single count
-in this time looks like a high speed."""
+"""Shortest time between two lines, s, which occurs while a host catches up after a stall. A single
+count in this time looks like a high speed."""
 
 
 class Sanity:
@@ -44,9 +45,9 @@ class Sanity:
         self._last: WheelSpeeds | None = None
         self._since = 0.0
         self._longest = 0.0
-        """Longest time that one of the recent lines covers, s. After a pause, a line has the mean
-        of the whole pause, and its time is uncertain. A pause counts until its length has passed.
-        """
+        """Longest time that one of the recent lines covers, s. A line after a pause reports the
+        mean speed of the whole pause, and its time is uncertain. It counts as recent until the
+        length of the pause has passed again."""
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
@@ -67,8 +68,8 @@ class Sanity:
         """Return why this line is impossible for any robot, "" if it is possible.
 
         A change of speed is compared with the last possible line and the time since then. Therefore
-        a real jump of the speed is accepted as soon as it could have happened. Each speed is a mean
-        over the time of its line, so the change may have taken the time from the middle of one line
+        a real jump of the speed is accepted as soon as enough time for it has passed. Each speed is
+        a mean over the time of its line, so the change may have lasted from the middle of one line
         to the middle of the next.
         """
         since = max(feedback.dt, feedback.since)
@@ -120,11 +121,11 @@ class Sanity:
         rows = zip(WHEELS, wheels, then_wheels, line.steps, turned or wheels, strict=True)
         for name, now, then, step, angle in rows:
             size, change = abs(now), abs(now - then)
-            # A quantization step allows excess speed only if it is proved by counts. A faulty
-            # encoder may show any step.
+            # A quantization step allows excess speed only if encoder counts prove the step. A
+            # faulty encoder may show any step.
             room = 0.0
             if line.count and turned is not None:
-                # If the line has n counts, n - 1 of them certainly lie in its time.
+                # If the line reports n counts, n - 1 of them certainly occurred in its time.
                 room = size * min(1.0, line.count / abs(angle)) if angle else size
                 step = max(step, line.count / SHORTEST_S)
             elif turned is not None and step < math.inf:

@@ -1,4 +1,4 @@
-"""Computes with errors of a planar pose as elements of the Lie algebra of SE(2).
+"""Computes with the errors of a planar pose, which are elements of the Lie algebra of SE(2).
 
 SE(2) is the group of planar poses (x, y, yaw). The error of an estimate is log(estimate^-1 truth):
 the constant twist that leads from the estimated pose to the true pose in one unit of time. It is a
@@ -8,8 +8,8 @@ Errors are expressed in axes that are parallel to those of odom, with the origin
 the robot moves, an error in these axes changes only by the lever arm of the displacement
 (`seen_from`). In the axes of base_link it would change by the adjoint of the robot's displacement.
 
-A covariance is that of such a vector. E[...] is an expected value, ' transposes, and [a, b] is the
-Lie bracket of two errors.
+A covariance is the covariance of such a vector. E[...] is an expected value, ' means transposed,
+and [a, b] is the Lie bracket of two errors.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def added(
     """Return the covariance `p` plus the noise of a step.
 
     Args:
-        p: the covariance before.
+        p: the covariance before the step.
         along: the variance of the distance, m2.
         yaw: the variance of the turn, rad2.
         both: the covariance of distance and turn, m rad.

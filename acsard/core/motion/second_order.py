@@ -1,12 +1,12 @@
 """Adds terms of second order to the covariance of the pose: heading errors bend the position error.
 
-If the heading deviates and returns, the robot ends short of the estimated place, and never beyond
-it. This is an effect of second order. On a straight it causes nearly the whole error along the
-path: after 60 m with k = 1e-5 (`error_model.py`) the error is 17 mm to first order, but 0.12 m in
-truth.
+If the true heading deviates from the estimated one and returns, the robot ends short of the
+estimated place, and never beyond it. This is an effect of second order. On a straight drive, it
+causes nearly the whole error along the path: after 60 m with k = 1e-5 (`error_model.py`) the error
+is 17 mm to first order, but 0.12 m in truth.
 
 The path is divided into stretches. Each stretch composes the error e of the path before it with its
-own error w. The formula of Baker, Campbell and Hausdorff gives the error of both, where [a, b] is
+own error w. The formula of Baker, Campbell and Hausdorff gives the composed error, where [a, b] is
 the Lie bracket (`se2.py`):
 
     log(exp(e) exp(w)) = e + w + [e, w] / 2 + [e, [e, w]] / 12 + [w, [w, e]] / 12 + ...
@@ -66,12 +66,12 @@ class SecondOrder:
         self._with_x: list[tuple[Vector, Vector]] = []
         """E[M_i x'] for each parameter i, with the rows x and y."""
         self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik for each pair of parameters, m. The keys are the indices, of which the first is not
-        smaller."""
+        """C_ik for each pair of parameters, m. Each key is a pair of indices, the larger one first.
+        """
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
-        """The terms, m2, in the axes of odom.
+        """The terms of second order in the covariance of x and y, m2, in the axes of odom.
 
         A step does not transform them, because only yaw has a lever arm.
         """
@@ -89,12 +89,11 @@ class SecondOrder:
     def compose(
         self, p: PoseCovariance, q: PoseCovariance, j: list[Vector], w: list[Vector]
     ) -> PoseCovariance:
-        """Add a stretch, and return the covariance to add to p + q.
+        """Add a stretch, and return the covariance that the caller must add to p + q.
 
-        It is the contribution of the last two terms of the series.
-
-        All arguments are seen from the end of the stretch. `carry` must have moved this object
-        there.
+        The result is the contribution of the last two terms of the series. All arguments must be
+        expressed at the robot's place at the end of the stretch (`se2.seen_from`). The caller must
+        first call `carry` with the displacement of the stretch.
 
         Args:
             p: the covariance P of the path before the stretch.

@@ -1,11 +1,11 @@
-"""Decides whether a suspect wheel has a faulty encoder, by its command or a gyro.
+"""Decides whether a suspect wheel has a faulty encoder, by comparison with its command or a gyro.
 
 A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
 opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if an
 independent reference differs more from it than from the other wheel of its side. The reference is
-the turn by a gyro, or else the command: the speed of a healthy wheel lies between its command and
-the speed that a slow wheel would have reached by now. Without a reference nothing is decided: a
-person who pushes the robot may turn one wheel and not the other.
+the turn according to a gyro or, without one, the command: the speed of a healthy wheel lies between
+its command and the speed that a slow wheel would have reached by now. Without a reference nothing
+is decided: a person who pushes the robot may turn one wheel and not the other.
 
 `Suspect` tests a wheel that contradicts the other one of its side. `Stuck` tests every wheel,
 because a stuck encoder agrees with the other wheel until the command changes.
@@ -23,32 +23,33 @@ FAULT_S, FAULT_LINES = 0.025, 2
 reading is not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""The two terms of the angle by which the other wheel must have turned further meanwhile: encoder
-counts and rad."""
+"""The two terms, encoder counts and rad, of the angle by which the other wheel must have turned
+further than the suspect wheel while the sign lasted."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""The two terms of the angle, encoder counts and rad, by which even a slow wheel must have turned
-more or less than at its old speed. A sound wheel cannot still repeat that speed by then. If the
+"""The two terms of an angle, encoder counts and rad. When even a slow wheel must have turned by
+this angle more or less than at its old speed, a sound wheel can no longer repeat that speed. If the
 other wheel has followed the command, this one is stuck."""
 
 LEAVES = 0.05
-"""Least difference of the command from that at the first repetition of a speed, rad/s."""
+"""Least difference, rad/s, of the command from the command at the first repetition of a speed."""
 
 VOTE = 1 / 3
-"""Least share of the difference between the two wheels by which the suspect wheel must be further
-from the reference."""
+"""A reference decides only if one wheel is further from it than the other wheel by at least this
+share of the difference between the two wheels."""
 
 HAND_S = 0.3
-"""Time for which a wheel must repeat one speed without a command to be called stuck, s. A hand
-cannot turn a wheel so evenly."""
+"""Time for which a wheel must repeat one speed without a command before it is called stuck, s. A
+hand cannot turn a wheel as evenly as this."""
 
 DEAD, REVERSED = 0.1, 0.3
 """Shares of the other wheel's turn. A wheel that turns by less than the first share is dead. A
-wheel whose turn differs from the opposite by less than the second share is reversed."""
+wheel whose turn differs from the opposite of that turn by less than the second share is reversed.
+"""
 
 STUCK = 0.3
-"""Least difference between the two wheels for a stuck one, as a share of the faster wheel's turn. A
-smaller difference is slip beside a wheel at a steady speed."""
+"""Least difference between the two wheels for calling one stuck, as a share of the faster wheel's
+turn. A smaller difference may be slip of the other wheel while this one turns steadily."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 
@@ -60,7 +61,7 @@ WORDS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    """The summed turns of both wheels, and the range of the true turn by one reference, rad."""
+    """Sums of the two wheels' turns, and of the range of the true turn by one reference, rad."""
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
@@ -83,7 +84,7 @@ class _Ballot:
 
     @property
     def vote(self) -> float:
-        """The suspect's part of the error: 1 for all of it, -1 if all is the other wheel's."""
+        """Which wheel is wrong: from 1 (only the suspect wheel) to -1 (only the other wheel)."""
         return (self._off(self._own) - self._off(self._other)) / (self.apart or 1.0)
 
     @property
@@ -133,9 +134,9 @@ class Suspect:
         return sign is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
-        """Return the sign, None without one.
+        """Return the sign of a fault in this line, None without one.
 
-        The earlier sign is kept where all signs look alike: at rest, and when the speed crosses
+        The previous sign stays while all signs look alike: at rest, and when the speed crosses
         zero.
         """
         if self.sign == "stuck" and same:
@@ -167,8 +168,8 @@ class Suspect:
         """
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
-        # The sound wheels of a slow robot still turn against a command that has changed its sign,
-        # but they slow down.
+        # After a command to the other direction, a sound wheel of a slow robot still turns against
+        # the command. It obeys if it does not turn faster than in the first line of the test.
         obeys = not expected.settled and own * command < 0.0 and abs(own) <= self._begun + count
         if expected.clear and not obeys:
             self._command.add(own, other, min(slow, command) * dt, max(slow, command) * dt)
@@ -191,7 +192,7 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return whether slip beside a wheel at a steady speed cannot explain the difference."""
+        """Return whether slip of the other wheel cannot explain the difference."""
         return self.sign != "stuck" or ballot.share >= STUCK
 
 
@@ -200,9 +201,9 @@ class Stuck:
 
     At a steady speed a stuck encoder reports the same as a sound one. Nothing can detect it then,
     and it does not harm the pose. When the command changes, a sound wheel must report another
-    speed. Even a slow wheel must, once its angle differs by a few counts from that at the old
-    speed. If the other wheel of the side has followed the new command, the motors obeyed it, so
-    this encoder is stuck.
+    speed. Even a slow wheel must do so as soon as its angle differs by a few counts from the angle
+    at the old speed. If the other wheel of the side has followed the new command, the motors obeyed
+    it, so this encoder is stuck.
     """
 
     def __init__(self) -> None:
@@ -213,7 +214,7 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether `command`, rad/s, differs from that at the first repetition."""
+        """Return whether `command`, rad/s, differs from the one at the first repetition."""
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
@@ -244,7 +245,7 @@ class Stuck:
 
 
 def stands(own: float, other: float) -> bool:
-    """Return whether a wheel that turned `own` rad stands, compared with the `other` one, rad."""
+    """Return whether a wheel that turned `own` rad stands, if the other one turned `other` rad."""
     return own == 0.0 or abs(own) <= DEAD * abs(other)
 
 

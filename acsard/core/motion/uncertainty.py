@@ -4,7 +4,7 @@ The error is e = log(estimate^-1 truth) in SE(2) (`se2.py`), with the components
 has two parts. Noise is independent from step to step, and its covariance is P (3x3). The error of a
 parameter, such as a wheel radius, is the same in every step, so its effects add up. The matrix J
 has a column for each parameter: the error of the pose if this parameter is off by one standard
-deviation. Each step updates both parts, and their sum is published (' transposes):
+deviation. Each step updates both parts, and their sum is published (' means transposed):
 
     P <- F P F' + G Q G'
     J <- F J + G_p
@@ -54,7 +54,8 @@ MAX_VARIANCE = 1e9
 """Largest variance, m2 or rad2. It means "unknown", and it keeps the numbers finite for years."""
 
 COARSE_COUNTS = 400
-"""Encoder counts per wheel turn that are assumed if none are configured. Few encoders have less."""
+"""Encoder counts per wheel turn that are assumed if none are configured. Few encoders have
+fewer."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
@@ -110,7 +111,7 @@ class PoseUncertainty:
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: float) -> None:
-        """Reset the covariance to that of the start. `yaw` is the heading of the new pose, rad."""
+        """Reset the covariance to its initial value. `yaw` is the heading of the new pose, rad."""
         xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
@@ -172,7 +173,7 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Add variances to the last step: `along` in its direction, m2, and `yaw` in turn, rad2."""
+        """Add variances to the last step: `along` (distance, m2) and `yaw` (turn, rad2)."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
@@ -216,8 +217,8 @@ class PoseUncertainty:
     def _forget_where(self, distance: float, turn: float) -> None:
         """Publish that the pose is unknown, if the robot moves.
 
-        This is called when the position or the heading is unknown. A motion makes the other one
-        unknown too.
+        This method is called when the position or the heading is unknown. A motion then makes both
+        of them unknown.
         """
         if distance or turn:
             self.covariance = NOWHERE
@@ -238,8 +239,9 @@ class PoseUncertainty:
         """Update the columns: J <- F J + G_p.
 
         Half of the heading error of the step acts on the displacement of the step itself, because
-        the chord points to half of the turn. `scale` is the relative standard deviation of the
-        scale of the gyro that measured the turn, or None if the wheels measured it.
+        the direction of the chord is the old heading plus half of the turn. `scale` is the relative
+        standard deviation of the scale of the gyro that measured the turn, or None if the wheels
+        measured it.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []

@@ -1,22 +1,22 @@
 """Decides which wheel is faulty and which side slips.
 
 The two wheels of a side are compared with each other (`wheel_residual.py`). If they contradict each
-other, one of them may have a faulty encoder: it shows the sign of one, and an independent reference
-contradicts it (`suspect_wheel.py`). The pose then ignores this wheel and uses the other one in its
-place.
+other, one of them may have a faulty encoder. A wheel is faulty if it shows the sign of such a fault
+and an independent reference contradicts it (`suspect_wheel.py`). The pose then ignores this wheel
+and uses the other one in its place.
 
 - If both wheels agree again for `BACK_S` of rolling, the pose uses the ignored wheel again.
-- If the ignored wheel contradicts the other one and its command for `feedback.fault_time` instead,
-  it is a fault.
-- A wheel that contradicts its command for this time is a fault too (`wheel_witness.py`), because
-  both wheels of a side may be wrong and agree.
+- If the ignored wheel contradicts the other one and its command for `feedback.fault_time`, the
+  robot latches a fault.
+- If any wheel contradicts its command for this time (`wheel_witness.py`), the robot latches a fault
+  too, because both wheels of a side may be wrong and agree with each other.
 
-Every other contradiction counts as slip, and so does a faulty encoder until it is proven. A side
-always keeps one wheel. A wheel that is blocked or dragged looks like one with a dead encoder, so it
-is ignored too. The other wheel shows the distance driven.
+Every other contradiction counts as slip, and so does a faulty encoder until the fault is proven. At
+most one wheel of each side is ignored. A wheel that is blocked or dragged looks like one with a
+dead encoder, so it is ignored too. The other wheel shows the distance driven.
 
-If a wheel turns after a rest without a command, a hand or a slope turns it. That is reported, but
-it is never a fault, because the daemon could only react to it with the zero that it already sends.
+If a wheel turns after a rest without a command, a hand or a slope turns it. This is reported, but
+it is never a fault, because the daemon could only react with the zero that it already sends.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ LEAST = 0.005
 """Smallest speed that a feedback line can report, rad/s. It reports a smaller one as zero."""
 
 ROLLED_S, REPEATED_S = 0.2, 1.0
-"""Time for which wheels must turn without a command before it is reported, and least time between
-two such reports, s. A robot that rocks to rest is not being pushed."""
+"""Time for which wheels must turn without a command before this is reported, and least time between
+two such reports, s. A robot that rocks as it comes to rest is not being pushed."""
 
 SLIP_S = 0.5
 """Time after the last contradiction for which a side still counts as slipping, s."""
@@ -68,7 +68,7 @@ LEFT, RIGHT = (1, 2), (0, 3)
 
 
 class _Side:
-    """The two wheels of one side: their expected speed, which is ignored, and whether they slip."""
+    """The two wheels of one side, with the evidence of faults and slip, and the ignored wheel."""
 
     def __init__(self, name: str, wheels: tuple[int, int]) -> None:
         self.name, self.wheels = name, wheels
@@ -140,7 +140,7 @@ class _Side:
     def fault(self, seen: Motors, limit: float) -> str:
         """Return the words for a fault that has lasted longer than `limit` s, "" without one.
 
-        `seen` has the reported speeds of all wheels, rad/s, for the words.
+        `seen` contains the reported speeds of all wheels, rad/s, for the words.
         """
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
@@ -221,8 +221,8 @@ class _Side:
                 self._out_s = self._out_s + dt if same[self.out] else 0.0
             elif fault == "reversed" and against:
                 self._out_s += dt
-        # A finding that a wheel is reversed may be wrong on a slow robot, so the test goes on after
-        # it.
+        # On a slow robot, a wheel may be called reversed by mistake, so go on with the test of the
+        # other wheel then.
         if fault in ("dead", "stuck"):
             return False
         self.suspected = True
@@ -246,7 +246,7 @@ class _Side:
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
         """Return whether the ignored wheel may already have been wrong in an earlier line.
 
-        `before` has the speeds of that line and `now` those of the last line, rad/s.
+        `before` contains the speeds of that line, and `now` the speeds of the last line, rad/s.
         """
         if self.out is None:
             return False
@@ -301,7 +301,7 @@ class WheelFaults:
 
     @property
     def status(self) -> WheelsStatus:
-        """The ignored wheels, and the sides that slip."""
+        """The state of the wheels: ignored ones, slow ones, and the sides that slip."""
         sides = self._sides
         return WheelsStatus(
             text="; ".join(side.text for side in sides if side.text),
@@ -312,9 +312,9 @@ class WheelFaults:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """Return four wheel values in which the other wheel of the side replaces an ignored one.
+        """Return the wheel values, with each ignored wheel replaced by the other one of its side.
 
-        The values are angles, rad, or speeds, rad/s.
+        The values are angles, rad, or speeds, rad/s, in `WHEELS` order.
         """
         if not self._leaves_out:
             return wheels
@@ -334,7 +334,8 @@ class WheelFaults:
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
         """Compare a line with the command. Call this before `look`.
 
-        Return the fault that the lines prove in words, with the name of the wheel, or "".
+        Return a text that names the faulty wheel and its fault if the lines so far prove one,
+        otherwise "".
 
         Args:
             commanded: The commanded speeds, rad/s; None if the motors have no power.
@@ -362,7 +363,7 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Report, but not in every line, wheels that turn after a rest without a command."""
+        """Set `pushed` if wheels turn after a rest without a command, but not in every line."""
         fastest = 0.0
         if still:
             fastest = max([
@@ -447,9 +448,9 @@ class WheelFaults:
         return Event("wheel_fault", text, "warning", kind="slow")
 
     def was_faulty(self, before: WheelSpeeds) -> bool:
-        """Return whether the wheel that is ignored since the last line was already wrong before.
+        """Return whether the wheel that the last line proved faulty was wrong in an earlier line.
 
-        `before` has the speeds of an earlier line, rad/s.
+        `before` contains the speeds of the earlier line, rad/s.
         """
         return self._found is not None and self._found.was_faulty(before, self._last)
 

@@ -15,16 +15,16 @@ The comparison uses sums of recent wheel angles, in which older angles have less
 
     |D - r A| > SHARE A + COUNTS c + LEAST
 
-D is the sum of front minus rear, rad, A is the sum of the side's angle, rad, r is the learned
-fraction, and c is the angle of an encoder count, rad. They slip if |D - r A| exceeds this limit by
-more than LAG_S |v - mean of v|, the effect of a motor that reacts later. v is the speed of the
-side, rad/s.
+where D is the sum of the front wheel's angles minus those of the rear wheel, rad, A is the sum of
+the side's angles, rad, r is the learned fraction, and c is the angle of an encoder count, rad. The
+wheels slip if |D - r A| exceeds this limit by more than LAG_S |v - mean of v|, where v is the speed
+of the side, rad/s. This term is the effect of a motor that reacts later.
 
 Two wheels at unknown positions within a count can differ by two counts without slip. Therefore a
 slip by the fraction s at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per
 turn, a slip of a tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if the tyres may cause
-the fraction SHARE of it. With COUNTS and sums that forget, such a slip is found within 0.2 s above
-22 rad/s, and never below 11.5 rad/s.
+the fraction SHARE of it. With the limit COUNTS and with sums that forget old angles, such a slip is
+found within 0.2 s above 22 rad/s, and never below 11.5 rad/s.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ MEMORY_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Allowed difference as a fraction of the angle: half of the slip of 10 % that must be found."""
+"""Allowed difference as a fraction of the angle: half of 10 %, the slip that must be found."""
 
 COUNTS = 1.2
 """Allowed difference in encoder counts. Wheels without slip rarely exceed it."""
 
 LAG_S = 0.03
-"""Allowed delay of one motor behind the other, s."""
+"""Allowed delay of one motor relative to the other, s."""
 
 LEAST = 0.002
-"""Additional allowed difference, rad, for the two decimals and for backlash."""
+"""Additional allowed difference, rad, for speeds with two decimals and for backlash."""
 
 UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
@@ -56,8 +56,8 @@ SLOWEST = 1.0
 """Wheel speed below which the fraction is not learned, rad/s."""
 
 WILD = 0.1
-"""Fraction towards which the learned one moves while the wheels contradict each other. A slip ends
-soon, unlike the effect of a flat tyre."""
+"""Fraction towards which the learned fraction moves while the wheels contradict each other. A slip
+ends soon, unlike the effect of a flat tyre."""
 
 
 class Residual:

@@ -1,9 +1,9 @@
 """Compares wheels with their commands, and collects the evidence that a wheel is faulty.
 
-`Expected` is the one model of a healthy wheel: a first-order lag behind the command of its side.
-`suspect_wheel.py` uses it to decide which of two wheels is wrong, and `Witness` uses it to decide
-whether a wheel obeys. The bounds around the expected speed leave room for load, slip and coarse
-encoders. Only behaviour that no healthy wheel shows is evidence, and evidence must last.
+`Expected` is the only model of a healthy wheel: its speed follows the command with a first-order
+lag. `suspect_wheel.py` uses it to decide which of two wheels is wrong, and `Witness` uses it to
+decide whether a wheel obeys. The bounds around the expected speed leave room for load, slip and
+coarse encoders. Only behaviour that no healthy wheel shows is evidence, and evidence must last.
 
 If a wheel stands, turns against its command or turns too fast, it still counts as obeying while its
 speed approaches the command. If a wheel turns in the right direction but too slowly, the daemon
@@ -17,7 +17,7 @@ import math
 from typing import Literal
 
 SLACK = 2.0
-"""Speed below which coarse encoders and a robot at rest look like any fault, rad/s."""
+"""Speed below which coarse encoders and a robot at rest can look like any fault, rad/s."""
 
 COMMANDED = 0.3
 """Smallest command that shows which wheel is right, rad/s."""
@@ -59,9 +59,9 @@ class Expected:
         self._begins = self.settled = self.clear = False
 
     def forget(self) -> None:
-        """Start over, with the speed of the next line as the expected one.
+        """Start over, with the speed in the next line as the expected speed.
 
-        The wheels may still coast.
+        The wheels may still coast, so rest is not the right start.
         """
         self.commanded, self._begins, self.clear = 0.0, True, False
 
@@ -89,7 +89,7 @@ class Expected:
 
 
 class Witness:
-    """The evidence against one wheel by its command, and the ratio of the two speeds."""
+    """The evidence that one wheel does not obey its command, and the ratio of the two speeds."""
 
     def __init__(self) -> None:
         self.driven = False
@@ -102,7 +102,7 @@ class Witness:
         self.forget()
 
     def forget(self) -> None:
-        """Start over, but remember whether the wheel must still come to rest."""
+        """Start over, but keep `driven`: whether the wheel must still come to rest."""
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
         self._seen, self._begins = 0.0, True
@@ -113,7 +113,8 @@ class Witness:
         # already too fast would never count as slowing down: slow motors latched "runaway" that
         # way.
         self._nearest = math.inf
-        """Speed away from the command when the wheel last approached the command, rad/s."""
+        """How far the wheel was from obeying when it last approached the command, rad/s: its speed
+        if it was too fast, otherwise its speed against the direction of the command."""
         self._wrong = False
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0

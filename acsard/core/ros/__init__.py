@@ -1,1 +1,4 @@
-"""ROS 2 over Zenoh: names, tokens, attachments and parameters of the two transports."""
+"""ROS 2 over Zenoh: names, tokens, attachments and parameters.
+
+There are two transports: zenoh-bridge-ros2dds and rmw_zenoh_cpp.
+"""

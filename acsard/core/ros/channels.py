@@ -1,11 +1,11 @@
 """The table of topics in MCAP files and live viewers: name, ROS type and message definition.
 
-Each topic is encoded as CDR and has its message definition (`ros2msg` of MCAP), so Foxglove,
+Each topic is encoded as CDR and carries its message definition (`ros2msg` of MCAP), so Foxglove,
 Lichtblick and PlotJuggler can read it. No topic may have another encoding, because `ros2 bag play`
 refuses such a file.
 
 ROS has no type for `state`, so this topic has a type of the package `acsard` (`shapes.py`). `ros2
-bag play` leaves out the topic and reports that, and the programs above show it. The names and types
+bag play` skips this topic with a message, but the programs above show it. The names and types
 of all other topics come from `transports.py`. The definitions are those of ROS 2 Jazzy and later.
 """
 
@@ -25,7 +25,7 @@ from acsard.core.ros.shapes import Log, State, state
 from acsard.core.ros.transports import PUBLISHED
 
 OURS = "acsard/msg/"
-"""Prefix of the types that ROS does not have. An MCAP file has their definitions as well."""
+"""Prefix of the types that ROS does not have. An MCAP file contains their definitions too."""
 
 Field = tuple[str, str]
 """Type and name of a field."""
@@ -95,9 +95,9 @@ acsard/msg/RobotState: \
 """
 """Message definitions, one type in each line.
 
-A line has the name of the type, a colon, and a list separated by commas. The list has constants as
-`type NAME=value`, and fields as `type name` or `type name default`. `[]` marks a sequence and `[n]`
-an array.
+A line consists of the name of the type, a colon, and a list separated by commas. The list contains
+constants as `type NAME=value`, and fields as `type name` or `type name default`. `[]` marks a
+sequence and `[n]` an array.
 """
 
 
@@ -212,6 +212,6 @@ CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
     """Return the channels on which a robot publishes.
 
-    `silent` has the native keys to leave out, as `transports.left_out` returns them.
+    `silent` contains the native keys to leave out, as `transports.left_out` returns them.
     """
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

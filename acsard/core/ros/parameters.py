@@ -3,8 +3,8 @@
 A parameter has the name of its key in `acsard.toml`, with dots between table and key. Only the
 settings in `core/config/live.py` can be set. This module only decodes a request to set parameters.
 The robot accepts or refuses it. The description and the range of a parameter come from the types in
-`core/config/settings.py`. The module also has the types of rcl_interfaces, because no other module
-uses them.
+`core/config/settings.py`. The module also contains the types of rcl_interfaces, because no other
+module uses them.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 def kind_of(name: str) -> inspect.Type:
     """Return the declared type of the setting with the dotted key `name`.
 
-    The key has the name of a source in place of its index. Raises `KeyError` for the name of a
+    The key contains the name of a source in place of its index. Raises `KeyError` for the name of a
     table.
     """
     cls: type[Struct] = Config
@@ -165,7 +165,7 @@ class ListRequest(Struct, frozen=True):
     prefixes: Many[str]
     """Prefixes of the names to list. If there are none, all names are listed."""
     depth: Unsigned64
-    """Largest number of parts, separated by dots, that a name has after its prefix; 0: any."""
+    """Largest number of dot-separated parts that a name may have after its prefix; 0 = any."""
 
 
 class ListReply(Struct, frozen=True):
@@ -224,12 +224,12 @@ SETTING = ("set_parameters", "set_parameters_atomically")
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
     """Return the reply to a request that is refused.
 
-    Without a reply, the client would wait for ever. The reply to a request that sets parameters has
-    the reason. Other replies have no field for a reason, so they are empty, as in rclcpp.
+    Without a reply, the client would wait for ever. The reply to a request that sets parameters
+    gives the reason. Other replies have no field for a reason, so they are empty, as in rclcpp.
 
     Args:
         service: the name of the service.
-        why: the reason of the refusal.
+        why: the reason for the refusal.
         request: the payload of the request, which shows how many parameters it sets.
     """
     refused = SetParametersResult(False, why)
@@ -251,7 +251,7 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 class Parameters:
     """Answers the services that only read parameters.
 
-    The values come from the tables of a configuration.
+    The values come from `tables`, a configuration as `effective` returns it.
     """
 
     def __init__(self, tables: Mapping[str, object]) -> None:

@@ -1,4 +1,4 @@
-"""Converts messages whose fields differ in ROS from the native ones: log messages and `state`.
+"""Converts native messages to ROS messages with other fields: log messages and `state`.
 
 CDR has no maps, so the counters are a list. Null is encoded as NaN (`cdr_types.py`).
 """
@@ -64,7 +64,7 @@ def how_often(text: str, count: int) -> str:
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
     """Convert the command of a source to a message of `cmd_vel_in/<source>`.
 
-    The header of the message has the time `arrived` and the frame id `frame`.
+    The header of the message contains the time `arrived` and the frame id `frame`.
     """
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))

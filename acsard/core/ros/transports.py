@@ -146,8 +146,8 @@ def left_out(config: Config) -> frozenset[str]:
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
     """Return the topics and services of a robot.
 
-    A topic that accepts both types of twists appears twice, once for each type. `silent` has the
-    native keys to leave out, as `left_out` returns them.
+    A topic that accepts both types of twists appears twice, once for each type. `silent` contains
+    the native keys to leave out, as `left_out` returns them.
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (

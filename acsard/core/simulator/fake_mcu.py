@@ -5,8 +5,8 @@ motors, obeys only complete valid lines, stops the motors after 300 ms without a
 answers a checked line with a checked one. It shares no parser with the host, so that an error in
 one parser is not hidden by the same error in the other.
 
-The faults are `with` blocks, such as `with mcu.mute():` (`faults.py`). The faults in `[sim] faults`
-stay on.
+A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The faults in `[sim]
+faults` are always on.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ class FakeMcu(Faults):
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns
-        """Monotonic time of the last `advance`, and time up to which the vehicle has moved, ns."""
+        """`_now_ns` is the time of the last `advance`, and `_moved_ns` the time up to which the
+        vehicle has moved, both monotonic, ns."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -93,8 +94,7 @@ class FakeMcu(Faults):
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last lines that the board received, valid or not. The time is that of their end, ns.
-        """
+        """The last received lines, valid or not, each with the monotonic time of its end, ns."""
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False
@@ -105,16 +105,16 @@ class FakeMcu(Faults):
         """The faults of the inputs: begin (ns), end (ns), field of the status line, and its value.
 
         The value `silent` leaves the field out of the line. If several faults of a field are on,
-        the last one decides, except that several bumpers may be pressed at once. The line has only
-        the fields that a fault names.
+        the last one decides, except that several bumpers may be pressed at once. The line
+        contains only the fields that a fault names.
         """
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
-        """Charge of the battery, 0 to 1, and its capacity, ampere seconds."""
+        """State of charge of the battery, 0 to 1, and its capacity, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
-        """Time at which the charge was last computed, and last time at which no motor was
-        commanded, both ns."""
+        """`_drained_ns` is the time at which the charge was last computed, and `_rested_ns` the
+        last time at which no motor was commanded, both ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -156,7 +156,7 @@ class FakeMcu(Faults):
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`, and return the bytes that arrived at the host meanwhile."""
+        """Let time pass up to `now_ns`. Return the bytes that the host received in that time."""
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
@@ -191,7 +191,8 @@ class FakeMcu(Faults):
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
         """Reset the board.
 
-        The board stops the motors and ignores its input for `deaf_ns` ns. Meanwhile it sends noise.
+        The board stops the motors, and ignores its input for `deaf_ns` ns. During that time it
+        sends noise.
         """
         self._now_ns = now_ns
         self._events.clear()
@@ -217,7 +218,7 @@ class FakeMcu(Faults):
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _catch_up(self) -> None:
-        """Move the vehicle up to now. If the watchdog trips meanwhile, the motors stop then."""
+        """Move the vehicle up to the present time, and stop the motors when the watchdog trips."""
         vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
         deadline = self._fed_ns + self.watchdog_ns
         if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
@@ -348,7 +349,7 @@ class FakeMcu(Faults):
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
     def _tell_inputs(self, now_ns: int) -> None:
-        """Send a status line with the inputs, without the fields with the value `silent`."""
+        """Send a status line with the inputs, except those whose value is `silent`."""
         fields: dict[str, str] = {}
         for begin_ns, end_ns, name, value in self._inputs:
             before = fields.setdefault(name, self._bumpers if name == "bumpers" else "ok")
@@ -431,7 +432,7 @@ class FakeMcu(Faults):
 
     @contextmanager
     def battery(self, percent: float, minutes: float) -> Iterator[None]:
-        """Report a battery ten times a second. It has `percent` % of its charge at first.
+        """Report a battery ten times a second. At first its charge is `percent` %.
 
         A full battery lasts `minutes` minutes while the robot stands, and less while it drives.
         """

@@ -1,7 +1,7 @@
 """The faults of the simulated board and its wire. Each fault is a method for a `with` statement.
 
-This module has the switches of the faults, and `fake_mcu.py` implements their effects. No fault is
-random. A fault that affects only some lines affects every n-th line.
+This module contains the switches of the faults, and `fake_mcu.py` implements their effects. No
+fault is random. A fault that affects only some lines affects every n-th line.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Faults:
         self.baud_rate = 115200
         self.reply_gap_ns = 0
         self.drivers = [0, 1, 2, 3]
-        """The motor that each channel drives."""
+        """The motor that each channel drives. Channels 0 to 3 are the board's outputs a to d."""
         self.drives = [1.0] * 4
         """Factor between the command of a channel and its motor: 1, -1 if reversed, 0 if dead."""
         self.push: float | None = None
@@ -58,7 +58,7 @@ class Faults:
         """Interval between two packets of the host's USB adapter, ns; 0 means no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
-        """The fault affects every n-th reply, command or line. 0 means none."""
+        """The numbers n of the faults that affect every n-th reply, command or line; 0 = off."""
         self._passed = {"reply": 0, "command": 0, "bit": 0}
         self._clock = b""
 
@@ -72,13 +72,13 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        """Move the vehicle up to now with the old values, then set these switches."""
+        """Move the vehicle up to the present time with the old switches, then set the new ones."""
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)
 
     def _catch_up(self) -> None:
-        """Move the vehicle up to now. The subclass with the vehicle implements this."""
+        """Move the vehicle up to the present time. The subclass with a vehicle implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
         """Count an event of kind `what`, and return whether the fault affects this event.

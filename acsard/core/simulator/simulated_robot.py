@@ -43,7 +43,10 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """Pairs of a time (ns) and the angle turned until then (rad), as old as the gyro needs."""
+        """Pairs of a time (ns) and the angle turned until then (rad).
+
+        They go back as far as the delayed samples of the gyro need.
+        """
 
     def next_ns(self) -> int:
         """Return the monotonic time of the next event or observation, ns."""
@@ -51,7 +54,7 @@ class WatchedMcu(FakeMcu):
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`, and return the bytes that arrived at the host meanwhile."""
+        """Let time pass up to `now_ns`. Return the bytes that the host received in that time."""
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)

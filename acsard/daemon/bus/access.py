@@ -3,16 +3,17 @@
 Zenoh denies every message that no rule allows.
 
 - Zenoh checks the rules at the end of a link: at the daemon's session or, over TLS, at the session
-  of the TLS gateway. It knows only the neighbour on that link, so a client behind a router has the
-  permissions of the router.
-- A rule allows a message if one of the rule's key expressions includes the key expression of the
-  message. A query with a wildcard therefore needs a rule with a wildcard.
+  of the TLS gateway. That session knows only the neighbour on the link, so a client that connects
+  through a router has the permissions of the router.
+- A rule allows a message only if one of the rule's key expressions includes the whole key
+  expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
 - A client over TLS may use exact keys only, unless `access.wildcards` is set. A few wildcards can
   take all of Zenoh's processor time.
-- The daemon checks each message again: the exact key, the kind PUT and the source.
+- The daemon itself checks three things of each message again: the exact key, the kind (PUT), and
+  the source of commands.
 
 Zenoh does not tell the daemon with which certificate a sample came. Therefore each certificate that
-may command has keys of its own, which end with the certificate's name, and the rules let no other
+may command has keys of its own, which end with the certificate's name. The rules let no other
 certificate put on these keys.
 """
 
@@ -63,17 +64,17 @@ DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_RO
 
 
 def _grants(role: Role) -> tuple[str, ...]:
-    """Return the names of the rules of a role: for its own keys and for those of lower roles.
+    """Return the names of a role's rules: those for its own keys and for those of lower roles.
 
-    Only the maintainer may forward the liveliness tokens of other daemons. A router has this role.
+    Only the maintainer may forward the liveliness tokens of other daemons, because a router has
+    this role.
     """
     own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
     return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))
 
 
 USES = ("subscribes", "queries", "publishes")
-"""The last words of the rules for a role's keys. Such a rule is named, for example, "viewer
-queries"."""
+"""The last words in the names of the rules for a role's keys, as in "viewer queries"."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
 """The names of the rules of each role. `_rules` defines the rules."""
@@ -98,8 +99,9 @@ LOCAL = (
 """The names of the rules of a client on the robot's own machine.
 
 Such a client has the permissions of a maintainer. It may also subscribe with any wildcard and
-receive the commands of other clients. It may put on wrong keys, so that the daemon can count such a
-sample and refuse it with a reason. It may not publish on the keys on which the robot publishes.
+receive the commands of other clients. It may even put on wrong keys, so that the daemon receives
+such a sample, counts it and refuses it with a reason. It may not publish on the keys on which the
+robot publishes.
 """
 
 Flow = Literal["ingress", "egress"]
@@ -129,7 +131,7 @@ class _Keys:
         self._incoming = [topic for topic in topics if topic not in outgoing]
         """Rows of the topic table that the daemon does not publish: inputs, queries and services.
 
-        If the daemon publishes the simulator's gyro, the gyro's row is not among them.
+        If the daemon itself publishes the gyro of the simulator, the row of the gyro is left out.
         """
         self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
         """Rows of the topic table that clients may subscribe to or query."""
@@ -160,13 +162,13 @@ class _Keys:
         ]
         self.answered = [*self.published, *self.kept, *queries]
         self.answered += [e.key for e in ros if e.direction in ("query", "service")]
-        """Key expressions on which the daemon publishes, or which it answers."""
+        """Key expressions on which the daemon publishes, or whose queries it answers."""
 
     def of(self, role: Role, use: Use) -> list[str]:
         """Return the exact native and ROS keys that `role` may use and that no lower role may use.
 
-        `use` is the kind of use. Command keys that end with a certificate's name are not included;
-        see `commands_by`.
+        `use` is "subscribe", "query" or "publish". Command keys that end with a certificate's name
+        are not included; see `commands_by`.
         """
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
@@ -183,8 +185,9 @@ class _Keys:
     def _least(self, endpoint: Endpoint) -> Role | None:
         """Return the lowest role that may use a ROS endpoint: the same as for its native key.
 
-        Return None if the endpoint commands a source that is not configured: no role may do that. A
-        ROS key cannot contain a certificate's name, so every role that may command may use it.
+        Return None if the endpoint sends commands to a source that is not configured, which no role
+        may do. A ROS key cannot contain a certificate's name, so every role that may command may
+        use the ROS key of a command.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):
@@ -212,9 +215,9 @@ def access_control(config: Config) -> dict[str, object]:
 def gateway_access(config: Config) -> dict[str, object]:
     """Return the value of Zenoh's `access_control` for the session of the TLS gateway.
 
-    That session has only one link without a certificate, which leads to the daemon. Each
-    certificate that may command is a subject of its own, and also belongs to the subject of its
-    role.
+    The only link of that session without a certificate leads to the daemon. Each certificate that
+    may command is a subject of its own (Zenoh's word for those to whom rules apply), and also
+    belongs to the subject of its role.
     """
     return _access(config, ("pass",), gateway=True)
 
@@ -222,7 +225,7 @@ def gateway_access(config: Config) -> dict[str, object]:
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
     """Return the value of `access_control`.
 
-    `local` has the names of the rules for links without a certificate. `gateway` is true for the
+    `local` gives the names of the rules for links without a certificate. `gateway` is true for the
     TLS gateway and false for the daemon.
     """
     keys = _Keys(config)
@@ -272,12 +275,13 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
 
 def _rules(keys: _Keys) -> dict[str, Rule]:
     tokens = [keys.alive, *keys.claims, *keys.kept, *TOKENS]
-    # Samples on the gyro's key pass although the simulator publishes there, because the daemon
-    # refuses them with a reason.
+    # The gyro's key is not forbidden, although the simulator publishes on it. So the daemon
+    # receives a client's sample on this key, and can refuse it with a reason.
     forged = [key for key in keys.answered if key != keys.imu]
     following = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
     rules = [
-        # The daemon sends declarations and answers, data, and commands to subscribers of commands:
+        # The daemon sends declarations and answers (`speak`) and data (`tell`). It also forwards
+        # commands to clients that subscribe to commands (`overhear`):
         _rule("speak", "egress", SPOKEN, [*keys.answered, *keys.subscribed, *tokens]),
         _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
         _rule("overhear", "egress", ["put"], keys.subscribed),
@@ -302,7 +306,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.viewer_queries]),
         _rule("browse", "ingress", ["query"], [keys.all]),
         _rule("attend", "ingress", ["liveliness_token"], keys.kept),
-        # A client on the robot's own machine has these rules too (`LOCAL`).
+        # The next three rules are only for a client on the robot's own machine (`LOCAL`).
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*forged, *tokens], "deny"),

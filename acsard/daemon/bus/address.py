@@ -49,14 +49,14 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    An argument that is not None takes precedence. The other values come from the file that
-    $ACSARD_CONFIG names, or from the defaults. $ACSARD_TLS replaces the certificate directory of
-    the file. Raises `UsageError` for an id that no robot can have, and for a file that cannot be
-    used.
+    The arguments are the endpoint, the robot's id and the certificate directory. An argument that
+    is not None takes precedence. The other values come from the file that $ACSARD_CONFIG names, or
+    from the defaults. $ACSARD_TLS replaces the certificate directory of the file. Raises
+    `UsageError` for an id that no robot can have, and for a file that cannot be used.
     """
     complete = endpoint is not None and robot_id is not None
     if complete and (tls is not None or not _is_tls(endpoint or "")):
-        # The arguments decide everything, so do not read the file. It need not exist.
+        # The arguments give every value, so do not read the file, which need not exist.
         config = Config()
     else:
         config = _config_of_environment()

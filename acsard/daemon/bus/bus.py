@@ -1,4 +1,4 @@
-"""Owns the daemon's Zenoh session and its keys, takes input from the bus and publishes to it.
+"""Owns the daemon's Zenoh session and the robot's keys, receives from the bus and publishes to it.
 
 Every Zenoh call that may block (open, declare, put, reply, close) runs in a thread, never on the
 event loop.
@@ -35,7 +35,7 @@ OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
 TWIN_TIMEOUT_S = 0.5
-"""Time in which the start of the daemon checks whether another daemon has this robot's id or ROS
+"""Time for which the daemon checks at its start whether another daemon has this robot's id or ROS
 names, s."""
 
 
@@ -56,13 +56,14 @@ class ZenohBus:
         self._outlets, self._links = Outlets(), RouterLinks(config.bus, self._inbox)
         self._session: zenoh.Session
         self._kept: list[object] = []
-        """Declared entities. Zenoh undeclares an entity when nothing refers to it."""
+        """References to the declared entities. Zenoh undeclares an entity when nothing refers to
+        it."""
 
     # The control loop calls the methods below.
 
     @property
     def wanted(self) -> frozenset[str]:
-        """Published topics that have a subscriber, natively or in ROS."""
+        """The published topics that have a subscriber, on a native key or on a ROS key."""
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
@@ -129,7 +130,7 @@ class ZenohBus:
     def _conflict(self, tokens: set[str]) -> str:
         """Return an error message if another daemon has this robot's id or ROS names, else "".
 
-        `tokens` has those of this robot's liveliness tokens that other sessions hold.
+        `tokens` contains those of this robot's liveliness tokens that other sessions have declared.
         """
         if self._alive in tokens:
             return (
@@ -215,7 +216,7 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return those of the liveliness tokens `alive` and `claims` that other sessions hold.
+    """Return those of the liveliness tokens `alive` and `claims` that other sessions have declared.
 
     Blocks for up to `TWIN_TIMEOUT_S`.
     """
@@ -226,7 +227,7 @@ def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[
     deadline_ns = clock.now().mono_ns + int(TWIN_TIMEOUT_S * NS_PER_S)
     held: set[str] = set()
     # A daemon with this robot's id also has its ROS names. The message about the id is clearer, so
-    # go on until the token of the id arrives.
+    # go on until the token of the id or the deadline arrives.
     while alive not in held and clock.now().mono_ns < deadline_ns:
         time.sleep(0.01)
         held |= {token for token, other in subscribers.items() if other.try_recv() is not None}

@@ -1,7 +1,7 @@
-"""A thread of the bus whose unexpected end ends the daemon.
+"""A thread of the bus. If an exception ends it, the daemon ends too.
 
-Without such a thread the robot would drive on, but would no longer publish or answer. An exception
-in it is a bug, like one in a control step.
+If such a thread were missing, the robot would drive on, but would no longer publish or answer. An
+exception in the thread is a bug, like one in a control step.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from threading import Thread
 
 
 class BusThread(Thread):
-    """A thread that keeps the exception that has ended it, for the control loop."""
+    """A thread that stores the exception that has ended it. The control loop calls `check`."""
 
     def __init__(self, name: str, work: Callable[[], None]) -> None:
         """Prepare the thread, which runs `work`."""

@@ -2,11 +2,11 @@
 
 Zenoh reads the files of a listening endpoint only when it opens the endpoint, and the files of a
 connection only when it connects. A process that listens must therefore know when its files have
-been replaced, which `renewed` reports. Three files cannot be replaced at the same moment. So new
-files are reported only when they belong together and no longer change.
+been replaced. `CertificateFiles.renewed` reports this. Three files cannot be replaced at the same
+moment. So new files are reported only when they belong together and no longer change.
 
-The watched expiry times are those of the robot's own certificate, of its authority's and of the
-routers'. A thread reads them again and again, because a disk or a router may not answer.
+The watched expiry times are those of three kinds of certificates: the robot's own, its authority's
+and the routers'. A thread reads them again and again, because a disk or a router may not answer.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
 
 FILES_LOOK_NS = 2 * NS_PER_S
-"""Time between two checks for replaced files, ns. Copying three files takes less."""
+"""Time between two checks for replaced files, ns. Copying three files takes less time, so files
+that have not changed between two checks are complete."""
 
 Signature = tuple[tuple[int, int, int], ...]
 """Inode, size in bytes and modification time in ns of each file; () if a file is missing."""
 
 
 class CertificateFiles:
-    """The authority, the certificate and the key of a process that listens."""
+    """The three files of a process that listens: its authority, its certificate and its key."""
 
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
         """Record the present files. Call this before the process itself reads the files."""
@@ -39,7 +40,7 @@ class CertificateFiles:
         self._due_ns = clock.mono_ns() + FILES_LOOK_NS
 
     def renewed(self) -> bool:
-        """Return whether the files were replaced by others that can be used together.
+        """Return whether the files were replaced by new ones that can be used together.
 
         It returns True once for each replacement. It checks the files at most every
         `FILES_LOOK_NS`, and returns False in between.
@@ -74,16 +75,17 @@ ENDS_LOOK_S = 60.0
 ROUTER_LOOKS = 60
 """Number of readings of the robot's files for each reading of the routers' certificates.
 
-Reading a router's certificate costs the router a connection. If a router did not answer, the
-routers are tried again at the next reading of the files.
+Each reading of a router's certificate takes one of the router's connections. If a router did not
+answer, all routers are tried again at the next reading of the robot's files.
 """
 
 
 def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
-    """Return when the certificates of the routers that answer expire, ns since 1970.
+    """Return the expiry times of the certificates of those routers that answer, ns since 1970.
 
-    The keys of the result are names for messages, like "the router tls/HOST:PORT". `routers` has
-    the endpoints. `directory` has the certificate with which this machine connects to the routers.
+    The keys of the result are names for messages, like "the router tls/HOST:PORT". `routers` lists
+    the endpoints. `directory` contains the certificate with which this machine connects to the
+    routers.
     """
     found = {f"the router {one}": peer_ends_ns(one, directory) for one in routers}
     return {whose: ends_ns for whose, ends_ns in found.items() if ends_ns is not None}

@@ -1,9 +1,9 @@
-"""Finds out which role and certificate this client has for a robot.
+"""Finds out which role this client has at a robot, and which certificate it uses.
 
 Zenoh does not tell the daemon over which link a query came. But each role has a key, and the access
-rules let a client query only the keys of its own role and of lower roles. So the client queries all
-these keys, and the highest role whose key answers is its own. The certificate is the one in the
-client's own file.
+rules let a client query only the keys of its own role and of lower roles. So the client queries the
+keys of all roles, and the highest role whose key answers is its own. The certificate's name comes
+from the client's own file.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
 """Time to wait for the first answer, and then for further answers, s."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""Function that queries a key (first argument), and passes each sample that answers to a callback
-(second argument)."""
+"""Function that queries a key (its first argument), and passes each sample of the answer to a
+callback (its second argument)."""
 
 
 class Identity(Struct, frozen=True):
@@ -61,7 +61,7 @@ class Identity(Struct, frozen=True):
     def silence(self) -> str:
         """The likeliest reasons why no key answered, in words.
 
-        This is "" if the client has a role, or has no certificate. A client cannot distinguish
+        The text is "" if the client has a role, or has no certificate. A client cannot distinguish
         three cases: the robot is absent, the robot hangs, or the robot does not list the client's
         certificate. Therefore the text names all three.
         """
@@ -113,7 +113,8 @@ def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "
     while best < len(ROLES) - 1 and (left := end - _now_s()) > 0:
         with suppress(Empty):
             name = answers.get(timeout=left).rpartition("/")[2]
-            # A key that this client may not query never answers. The other answers arrive together.
+            # The keys of higher roles never answer, and all other answers arrive at about the same
+            # time. So wait only a little longer after the first answer.
             end = min(end, _now_s() + WHOAMI_MORE_S)
             best = max(best, next((n for n, role in enumerate(ROLES) if role == name), -1))
     certificate = common_name(tls) if tls else ""

@@ -4,8 +4,8 @@ Zenoh's threads fill the buffers, and every buffer is bounded. A callback in thi
 its input. It never calls back into Zenoh: even a refusal is queued for `Replies`.
 
 `Replies` sends the replies in a separate thread, because a client that hangs would block the
-control loop. Each query gets a number, its ticket, when it arrives, and a reply names that ticket.
-When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
+control loop. Each query gets a number when it arrives, its ticket. A reply names the ticket of its
+query. When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class Replies:
     def issue(self, query: zenoh.Query, key: str) -> int | None:
         """Return a ticket for this query, or None if there are too many unfinished queries.
 
-        The replies to the query go to the key `key`. If `key` is "", each reply goes to the key
-        that it names below the prefix of the robot.
+        The replies to the query are sent on the key `key`. If `key` is "", each reply is sent on
+        the robot's prefix followed by the key that the reply names.
         """
         if len(self._queries) >= TICKETS:
             return None
@@ -70,7 +70,7 @@ class Replies:
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Start the thread that sends the replies. Replies that are queued already wait for it."""
+        """Start the thread that sends the replies. It also sends those that are queued already."""
         self._thread = BusThread("replies", partial(self._run, session))
         self._thread.start()
 
@@ -125,16 +125,18 @@ SAMPLES = 64
 samples for 160 ms."""
 
 OTHERS = ""
-"""Name of the buffer for the keys of all unlisted sources.
+"""Name of the buffer for the keys of all sources that are not configured.
 
-They share one buffer, so that a flood on these keys cannot displace a command on a listed key.
+These keys share one buffer, so that a flood on them cannot displace the command of a configured
+source.
 """
 
 ALL = "*"
 """Placeholder for the name of a certificate in a key."""
 
 STOPS = 16
-"""Size of the buffer for stops. It is separate, so that no flood can displace a stop."""
+"""Size of the buffer for stops. It is separate, so that no flood of commands can displace a stop.
+"""
 
 QUERIES = 256
 """Size of each of the three queues: services, other native queries, and slow queries.
@@ -161,12 +163,14 @@ class Inbox:
         self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
-        """The id with which the daemon's own session stamps samples that came without a timestamp.
+        """The id of the daemon's own session in timestamps.
 
-        Such a timestamp is not the sender's.
+        A timestamp with this id is not from the sender: the session has stamped a sample that came
+        without a timestamp.
         """
         self.routers: frozenset[str] = frozenset()
-        """The ids of the connected routers, which stamp samples without a timestamp.
+        """The ids of the connected routers in timestamps. A router stamps samples without a
+        timestamp.
 
         Such a timestamp says when the sample passed the router, and does not identify its sender.
         """
@@ -184,21 +188,21 @@ class Inbox:
         self._others: deque[Query] = deque()
         """Native queries that are neither services nor slow."""
         self._slow: deque[Query] = deque()
-        """ROS parameter queries, and changes of settings.
+        """Slow queries: ROS parameter queries, and changes of settings.
 
-        One of these takes as much time as all other queries of a step.
+        A single slow query takes as much time as all other queries of a step.
         """
         self._lost = dict.fromkeys(self._arrivals, 0)
         """For each buffer, the number of samples that newer ones had displaced before the last
         `take`."""
         self._any = False
-        """True if an item has arrived. It is set after the item is queued, so that `take` misses no
-        item.
+        """True if an item waits. It becomes true only after the item is queued, so that `take`
+        misses no item.
         """
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples since the last call, and waiting queries.
+        """Return the samples since the last call, and some of the waiting queries.
 
         The stops come first, then the other samples in the order of their arrival. There are at
         most `queries` queries, or one more if all of these are services and a slow query waits.
@@ -236,8 +240,8 @@ class Inbox:
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
         """Queue a sample that arrived on a ROS key.
 
-        It is treated like a sample on the native key for which the ROS key stands. A ROS sample has
-        no encoding, so `endpoint` supplies the encoding.
+        The sample is treated like one on the native key that corresponds to the ROS key. A ROS
+        sample has no encoding, so `endpoint` supplies the encoding.
         """
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
@@ -294,9 +298,9 @@ class Inbox:
         """Queue a query that matches `topic`, a row of the native topic table."""
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
-            # A query with a wildcard must not call a service. A JSON key does not answer it either,
-            # because the wildcard also matches the topic's key without `json/`, which answers.
-            # Returning without a ticket drops the query.
+            # A query with a wildcard must not call a service. A JSON key does not answer such a
+            # query either, because the wildcard also matches the topic's key without `json/`, and
+            # that key answers. Returning without a ticket drops the query.
             return
         self._queried(query, topic, asked, "", "native")
 
@@ -316,7 +320,7 @@ class Inbox:
     def _queried(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
         arrived = clock.now()
         if topic == STOP:
-            # The stop itself never waits behind other queries and is never refused with `BUSY`.
+            # The stop itself never waits for other queries, and is never refused with `BUSY`.
             by = _bytes(query.attachment, ATTACHMENT_BYTES)
             self._stops.put(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
@@ -348,7 +352,7 @@ class Inbox:
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
     """Return a copy of at most `most` + 1 bytes of a payload.
 
-    The extra byte shows that a payload is too long. Without a payload the copy is empty.
+    The extra byte shows that a payload is too long. If `payload` is None, the result is empty.
     """
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 

@@ -1,11 +1,12 @@
 """Publishes each topic on those of its keys that have a subscriber.
 
-A topic has native keys and perhaps ROS keys; this module calls each of them an outlet. A message is
-encoded once per encoding, and only if an outlet with that encoding has a subscriber.
+A topic has native keys and perhaps ROS keys. Each of these keys has an outlet, which is the
+publisher on that key. A message is encoded once per encoding, and only if an outlet with that
+encoding has a subscriber.
 
 The control loop only puts messages into slots. A slot keeps the newest messages of one topic. A
-thread encodes and sends these messages. So if the bus blocks, messages are lost, but no control
-period is.
+thread encodes and sends these messages. So if the bus blocks, messages are lost, but the control
+loop misses no period.
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ OPTIONS: dict[str, Any] = {
 HELD = 16
 """Size of the slot of a topic, in messages. A newer message displaces the oldest one.
 
-At 100 Hz a slot holds 0.16 s of odometry. The machine or a joining client usually blocks the thread
-for less.
+At 100 Hz a slot holds 0.16 s of odometry. A busy machine or a client that connects usually blocks
+the thread for a shorter time.
 """
 
 STUCK_NS = NS_PER_S // 4
 """Longest time of a round of puts, ns. If a round takes longer, the bus counts as blocked.
 
-A round usually takes 0.1 ms, and a little longer on a busy machine.
+A round sends all waiting messages. It usually takes 0.1 ms, and a little longer on a busy machine.
 """
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
-"""Heartbeat of latched ROS topics, with the settings of rmw_zenoh."""
+"""Heartbeat of the publishers of latched ROS topics, with the settings of rmw_zenoh."""
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
@@ -57,7 +58,7 @@ def direct(callback: Callable[[Any], None]) -> Any:
 
 
 class _Outlet:
-    """The publisher of one key."""
+    """The publisher on one key."""
 
     def __init__(self, publisher: Any, form: Format, gid: bytes, signed: bytes) -> None:
         self.publisher, self.form = publisher, form
@@ -82,7 +83,7 @@ class Outlets:
         self._outlets: dict[str, list[_Outlet]] = {}
         """Maps the native key of each topic to its outlets."""
         self._kept: list[object] = []
-        """Zenoh's listeners, which end when nothing refers to them."""
+        """References to Zenoh's listeners. Zenoh ends a listener when nothing refers to it."""
         self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
         """The native keys of the topics that have a subscriber."""
@@ -97,8 +98,8 @@ class Outlets:
         self._thread = BusThread("outlets", self._run)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
-        # Several threads of Zenoh call this method, so it needs a lock. It replaces the set as a
-        # whole, because the control loop may be reading the set.
+        # Several threads of Zenoh call this method, so it needs a lock. It replaces the set
+        # `wanted` as a whole, because the control loop may be reading the set.
         with self._counting:
             outlet.wanted = wanted
             self.wanted = frozenset(
@@ -128,9 +129,9 @@ class Outlets:
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return the number of messages that were dropped, and whether the bus has begun to block.
+        """Return the number of dropped messages, and whether the bus has begun to block.
 
-        Both values are for the time since the last call. `now_ns` is the monotonic time.
+        Both values cover the time since the last call. `now_ns` is the monotonic time.
         """
         dropped, self._dropped = self._dropped, 0
         began_ns, was_stuck = self._began_ns, self._stuck
@@ -138,7 +139,7 @@ class Outlets:
         return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
-        """Start the thread that sends the messages. Earlier messages wait for it in the slots."""
+        """Start the thread that sends the messages, first those that wait in the slots already."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
@@ -188,7 +189,7 @@ class Outlets:
             key: key to publish on.
             form: format of the payload.
             encoding: Zenoh's name of the encoding.
-            latched: keep the last sample for late subscribers.
+            latched: whether the publisher keeps its last sample for late subscribers.
             gid: identity of a ROS publisher, or b"". With it, the samples carry an attachment of
                 rmw_zenoh.
             signed: attachment of the samples without a `gid`, or b"" for none.
@@ -217,6 +218,6 @@ class Outlets:
             self._count(outlet, status.matching)
 
         self._kept.append(publisher.declare_matching_listener(direct(matching)))
-        # The listener reports only later changes, so ask for a subscriber that is there already.
+        # The listener reports only later changes, so ask whether the key has a subscriber already.
         if publisher.matching_status.matching:
             self._count(outlet, True)

@@ -27,10 +27,10 @@ PRESENT_S = 2.0
 
 
 def named(text: str) -> tuple[str, ...]:
-    """Return the robot ids in the text of an option `--id`.
+    """Return the robot ids in the text of an option `--id` that names several robots.
 
     Returns `("*",)` if the text stands for all robots, and () if it names only one robot. Raises
-    `UsageError` for a text that is not a list of robot ids.
+    `UsageError` for a text with commas that is not a list of robot ids.
     """
     if text == ALL:
         return (ALL,)
@@ -50,7 +50,7 @@ def named(text: str) -> tuple[str, ...]:
 def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
     """Return those of `ids` whose daemon is running, sorted.
 
-    "*" in `ids` stands for all robots. Raises `NoAnswerError` if `ids` has "*" and no robot is
+    "*" in `ids` stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no robot is
     visible. The message of the error names `endpoint`, the endpoint of the client.
     """
     found = set()
@@ -64,7 +64,7 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:
-    """Return whether the client is connected, whether this robot is present, and which others are.
+    """Return whether the client is connected, whether this robot is present, and the other robots.
 
     The other robots are looked up only if this robot is absent. Returns None if the session is
     closing.
@@ -93,7 +93,10 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
 
 
 def seen(endpoint: str, robots: int) -> str:
-    """Return a sentence with the number of robots that are visible at an endpoint."""
+    """Return a text that gives the number of robots that are visible at an endpoint.
+
+    `robots` is that number.
+    """
     return f"all robots visible at {endpoint}: {many(robots, 'robot')}"
 
 
@@ -111,8 +114,8 @@ def nobody(endpoint: str) -> str:
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
     """Subscribe to the key `name` of all these robots; "*" in `ids` stands for all robots.
 
-    `robot_of` returns the robot of a sample from the sample's key. Raises `UsageError` if `name` is
-    not a key.
+    The function `robot_of` finds the robot of a sample from the sample's key. Raises `UsageError`
+    if `name` is not a key.
     """
     topic = by_key(name)
     latched = topic is not None and topic.latched
@@ -157,7 +160,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
     if presence.here:
         return f"robot {robot_id} is there, but {_silent(key)}"
     if presence.others:
-        # With a cutoff of 0.0 the list has every robot, the most similar id first.
+        # With a cutoff of 0.0 no robot is excluded, and the most similar ids come first.
         near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
         more = len(presence.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet`)" if more else "")

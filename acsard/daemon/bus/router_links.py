@@ -23,8 +23,8 @@ STOP_S = 0.05
 class RouterLinks:
     """The watch of the connections to the endpoints of `bus.connect`.
 
-    Zenoh reconnects by itself, but does not report that a connection is lost or made. Without this
-    watch, the operator would not notice that a router is gone. A thread of its own polls Zenoh,
+    Zenoh reconnects by itself, but does not report that a connection is lost or restored. Without
+    this watch, the operator would not notice that a router is gone. A separate thread polls Zenoh,
     because the call may block.
     """
 
@@ -46,7 +46,10 @@ class RouterLinks:
         self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
-        """Start polling, also without `bus.connect`: a router may connect to the daemon."""
+        """Start polling, even if `bus.connect` is empty: a router may connect to the daemon.
+
+        `session` is the daemon's Zenoh session.
+        """
         self._session = session
         self._thread.start()
 
@@ -89,10 +92,10 @@ class RouterLinks:
 def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
     """Return the endpoints to which no link leads.
 
-    `mode` is `bus.mode`, and `ends` has the address of the far end of each link. In mode "client"
-    there is only one link, and if it exists, no endpoint is unreached. A program that connected to
-    the daemon (the TLS gateway, a bridge, a ROS node) has an ephemeral port at its end and matches
-    no endpoint. This function resolves host names, which may block.
+    `mode` is `bus.mode`, and `ends` contains the address of the far end of each link. In mode
+    "client" there is only one link, and if it exists, no endpoint counts as unreached. A program
+    that has connected to the daemon (the TLS gateway, a bridge, a ROS node) has an ephemeral port
+    at its end, so it matches no endpoint. This function resolves host names, which may block.
     """
     if mode == "client":
         return () if ends else endpoints
@@ -102,7 +105,7 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
     """Return whether one of the far ends `ends` belongs to the endpoint.
 
-    The far ends are addresses like "tcp/192.168.0.2:7447". The endpoint may have a host name.
+    The far ends are addresses like "tcp/192.168.0.2:7447". The endpoint may contain a host name.
     """
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, address = bare.partition("/")
@@ -112,7 +115,8 @@ def _leads_there(endpoint: str, ends: set[str]) -> bool:
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
     except (OSError, ValueError):
-        # The name does not resolve any more, but its link may still exist. Compare the port alone.
+        # The name no longer resolves, but a link to that host may still exist. So compare only the
+        # protocol and the port.
         return bool(port) and any(
             end.startswith(f"{protocol}/") and end.endswith(f":{port}") for end in ends
         )

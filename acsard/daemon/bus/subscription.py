@@ -52,7 +52,7 @@ class Subscription:
 
     def try_recv(self) -> zenoh.Sample | None:
         """Return the next sample, or None; raise `ZError` at the end of the session."""
-        # The loop is bounded, because a flood of samples on other keys must not hold the caller.
+        # The loop is bounded, because a flood of samples on other keys must not block the caller.
         for _ in range(QUEUED):
             sample: zenoh.Sample | None = self._queue.try_recv()
             if sample is None or not self._key or on(self._key, sample):
@@ -70,8 +70,8 @@ class Subscription:
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
         """Yield samples until the session closes or no sample arrives for `timeout` s.
 
-        If `timeout` is None, wait for samples without a limit. Undeclare the subscribers at the
-        end.
+        If `timeout` is None, wait for each sample without a time limit. Undeclare the subscribers
+        at the end.
         """
         quiet_since_ns = clock.mono_ns()
         try:

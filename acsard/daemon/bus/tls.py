@@ -1,8 +1,8 @@
 """Checks and reads the certificate files, and explains why a TLS endpoint cannot be reached.
 
 Zenoh reports the same error for every cause. `trouble` therefore repeats the connection step by
-step with Python's own TLS, and has a message for each cause. Only the expiry times of certificates
-need a library of the optional extra `tls`.
+step with Python's own TLS, and returns a message for each cause. Only reading the expiry times of
+certificates needs a library from the optional extra `tls`.
 """
 
 from __future__ import annotations
@@ -69,8 +69,9 @@ def unusable(authority: Path, certificate: Path, key: Path) -> str:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(authority)
-        # Without a password OpenSSL would ask for the password of an encrypted key on the terminal.
-        # With an empty one it fails, which is right, because Zenoh accepts no encrypted key.
+        # If no password is passed, OpenSSL asks on the terminal for the password of an encrypted
+        # key. With an empty password it fails, which is right, because Zenoh accepts no encrypted
+        # key.
         context.load_cert_chain(certificate, key, password="")
     except (OSError, ValueError) as error:
         # SSLError is an OSError.
@@ -86,10 +87,10 @@ def common_name(directory: str) -> str:
 
 
 def shown_at(endpoint: str, directory: str) -> str:
-    """Return the common name that this client's certificate shows at an endpoint.
+    """Return the common name with which this client presents itself at an endpoint.
 
-    `directory` is the client's TLS directory. Returns "" if the client needs no certificate there,
-    or has no readable one.
+    The name comes from the certificate in `directory`, the client's TLS directory. Returns "" if
+    the client needs no certificate at this endpoint, or has no readable one.
     """
     return common_name(directory) if directory and endpoint.startswith(TLS) else ""
 
@@ -101,9 +102,9 @@ def names_in(directory: str) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    """Return an IPv6 address in its short form, and any other name unchanged.
+    """Return the short form of an IPv6 address, or any other name unchanged.
 
-    In a decoded certificate, the standard library writes every zero of an IPv6 address.
+    The standard library decodes an IPv6 address in a certificate with all its zeros.
     """
     try:
         return str(ipaddress.ip_address(name))
@@ -147,8 +148,9 @@ certificate is the empty string."""
 def ends(directory: str) -> dict[str, int]:
     """Return when the certificates in `directory` expire, ns since 1970.
 
-    The key "" has the directory's own certificate, and the key `AUTHORITY` that of its authority.
-    Returns {} if a file or the optional library is missing.
+    The key "" gives the expiry time of the directory's own certificate, and the key `AUTHORITY`
+    gives that of its authority. Returns {} if a file cannot be read or the optional library is
+    missing.
     """
     try:
         from cryptography import x509
@@ -168,9 +170,9 @@ def ends(directory: str) -> dict[str, int]:
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
 
-    `directory` has the certificate of this machine. Nothing is verified, so that the function also
-    works for an expired certificate. Returns None if the program cannot be reached or the optional
-    library is missing. Blocks for up to twice `PATIENCE_S`.
+    `directory` contains the certificate of this machine. Nothing is verified, so that the function
+    also works for an expired certificate. Returns None if the program cannot be reached or the
+    optional library is missing. Blocks for up to twice `PATIENCE_S`.
     """
     try:
         from cryptography import x509
@@ -188,9 +190,9 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
-    """Return the TLS context of a client that verifies nothing.
+    """Return the TLS context of a client that does not verify the server.
 
-    The client has the certificate in `directory`.
+    The client presents the certificate in `directory`.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
@@ -231,7 +233,8 @@ waits for data.
 """
 
 AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
-"""Error numbers that mean that no machine answers at the address. The port is then unknown."""
+"""Error numbers that mean that no machine answers at the address. They say nothing about the port.
+"""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 """OpenSSL's verify codes (X509_V_ERR_...). Other codes mean a certificate of another authority."""
@@ -240,8 +243,8 @@ EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 def trouble(endpoint: str, directory: str) -> str:
     """Return why this machine cannot connect to a TLS endpoint, and how to fix it.
 
-    `directory` has the client's certificate. Returns "" if this function finds no fault. Blocks for
-    a few seconds at most.
+    `directory` contains the client's certificate. Returns "" if this function finds no fault.
+    Blocks for a few seconds at most.
     """
     host, port = _place(endpoint)
     try:

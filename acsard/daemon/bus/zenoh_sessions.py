@@ -1,6 +1,6 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-This module has the settings of these sessions, and the reason for each setting. Of the robot's
+This module contains the settings of these sessions, and the reason for each setting. Of the robot's
 keys, it names only those with a rate limit.
 """
 
@@ -25,9 +25,9 @@ from acsard.host.terminal_modes import coloured
 COMMAND_RATE_HZ = 1000.0
 """Largest number of commands per second that a session accepts on each key.
 
-The rate is high enough that a zero command passes 1 ms after another command. It is too low for a
-flood to cost a control period. The TLS gateway has the same limit for stops. Dropping a stop beyond
-the limit is safe, because another stop came less than a millisecond before.
+The rate is high enough for a zero command that comes 1 ms after another command. It is so low that
+a flood does not cost a control period. The TLS gateway applies the same limit to stops. Dropping a
+stop beyond the limit is safe, because another stop came less than a millisecond before.
 """
 
 MAX_SESSIONS = 256
@@ -72,8 +72,8 @@ def gateway_session(config: Config) -> zenoh.Session:
     """
     bus = config.bus
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
-    # Limit only puts. Otherwise a flood of DELETE messages, which are not stops, would use up the
-    # limit of the stops. The daemon's own session does not limit stops.
+    # Limit only PUT messages. Otherwise a flood of DELETE messages, which are not stops, would use
+    # up the limit of the stops. The daemon's own session does not limit stops.
     stops = _rate_limit("stops", ["put"], [full_key(config.robot.id, "stop")])
     settings |= _limits(config, gateway_access(config), stops)
     settings |= {
@@ -110,9 +110,9 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint with which a program on this machine reaches a listening endpoint.
+    """Return the endpoint to which a program on this machine connects to reach a listening one.
 
-    For an endpoint that listens on all addresses, this is the loopback address.
+    If `endpoint` listens on all addresses, the result names the loopback address.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
@@ -123,16 +123,16 @@ def no_endpoint(text: str) -> UsageError:
 
 
 PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
-"""Settings of a session that tries to connect until it succeeds."""
+"""Settings with which a session tries to connect until it succeeds."""
 
 
 def _listening() -> dict[str, object]:
-    """Return the settings that limit clients which connect and send nothing, or too much."""
+    """Return the settings that limit clients that send nothing after connecting, or too much."""
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
         # If only 32 connections may be pending, 300 idle connections keep an operator out for 2 s.
-        # With 512 these connections cost 3 MB.
+        # With 512 they do not, and they cost 3 MB.
         "transport/unicast/accept_pending": 512,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
@@ -147,7 +147,7 @@ def _limits(
 ) -> dict[str, object]:
     """Return the access rules and the rate limits as Zenoh settings.
 
-    The rate limits are those of the commands, and those in `more`.
+    The rate limits are those of `_command_limits`, and those in `more`.
     """
     return {"access_control": access, "downsampling": [_command_limits(config), *more]}
 
@@ -249,8 +249,8 @@ def _command_limits(config: Config) -> dict[str, object]:
     """Return the rate limits of commands, speed limits and gyro samples, on native and ROS keys.
 
     Each configured source has a limit of its own, so that no source uses up another's limit. All
-    other sources share one limit. All certificates of a source share the limit of the source. Zenoh
-    applies the limits to each connection separately.
+    other sources share one limit. All certificates of a source share the limit of that source.
+    Zenoh counts each connection separately.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]

@@ -6,7 +6,7 @@ client with a certificate can still make a router hang. This router detects that
 
 `router_file` makes the file from the text of `deploy/zenoh/router.json5`, a template for one robot.
 It repeats the lines between the marks ROBOT and END for each robot. It repeats the lines between
-PERSON and END PERSON for each certificate that may command.
+the marks PERSON and END PERSON for each certificate that may command.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
 IS_FOR = "// It is for {}. For yours:\n"
-"""Line at the head of the template. It has the ids of the robots in place of {}."""
+"""Line at the head of the template. In the file, the ids of the robots replace {}."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
@@ -53,7 +53,7 @@ def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequ
             certificate with the role's own name.
 
     Raises:
-        UsageError: a name occurs twice. A certificate belongs to one robot or to one role.
+        UsageError: a name occurs twice. Each certificate must belong to one robot or to one role.
     """
     names = [*robots, *ROLES, *(name for role in ROLES for name in people.get(role, ()))]
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -181,7 +181,7 @@ class Router(Listener):
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether Zenoh accepts the configuration with free addresses on loopback.
+        """Return whether Zenoh accepts the configuration if it listens on free loopback ports.
 
         If it does, only the configured addresses are at fault, and they may become free later.
         Zenoh's messages do not distinguish this case from a mistake in the file.

@@ -2,8 +2,8 @@
 
 A malicious client can make Zenoh compare key expressions for ever, keep all connections, or take
 memory. All of that happens in this process, and not in the daemon. During such an attack a call to
-Zenoh may never return. Therefore one thread observes the session. The main thread checks whether
-that thread still makes observations.
+Zenoh may never return. Therefore a separate thread observes the session. The main thread checks
+that new observations keep coming.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ An observation takes a millisecond.
 """
 
 FIRST_NS = 5 * NS_PER_S
-"""Time after the start within which the daemon must connect, ns.
+"""Longest time from the opening of the session to the connection of the daemon, ns.
 
 It is longer than `ALONE_NS`, because the other clients connect at the same time.
 """
 
 ALONE_NS = NS_PER_S
-"""Longest time without a connection to the daemon, once there was one, ns."""
+"""Longest time without a connection to the daemon after an earlier connection, ns."""
 
 REPORTS = Rate(1 / 60)
-"""Largest rate of events which report that all connections are taken: one a minute."""
+"""Largest rate of events that report that all connections are taken: one a minute."""
 
 MAX_UNANSWERED = 4
 """Number of consecutive unanswered queries that show a dead connection to the daemon.
 
-A query counts as unanswered after a second. The connection is then still open, but data does not
+A query counts as unanswered after a second. A dead connection is still open, but its data does not
 reach the daemon.
 """
 
@@ -73,7 +73,7 @@ GATEWAY_EVENTS: Events = {
 
 
 class Observation(Struct, frozen=True):
-    """The state of the Zenoh session at a time."""
+    """The state of the Zenoh session at one moment."""
 
     at_ns: int
     """Monotonic time of the observation, ns."""
@@ -83,13 +83,13 @@ class Observation(Struct, frozen=True):
     It is "" if Zenoh does not report the name.
     """
     linked: bool = False
-    """True if the daemon is connected. A router, which needs no daemon, always has True."""
+    """True if the daemon is connected. For a router, which needs no daemon, it is always True."""
     unanswered: int = 0
     """Number of consecutive queries that the daemon has not answered in time."""
 
 
 class SessionHealth:
-    """The health of the session, derived from one observation after the other."""
+    """The health of the session, derived from its successive observations."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
         """Start at the monotonic time `opened_ns`, at which the session was opened.
@@ -104,10 +104,7 @@ class SessionHealth:
         """Number of observations in which all connections were taken."""
 
     def full_event(self, observed: Observation) -> Event | None:
-        """Return an event if all connections are taken and the last such event is a minute old.
-
-        Otherwise return None.
-        """
+        """Return an event if all connections are taken, at most once a minute; otherwise None."""
         if len(observed.holders) < self._most:
             return None
         self.full += 1
@@ -145,9 +142,9 @@ class SessionHealth:
 
 
 def connection_counts(holders: Sequence[str]) -> str:
-    """Return a text with the number of connections of each client with many connections.
+    """Return a text with the clients that hold the most connections, and how many each one holds.
 
-    `holders` has the name of the client for each connection.
+    `holders` gives the name of the client for each connection.
     """
     most = Counter(holders).most_common(NAMES)
     return ", ".join(f"{count} by {name or 'an unnamed client'}" for name, count in most)
@@ -164,7 +161,7 @@ a check could not react in time. The kernel refuses memory above the limit, whic
 """
 
 NICE = 5
-"""Nice value of this process. The daemon and the programs of people have priority over it."""
+"""Nice value of this process. The daemon and ordinary programs have priority over it."""
 
 
 class Listener:
@@ -196,19 +193,19 @@ class Listener:
 
 
 class ListenerProcess:
-    """The process of one listener, from its start to its end or its next restart."""
+    """The process of one listener, from its start until it ends or must be started again."""
 
     def __init__(self, listener: Listener, log: Log, manager: Systemd, parent: int | None) -> None:
         """Prepare the process.
 
-        `parent` is a file descriptor that the parent process holds too, or None. The process ends
-        when the parent closes its end. If the descriptor is a socket, the process writes a sign of
-        life to it in every period.
+        `parent` is a file descriptor whose other end the parent process holds, or None. This
+        process ends when the parent closes that end. If the descriptor is a socket, the process
+        writes a sign of life to it in every period.
         """
         self._listener, self._log, self._manager = listener, log, manager
         self._parent = None if parent is None else Parent(parent)
         self._session: zenoh.Session | None = None
-        """The session is never closed, because closing it could take for ever."""
+        """The open session. It is never closed, because closing it could take for ever."""
         self._observed = Observation(0)
         self._error: BaseException | None = None
         self._leaving = False

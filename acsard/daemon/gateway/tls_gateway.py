@@ -1,8 +1,8 @@
 """The TLS gateway between clients on other machines and the daemon on loopback.
 
 The gateway is a Zenoh router in a process of its own. It forwards only the messages that the access
-rules allow. The worst harm that a client can do is a restart of the gateway
-(`listener_process.py`), after which all clients reconnect.
+rules allow. The worst that a client can cause is a restart of the gateway (`listener_process.py`),
+after which all clients reconnect.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ class Gateway(Listener):
     def __init__(self, config: Config) -> None:
         """Check the certificate files.
 
-        Raises `CertificateError` or `NotPermittedError` if those in `bus.tls` cannot be used.
+        Raises `CertificateError` or `NotPermittedError` if the files in the directory `bus.tls`
+        cannot be used.
         """
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
@@ -89,7 +90,7 @@ class Gateway(Listener):
         return Observation(clock.mono_ns(), holders, bool(local), unanswered)
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Publish the number of connections and related values, which `state` shows."""
+        """Publish the number of connections and related values, which appear in `state`."""
         if self._publisher is None:
             self._ends_ns = min(ends(self._config.bus.tls).values(), default=0)
             key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
@@ -102,9 +103,9 @@ class Gateway(Listener):
 class DaemonProbe:
     """A probe that queries the daemon repeatedly, because an open connection may carry no data.
 
-    This was observed on a machine with forty times as much work as it could do. There two gateways
-    ended within half a minute. The connection of the third gateway then stayed open for minutes,
-    while the daemon's Zenoh did not read from it.
+    A test observed such a connection on a machine with forty times as much work as it could do. Two
+    gateways ended within half a minute. The connection of the third gateway then stayed open for
+    minutes, although the daemon's Zenoh did not read from it.
     """
 
     def __init__(self, key: str) -> None:
@@ -113,7 +114,7 @@ class DaemonProbe:
         self._ended = threading.Event()
         """Set when the query has ended.
 
-        An end without a reply is an answer too, because the daemon has received the query.
+        An end without a reply counts as an answer too, because the daemon has received the query.
         """
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:

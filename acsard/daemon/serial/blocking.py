@@ -56,7 +56,7 @@ class BlockingPort:
             raise WireLostError(f"{self._path}: {error}") from error
 
     def close(self) -> None:
-        """Send the last bytes, unlock and close. No driver can block this for long."""
+        """Send the last bytes, then unlock and close. Every wait for the driver is limited."""
         device, self._device = self._device, None
         if device is None:
             return
@@ -72,7 +72,7 @@ class BlockingPort:
     def late_ns(self) -> int:
         """Return how long the program at the other end of a pty has waited for a processor, ns.
 
-        This is the time since the last call. It is 0 for a real device.
+        Only waiting since the last call counts. The result is 0 for a real device.
         """
         if self._program is None:
             return 0
@@ -82,7 +82,7 @@ class BlockingPort:
     def send(self, data: bytes) -> None:
         """Write all of `data`.
 
-        Raises `WireLostError` if the port is lost or accepts no more bytes.
+        Raises `WireLostError` if the port is lost, or accepts no bytes for `SEND_S`.
         """
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)

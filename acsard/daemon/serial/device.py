@@ -98,7 +98,7 @@ def _set_up(device: serial.Serial) -> None:
 
 
 def unsent(fd: int) -> int:
-    """Return the number of bytes that the driver has not sent, or 0 if it cannot say (a pty)."""
+    """Return how many bytes the driver has not sent, or 0 if it cannot say, like that of a pty."""
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -131,9 +131,10 @@ def unlock(fd: int) -> None:
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
     """Discard unsent bytes, and unlock and close the device in a thread.
 
-    The thread is needed because a driver may drain for 30 s. Wait for it at most `wait_s`. The
-    descriptor of `device` refers to /dev/null from now on, so its owner can drain and close it
-    without delay. If no thread can be started, the next `open_raw` closes the device.
+    The thread is needed because a driver may drain for 30 s. This call waits for the thread for at
+    most `wait_s` seconds. After the call, the descriptor of `device` refers to /dev/null, so its
+    owner can drain and close it without delay. If no thread can be started, the next `open_raw`
+    closes the device.
 
     `lost` is true if the device has failed. The buffers are then discarded in any case.
     """

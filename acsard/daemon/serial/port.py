@@ -1,8 +1,9 @@
 """The daemon's serial port: opens, reads and reopens the device, and sends STOP before it closes.
 
-pyserial-asyncio reads. Its transport would queue the bytes that the kernel does not take, but the
-daemon must not keep a line to send it later (invariant 3). Therefore the daemon writes lines to the
-descriptor directly. Opening runs in a thread with a time limit, because drivers may block.
+The daemon uses pyserial-asyncio only to read. For writing, its transport would queue the bytes that
+the kernel does not take, but the daemon must not keep a line to send it later (the third rule in
+`acsard/README.md`). Therefore the daemon writes lines to the descriptor directly. Opening runs in a
+thread with a time limit, because drivers may block.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ different device may be opened."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
 """Pauses between the attempts to reopen the port, s. The last pause repeats. The first ones are
-short, because udev sets the group of a device a moment after it appears."""
+short, because a device can be opened only a moment after it appears, when udev has set its group.
+"""
 
 PERMISSION_PATIENCE_S = 2.0
 """Time that the start waits for udev to grant access before it fails, s."""
@@ -39,8 +41,8 @@ PERMISSION_PATIENCE_S = 2.0
 HUNG = "the driver did not answer"
 
 FAREWELL_S = 0.15
-"""Time limit of the last STOP, s. It is twice the time of a line on the slowest wire, and a margin.
-"""
+"""Time limit of the last STOP, s. It is twice the time of a line on the slowest wire, with a
+margin."""
 
 
 AT_ONCE = 4096
@@ -89,13 +91,13 @@ class SerialPort:
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        `late` is the time of a step that comes late, else None. For a late step, the bytes that
-        wait in the kernel are read too. Otherwise the step could run before the reader, and its own
+        `late` is the time of the step if the step comes late, else None. A late step also reads the
+        bytes that wait in the kernel. Otherwise the step could run before the reader, and its own
         delay would look like silence of the board.
 
-        After a suspend of the computer the port is reopened even if the device did not notice.
-        Everything before the suspend then belongs to another session, and every commander must
-        return to neutral.
+        After a suspend of the computer this method closes the port, so that it is opened again,
+        even if the device did not notice the suspend. A new session then begins, and every sender
+        must return to neutral.
         """
         if self._asleep.was():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
@@ -113,8 +115,7 @@ class SerialPort:
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Write a line that was made at `now`, and return "sent".
 
-        If the line was not written, return "superseded", or "down" for a closed port. The line is
-        dropped.
+        Otherwise drop the line, and return "down" if the port is closed, else "superseded".
         """
         if not self.is_open:
             return "down"
@@ -215,9 +216,9 @@ class SerialPort:
         self._wake()
 
     def _leave(self, error: BaseException | None) -> None:
-        """Close the port. Bytes that the kernel still holds must not be sent later.
+        """Close the port, so that no bytes in the kernel are sent later.
 
-        `error` is the reason why the port is lost, None if the daemon closes it.
+        `error` is the reason why the port is lost. It is None if the daemon closes the port.
         """
         if not self.is_open:
             return
@@ -240,7 +241,7 @@ class SerialPort:
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP as the last line and close, whatever ended the block.
+        """Send STOP as the last line and close, even if an exception has ended the block.
 
         This takes at most `FAREWELL_S`.
         """
@@ -268,8 +269,7 @@ class _Reader(asyncio.Protocol):
         self._port._data(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        # The port may have been reopened meanwhile. The end of an old transport does not concern
-        # it.
+        # Ignore the end of an old transport, because the port may have been reopened since.
         if self._port._transport is self._transport:
             self._port._transport = None
             self._port._leave(exc or OSError(errno.EIO, "closed"))

@@ -1,9 +1,9 @@
-"""The simulated board in real time behind a pty, so that the real serial code runs.
+"""The simulated board at the end of a pty, in real time, so that the real serial code runs.
 
-A pty itself carries data at any baud rate. This module garbles the data in both directions if the
-host sets another baud rate than the board's, as a real wire would. `PtyEnd` is the board's end of
-any serial line that is a pty. `Simulated` is the board beside a daemon. It also publishes the
-board's true state on the bus. The control loop reads its device like that of a real board.
+A pty itself carries data at any baud rate. If the host sets another baud rate than the board's,
+this module garbles the data in both directions, as a real wire would. `PtyEnd` is the board's end
+of any serial line that is a pty. `Simulated` is the board that runs in the daemon's process, and
+also publishes its true state on the bus. The control loop uses its pty like a real device.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ _RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_arg
 
 
 class SimPty:
-    """The simulated board behind a pty. Entering it creates a serial device at `path`."""
+    """The simulated board at the end of a pty. Entering it creates a serial device at `path`."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.mcu = mcu
