@@ -98,8 +98,9 @@ class Followed:
         self._before: dict[str, Command] = {}
         """The newest command of each adjusted clock that was followed."""
         self._adjusted: set[Who] = set()
-        """Identities under which a sender with an adjusted clock has sent. Several programs may
-        share one of them, and each must send a zero when the clock of one was set."""
+        """Identities under which a sender with an adjusted clock has sent, or several programs, one
+        of which was delayed so that its clock seemed adjusted. Several programs may share an
+        identity, and each must send a zero when the clock of one was set."""
         self._armed_since_ns = witness.armed_since_ns
         self._mode = ""
         self._decided_ns = 0
@@ -173,6 +174,8 @@ class Followed:
         proof_ns = 3 * NS + 2 * min(timeout_ns, 2 * NS)
         if sender["way"] in FOREIGN and age - least > timeout_ns - FALL_NS:
             self._late_ns[sample.clock] = at_ns
+            if sample.shared:
+                self._adjusted.add(found.who)
         if age < self._lowest_learned(sample.clock, age) - FALL_NS:
             self._below_ns[sample.clock] = at_ns
         proven = run.followed or (not sender.get("jitter") and at_ns - run.begun_ns > proof_ns)
