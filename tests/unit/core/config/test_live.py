@@ -213,5 +213,5 @@ def test_the_others_may_be_set_at_any_time(key: str) -> None:
     if isinstance(now, tuple | list):
         other = [1.0] * 6
     elif isinstance(now, float):
-        other = now + 0.5
+        other = now / 2 or 0.5
     assert changed(CONFIG, {key: other}, at_rest=False)[1]
