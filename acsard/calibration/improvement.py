@@ -315,7 +315,6 @@ def no_better(found: Improvement) -> str:
         if error.before is not None and error.after is not None
     )  # fmt: skip
     return (
-        "the multipliers of this log are not surely better than the configured ones over whole "
-        f"drives that the fit did not use ({errors or 'no drive could be left out'}): keep the "
-        "configured ones"
+        "keep the configured multipliers: over whole drives that the fit did not use, those of "
+        f"this log are not surely better ({errors or 'no drive could be left out'})"
     )

@@ -105,7 +105,7 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
             values[wild] = math.nan
             count = int(wild.sum())
             cells = f"{count} cell{'s' if count > 1 else ''}"
-            yield f"{cells} of {name} left out because no robot has such a value, like {example:g}"
+            yield f"{cells} of {name} left out: no robot has a value like {example:g}"
 
 
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

@@ -88,9 +88,11 @@ def _table(log: Path, config: Config, choice: Choice) -> Table:
     if begin.startswith(MAGIC) and not _is_ours(log):
         return _bag([log], config, choice)
     if choice != Choice():
-        raise LogError("--topic and --yaw-axis choose within a ROS 2 bag, and this is none")
+        raise LogError(
+            "--topic and --yaw-axis are for a ROS 2 bag, and this is not one: leave them out"
+        )
     if log.stat().st_size > MOST_BYTES:
-        raise MendableError(f"{log} is larger than 1 GiB: cut it; ten minutes are enough")
+        raise MendableError(f"{log} is larger than 1 GiB: use a part; ten minutes are enough")
     return read(_measured(log) if begin.startswith(MAGIC) else log.read_bytes())
 
 

@@ -471,7 +471,7 @@ def _of_noise(shown: Noise | None) -> Iterator[str]:
     if shown is None or not shown.better:
         yield (
             "the variances per metre and per radian stay as configured, because those of this log "
-            "do not surely describe the errors of other drives better"
+            "may not describe the errors of other drives better"
         )
     elif not shown.places:
         yield (
@@ -514,9 +514,9 @@ def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
 
 def _own(what: str) -> str:
     return (
-        f"no sensor agrees as well with the wheels as {what}: if these values were computed from "
-        "the same wheels, like the odometry of a driver, the result describes the settings of that "
-        "driver and not the robot; use a gyro, SLAM, GPS or motion capture"
+        f"{what}: these values agree better with the wheels than a sensor can. If they were "
+        "computed from the same wheels, like the odometry of a driver, the result describes the "
+        "settings of that driver and not the robot; use a gyro, SLAM, GPS or motion capture"
     )
 
 

@@ -131,7 +131,8 @@ FAIL? lost where: both | {there} of {sent} there, {back} back
     -> check first the ground of board and computer, then cable and plugs; or use a lower baud rate
     at both ends
 SKIPPED? lost where: untold
-    the motors cannot show where: they are too slow, measured too coarsely, or too much is lost
+    the motors cannot show where lines are lost: they turn too slowly, their speeds are measured too
+    coarsely, or too many lines are lost
 
 PASS motor: right | {figure}
 WARN? motor: off | {figure}
@@ -188,6 +189,7 @@ PASS trailing comma: sent | sent, as configured
 PASS trailing comma: not sent | not needed
 SKIPPED trailing comma: dead
     motor d showed no movement with or without the comma, so the check cannot decide
+    -> fix motor d, and check again
 FAIL? trailing comma: refused | {figure}
     the board answers only lines {form} a comma at their end
     -> write mcu.trailing_comma = {comma}; the check goes on with it
@@ -218,6 +220,7 @@ WARN? encoder counts: coarse | about {about:.0f} per turn
     gear ratio, four for each pulse of two channels
 SKIPPED encoder counts: damaged
     {share:.1%} of the lines are lost, so the counts of the rest cannot be measured
+    -> fix the lost lines above, and check again
 SKIPPED encoder counts: not turned
     the wheels turned too little to measure them
 FAIL encoder counts: unequal | {shown} per turn
@@ -230,7 +233,8 @@ FAIL encoder counts: misnamed | {measured:.0f}
     the firmware names {named} per turn, but by its speeds there are {measured:.0f}
     -> correct the counts per turn or the speeds in the firmware
 WARN encoder counts: many | {counts} per turn
-    these are more than the {most} that the daemon accepts: count fewer edges
+    these are more than the {most} that the daemon accepts
+    -> count fewer edges in the firmware
 PASS encoder counts: right | {counts} per turn
     {how}
 FAIL encoder counts: wrong | {counts}, not {configured}
@@ -238,9 +242,10 @@ FAIL encoder counts: wrong | {counts}, not {configured}
     -> write mcu.encoder_counts = {counts}
 
 SKIPPED watchdog: untested
-    no motor followed its commands, so none can show it
+    no motor followed its commands, so none can show whether the watchdog works
+    -> fix the motors above, and check again
 FAIL? watchdog: weak
-    motors {letters} turned one by one, but not together: does the supply give in?
+    motors {letters} turned one by one, but not together: is the supply too weak?
     -> measure the supply under load
 FAIL watchdog: none | none within {seconds:.1f} s
     the motors run on when the computer is silent: with a pulled cable or a hung computer the
@@ -263,7 +268,8 @@ PASS? watchdog: right | {figure}
     contract 300 ms
 
 SKIPPED damaged lines: untested
-    no motor followed its commands, so none can show it
+    no motor followed its commands, so none can show whether the board obeys damaged lines
+    -> fix the motors above, and check again
 PASS? damaged lines: right | {lines} lines, none moved
 WARN damaged lines: lenient | {took} of {kinds} kinds moved
     motors followed broken lines: {which}
@@ -288,6 +294,7 @@ FAIL inputs: wrong | {figure}
 
 FAIL wheels: not lifted
     the operator did not confirm that the wheels are lifted
+    -> lift the wheels, start the check again and confirm it
 FAIL runaway: along | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/s
     the encoder of {motor} reports more than {most:g} rad/s
     -> are the counts per turn in the firmware too low, or is its control loop unstable?

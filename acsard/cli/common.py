@@ -62,7 +62,7 @@ def count(text: str) -> int:
     """Parse a whole number of at least 1. This function is an argparse type."""
     number = int(text)
     if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1")
+        raise argparse.ArgumentTypeError(f"{text} is less than 1, the smallest number")
     return number
 
 
@@ -73,7 +73,7 @@ def seconds(text: str) -> float:
     """
     value = float(text)
     if not 1.0 <= value <= 600.0:
-        raise argparse.ArgumentTypeError(f"{text} is not from 1 to 600 s")
+        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds from 1 to 600")
     return value
 
 

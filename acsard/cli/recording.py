@@ -232,7 +232,8 @@ def main(args: argparse.Namespace) -> int:
         show(table(rows, right={2, 3}))
     else:
         words = f" {in_words(first, last)}" if files else ""
-        print(f"no recordings{words} in {where}")
+        mend = ": leave out --from and --to to list all" if words else ""
+        print(f"no recordings{words} in {where}{mend}")
     return int(Exit.OK)
 
 
@@ -251,7 +252,9 @@ def _bracketed(text: str) -> str:
 def main_show(args: argparse.Namespace) -> int:
     for recording, part in _parts(args):
         if not _show(recording, part, args.json) and part != WHOLE:
-            raise RecordingError(f"{recording.path} has no step in that span of time")
+            raise RecordingError(
+                f"{recording.path} has no step in that span of time: correct --from and --to"
+            )
         note = recording.missing
         if _is_being_recorded(recording):
             note = note.replace(UNFINISHED, "being recorded")
@@ -416,8 +419,9 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
     parts = _parts(args)
     if args.new is not None and len(parts) > 1:
         raise UsageError(
-            f"that time has {len(parts)} runs of the daemon, or steps are missing in it, and each "
-            "becomes a file of its own: leave out NEW, or use a shorter --from and --to"
+            f"that time has {len(parts)} parts, because the daemon restarted or steps are missing, "
+            "and each part becomes a file of its own: leave out NEW, or choose a shorter time with "
+            "--from and --to"
         )
     return parts
 
@@ -475,8 +479,8 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
     except FileNotFoundError:
         raise MendableError(
             f"nothing is recorded in {where}: the directory does not exist. The service records "
-            "by itself; `acsard run --record DIRECTORY` records where you say. --directory "
-            "reads another directory",
+            "by itself; `acsard run --record DIRECTORY` records into DIRECTORY, and --directory "
+            "DIRECTORY reads from there",
         ) from None
     except OSError as error:
         raise ExitError(

@@ -80,7 +80,7 @@ def main_status(args: argparse.Namespace) -> int:
     """Print the state of the service's files and units. Return 0 if the daemon's unit is active."""
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
-    print(state or "systemd does not answer on this machine")
+    print(state or "systemd does not answer on this machine: does it run here?")
     if state:
         for unit in service.ALL[1:]:
             print(f"\n{unit}:\n{service.state(unit)}")

@@ -147,7 +147,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     if not urls:
         raise UsageError(
             f"no browser could use the link: web.address in {where} has no https://. Add "
-            '"https://0.0.0.0:8443" there, or name another file with --config (or --address); '
+            '"https://0.0.0.0:8443" there, or use another file (--config) or --address; '
             "`acsard tls init` makes a certificate"
         )
     vault = _vault(args, config)
@@ -184,7 +184,7 @@ def _list(vault: Vault) -> int:
     if tokens:
         show(table((one.name, one.role, until(one.ends)) for one in tokens))
     else:
-        print(f"no tokens of {vault.robot} in {vault.path}")
+        print(f"no tokens of {vault.robot} in {vault.path}; acsard web --invite ROLE makes one")
     return int(Exit.OK)
 
 

@@ -253,14 +253,17 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     if state.sender in ("", sender):
         return ""
     return (
-        f"another program drives the robot as {source}, {state.sender}: end it, or wait until it "
+        f"another program, {state.sender}, drives the robot as {source}: end it, or wait until it "
         "is silent"
     )
 
 
 def no_command(source: str) -> str:
     """Return the objection to a client whose commands do not arrive at the daemon."""
-    return f"the daemon receives no command of source {source}"
+    return (
+        f"the daemon receives no command of source {source}; `acsard top` shows whether it refuses "
+        "commands"
+    )
 
 
 def heard(state: RobotState, source: str) -> bool:

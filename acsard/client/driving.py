@@ -185,10 +185,11 @@ class _Drive:
                 self._fine = now
         if watch.silent(now):
             raise NoAnswerError(
-                "the daemon's state cannot be read: does the daemon have another version?"
+                "the daemon's state cannot be read: does the daemon have another version? Use the "
+                "same version here"
                 if watch.unreadable
                 else f"nothing received from the daemon for {watch.patience_s:g} s: does it run, "
-                "with this robot.id?"
+                "with this robot.id? `acsard fleet` lists the robots"
             )
 
     def require(self, grace: float) -> None:

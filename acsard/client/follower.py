@@ -186,7 +186,10 @@ class Watch(Follower):
         command source, `sender` is the public name of the sender, and `now` is the present time, s.
         """
         if self.silent(now):
-            return "nothing received from the daemon: does it run?"
+            return (
+                "nothing received from the daemon: does it run? `acsard doctor` on the robot "
+                "checks it"
+            )
         return "" if self.state is None else objection(self.state, source, sender)
 
     def end(self) -> None:

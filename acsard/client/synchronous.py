@@ -429,7 +429,7 @@ class Client:
         if seen is None or seen.here or not where.endpoint:
             return NoAnswerError(
                 f"{no_answer}; is the daemon of robot.id {where.robot_id!r} stuck, does it have "
-                "this key (`acsard topics`), and may you query it?"
+                "this key (`acsard topics`), and may you query it (`acsard whoami`)?"
             )
         return NoAnswerError(
             f"{no_answer}: {explain_silence(key, where.robot_id, where.endpoint, seen)}"

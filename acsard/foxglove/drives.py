@@ -41,12 +41,15 @@ def encoding_of(encoding: str, schema_name: str) -> str:
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
     if full not in (TWISTS[0], STAMPED_TWISTS[0]):
-        raise DecodeError("wrong_type", f"the type is {schema_name or 'missing'}: send {TWISTS[0]}")
+        text = f"a channel of the type {schema_name or '(none)'} does not drive: use {TWISTS[0]}"
+        raise DecodeError("wrong_type", text)
     if encoding == "cdr":
         return f"{encoding_name('cdr')};{full}"
     if encoding == "json":
         return encoding_name("json")
-    raise DecodeError("unknown_encoding", f"{encoding}, but json or cdr is needed")
+    raise DecodeError(
+        "unknown_encoding", f"the encoding is {encoding or '(none)'}: use json or cdr"
+    )
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
@@ -184,5 +187,6 @@ class Drives:
         try:
             robot.send(twist.linear, twist.angular, stamp_ns=wished.stamp_ns)
         except zenoh.ZError as error:
-            words = "the bus accepts no commands: all commands of a panel are lost until it does"
-            self._notices.say("error", "drive", f"{words} ({error})")
+            words = "the bus accepts no commands, so the commands of all panels are lost"
+            mend = "run `acsard doctor` on the robot"
+            self._notices.say("error", "drive", f"{words} ({error}): {mend}")

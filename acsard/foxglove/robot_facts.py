@@ -70,6 +70,7 @@ def learn(robot: Client) -> Facts:
         config = Config() if tables is None else from_builtins(tables)
     except (DecodeError, msgspec.ValidationError) as error:
         raise ReplyError(
-            f"cannot read the robot's state ({error}); does the daemon have another version?"
+            f"cannot read the robot's state ({error}); does the daemon have another version? Use "
+            "the same version here"
         ) from None
     return Facts(config, tables, sources, forbidden, deaf)

@@ -263,8 +263,8 @@ class Refusals(logging.Handler):
             self._notices.say(
                 "warning",
                 "refused",
-                "a client was refused: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 "
-                "does not), or is not a Foxglove viewer",
+                "a client was refused, because it does not speak foxglove.sdk.v1 (Lichtblick "
+                "before 2026 does not) or is not a Foxglove viewer: use a newer viewer",
             )
 
 

@@ -42,7 +42,11 @@ def find(path: str | None) -> tuple[str, bytes]:
         except FileNotFoundError:
             continue
         except OSError as error:
-            raise ExitError(Exit.BAD_CONFIG, f"cannot read {place}: {error.strerror}") from None
+            raise ExitError(
+                Exit.BAD_CONFIG,
+                f"cannot read {place}: {error.strerror}; correct its permissions, or name another "
+                "file with --config",
+            ) from None
     return "built-in defaults", b""
 
 

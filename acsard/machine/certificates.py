@@ -203,6 +203,9 @@ def _writable(directory: Path) -> None:
     """Raise `MendableError` unless the directory can be created or written to. Create nothing."""
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     if not there.is_dir():
-        raise MendableError(f"{there} is not a directory; use --directory")
+        raise MendableError(f"{there} is not a directory; name a directory with --directory")
     if not os.access(there, os.W_OK | os.X_OK):
-        raise NotPermittedError(f"cannot write to {there}: run it with sudo, or use --directory")
+        raise NotPermittedError(
+            f"cannot write to {there}: run this command with sudo, or name another directory with "
+            "--directory"
+        )

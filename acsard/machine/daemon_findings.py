@@ -68,8 +68,8 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         lambda key: key not in OPTIONS and live(key) is None,
         "warning",
         "by another file or its environment, or the file has changed since",
-        "if it runs with another file, name that with --config; otherwise write its values into "
-        "the file, or restart it. The following is about the running daemon",
+        "if it runs with another file, name that file with --config; otherwise write its values "
+        "into this file, or restart the daemon. The findings below are about the running daemon",
     ),
     (
         lambda key: live(key) is not None,
@@ -185,7 +185,7 @@ def link(running: Running) -> Iterator[Finding]:
     if state.link != "up":
         if state.link == "down":
             mend = (
-                "see the port above"
+                "see the finding about the port above"
                 if running.here
                 else "run `acsard doctor` on that machine, which checks its port"
             )
@@ -240,7 +240,7 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
         # If the board has fallen silent, all bumpers count as pressed.
         todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
         if safety.bumper == "away":
-            todo = f"drive straight away from it, or {todo} if the robot is stopped"
+            todo = f"drive straight away from it; if the robot is stopped, {todo}"
         yield Finding("bumpers", "warning", bumpers.pressed_words(safety.bumpers, pressed), todo)
     elif pressed is not None:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
@@ -421,7 +421,10 @@ def daemon(running: Running) -> Iterator[Finding]:
         yield Finding("latch file", "warning", state.latch_file_error, mend)
     # On this machine `compared` has read the file itself.
     if state.settings_differ and not running.here:
-        mend = "its next start uses the file's values; set them again, or correct its file there"
+        mend = (
+            "a restart of the daemon uses the file's values; `acsard set KEY VALUE --keep` writes "
+            "a present value into that file"
+        )
         text = f"the settings in force differ from the robot's file: {state.settings_differ}"
         yield Finding("configuration", "warning", text, mend)
     yield from late(running)
@@ -459,7 +462,7 @@ def late(running: Running) -> Iterator[Finding]:
     if missed > 0.01 * max(1, lines):
         told = [f"missed {missed} control periods"]
     for text in told:
-        mend = "which other program uses the processor? `top` shows it; the service runs real-time"
+        mend = "`top` shows which other program uses the processor; the service runs real-time"
         yield Finding("daemon", "warning", text, mend)
     causes = [
         (event, cause)
@@ -498,7 +501,9 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
     """
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
-        mend = GYRO_MENDS.get(does, "is the daemon of another version?")
+        mend = GYRO_MENDS.get(
+            does, "does the daemon have another version? Use the same version here"
+        )
         yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
     if refused:

@@ -102,7 +102,7 @@ def serial_port(config: Config) -> Iterator[Finding]:
     """Yield findings about the port: existence, permissions, and other programs that use it."""
     path = config.mcu.port
     if path == "sim":
-        mend = '`acsard ports` lists the ports; write mcu.port = "/dev/acsar", say'
+        mend = '`acsard ports` lists the ports; write, for example, mcu.port = "/dev/acsar"'
         yield Finding("port", "warning", "the built-in simulator: no robot will move", mend)
         return
     if not os.path.exists(path):
@@ -113,7 +113,8 @@ def serial_port(config: Config) -> Iterator[Finding]:
         yield Finding("port", "failure", f"{path} does not exist; the ports are: {seen}", mend)
         return
     if not stat.S_ISCHR(os.stat(path).st_mode):
-        yield Finding("port", "failure", f"{path} is not a serial device", "see `acsard ports`")
+        mend = "`acsard ports` lists the serial devices: write one of them as mcu.port"
+        yield Finding("port", "failure", f"{path} is not a serial device", mend)
         return
     yield _permission(path)
     for holder in holders(path):

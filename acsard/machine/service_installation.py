@@ -333,7 +333,10 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
         steps.append(Write(file))
     if changed and not force:
         paths = ", ".join(changed)
-        raise MendableError(f"would overwrite {paths}; look at them, or use --force")
+        raise MendableError(
+            f"these files differ from those of this version: {paths}; look at them, and replace "
+            "them with --force"
+        )
     return [*steps, *INSTALLED]
 
 

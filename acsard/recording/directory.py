@@ -187,7 +187,9 @@ class Ring:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(self._lock)
-            raise OSError(error.errno, "another daemon records there") from None
+            raise OSError(
+                error.errno, "another daemon records there: set another record.directory"
+            ) from None
         try:
             for copy in self._directory.glob(f".*{PART}.new"):
                 # A crash interrupted the writing of this copy.

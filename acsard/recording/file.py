@@ -389,7 +389,9 @@ class Recording:
         try:
             self._data = path.read_bytes()
         except OSError as error:
-            raise RecordingError(f"cannot read {path}: {error.strerror}") from None
+            raise RecordingError(
+                f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
+            ) from None
         self.ended = False
         """True if the file is finished. This is known only after `messages` was read to its end.
 

@@ -98,7 +98,8 @@ def config_of(recording: Recording) -> Config:
         return parse(recording.about.config.encode())
     except ConfigError as error:
         raise RecordingError(
-            f"this version cannot use the configuration in {recording.path}: {error}"
+            f"this version cannot use the configuration in {recording.path}: {error}; acsard "
+            f"{recording.about.version}, which recorded it, can"
         ) from None
 
 
@@ -270,9 +271,15 @@ class RecordedRun(_Source):
                 self.number, self._next, replayed_ns = step.number, step.number + 1, now_ns
                 yield step
         if last is None:
-            raise RecordingError(f"{recording.path} has no steps: it ends within its first second")
+            raise RecordingError(
+                f"{recording.path} has no steps, because it ends within its first second: choose "
+                "another recording"
+            )
         if self.number is None:
-            raise RecordingError(f"{recording.path}: its first steps are missing or damaged")
+            raise RecordingError(
+                f"{recording.path} cannot be replayed: its first steps are missing or damaged, and "
+                "no readable state of the robot follows them"
+            )
         if recording.damaged > damaged:
             end, now = read_end(recording.paths[-1]), last.inputs.now
             lost_ns = 0 if end is None else end.last_ns - now.wall_ns
@@ -351,7 +358,7 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
         return str(error)
     name = f"step {step.number}, which ended the daemon,"
     if last is None or step.number != last + 1:
-        return f"{name} does not follow the previous step"
+        return f"{name} was not replayed, because the step before it is missing"
     try:
         robot.step(step.inputs)
     except Exception as error:  # noqa: BLE001 - the failure may be any exception

@@ -131,7 +131,13 @@ class Recorder:
             self._hangs()
             self._full = True
             self._lost += 1
-            self._report(Event("recording", "the disk is too slow; steps are lost", "warning"))
+            self._report(
+                Event(
+                    "recording",
+                    "the disk is too slow, so steps are missing in the recording",
+                    "warning",
+                )
+            )
             return
         else:
             queue.append(taken)
@@ -172,7 +178,10 @@ class Recorder:
         if self._full:
             trouble = "the disk is too slow"
         if not self._thread.is_alive():
-            trouble = "the recorder has ended because of an error of its own, which is in the log"
+            trouble = (
+                "the recorder has ended because of an error of its own, which is in the log: "
+                "restart the daemon to record again"
+            )
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:

@@ -74,8 +74,8 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
         parts.append(f"{many(unreadable, 'step')} cannot be read")
     if skipped:
         parts.append(
-            f"{many(skipped, 'step')} with {many(lines, 'line')} can be read, but come before the "
-            "next state of the robot"
+            f"{many(skipped, 'step')} with {many(lines, 'line')} can be read, but not replayed, "
+            "because the next state of the robot comes after them"
         )
     if any(gap.end_lost for gap in gaps):
         parts.append("the end of the recording cannot be read and may have more steps")

@@ -116,7 +116,9 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
     try:
         date = time.strptime(words, "%Y-%m-%d")
     except ValueError:
-        raise TimeError(f"{words} is not a date: the calendar has no such day") from None
+        raise TimeError(
+            f"{words} is not a date: the calendar has no such day; correct it"
+        ) from None
     return date.tm_year, date.tm_mon, date.tm_mday
 
 
@@ -158,7 +160,8 @@ def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, 
             last = next(at for day in range(3) if (at := _on(first, day, end)) >= first)
     if last < first:
         raise TimeError(
-            f"--from is {clock(first, day=True)}, which is after --to, {clock(last, day=True)}"
+            f"--from is {clock(first, day=True)}, which is after --to, {clock(last, day=True)}: "
+            "correct one of them"
         )
     return first, last
 

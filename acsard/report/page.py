@@ -202,7 +202,8 @@ def drawn(
             break
     if data.began is None:
         raise RecordingError(
-            f"{recording.path} has no step in that span of time, so there is nothing to draw"
+            f"{recording.path} has no step in that span of time, so there is nothing to draw: "
+            "correct --from and --to"
         )
     data.end("" if data.over else recording.ending)
     remarks = [*filter(None, [recording.missing]), *replayed.notes]

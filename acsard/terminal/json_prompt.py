@@ -221,7 +221,7 @@ class JsonPrompt:
 
         def chosen(value: str | float | None) -> str:
             if value not in answers:
-                raise ValueError(f"one of: {', '.join(answers)}")
+                raise ValueError(f"answer with one of: {', '.join(answers)}")
             return str(value)
 
         return self._ask(chosen, words=words, answers=answers, **more)

@@ -45,7 +45,7 @@ class Ask(Struct, frozen=True):
         except ValueError:
             number = None
         if number is None or not self.least <= number <= self.most:
-            raise ValueError(f"a number of {self.unit} from {self.least:g} to {self.most:g}")
+            raise ValueError(f"type a number of {self.unit} from {self.least:g} to {self.most:g}")
         return number
 
 

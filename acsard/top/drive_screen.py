@@ -113,7 +113,7 @@ def reason(state: RobotState) -> str:
 
 def refused(objection: str) -> str:
     """Return why the robot does not follow the keys, and how to send a zero with keys."""
-    release = " (let go of the key, and press it again)" if "must send a zero" in objection else ""
+    release = " (release the key, and press it again)" if "must send a zero" in objection else ""
     return f"your keys do not drive: {printable(objection)}{release}"
 
 

@@ -187,12 +187,12 @@ class Roster(Fleet):
         if not self.left_out:
             return ""
         return (
-            f"more than {self._most} robots: the others are left out; name yours with --id "
-            "robot1,robot2"
+            f"there are more than {self._most} robots, and the others are left out: name yours "
+            "with --id robot1,robot2"
         )
 
     def hint(self) -> str:
         """Return a sentence that explains why there are no robots to show."""
         if ALL in self._ids:
             return nobody(self._robot.where.endpoint)
-        return "none of these robots is present"
+        return "none of these robots is present: correct --id, or start their daemons"

@@ -53,7 +53,7 @@ REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
-    413: f"over {MAX_BYTES} bytes",
+    413: f"the request has more than {MAX_BYTES} bytes: send less",
 }
 
 WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
@@ -230,7 +230,7 @@ class Admission:
         self._acceptor.admitted(request.transport, who)
         fast = self._too_fast(who, row)
         if fast and not (row and row.waits):
-            text = f"more than {REQUESTS.hz:g} requests a second: use /ws, which sends changes"
+            text = f"more than {REQUESTS.hz:g} requests a second: use /ws, which sends each change"
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:
             who.require(row.least, f"{row.method} {row.path}")

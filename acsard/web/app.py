@@ -145,7 +145,7 @@ class Page:
             counting = frozenset()
         for viewer in list(self._viewers):
             if viewer.who.token and viewer.who.token not in counting:
-                viewer.end("your token has expired")
+                viewer.end("your token has expired or was revoked: ask for a new one")
         self._acceptor.tidy(counting)
 
     # The page and its files.
@@ -268,7 +268,10 @@ class Page:
             raise RefusedError("malformed", f"the body must be a JSON object: {error}") from None
         robot = given.pop("robot", "")
         if not isinstance(robot, str):
-            text = "robot must be the id of a robot; a robot of another page can only be stopped"
+            text = (
+                "robot must be a text, the id of a robot; from here, another robot can only be "
+                "stopped"
+            )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
         told = await self._parts.calls.call(request[WHO], verb, given, robot)
@@ -333,7 +336,7 @@ class Page:
         except NoAnswerError as error:
             raise TroubleError(504, str(error)) from None
         except (MendableError, DecodeError, TimeoutError) as error:
-            raise TroubleError(503, str(error) or "no answer in time") from None
+            raise TroubleError(503, str(error) or "no answer in time: try again") from None
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:

@@ -81,7 +81,7 @@ class Who(Struct, frozen=True):
 
     def barred(self, least: Role) -> str:
         """Return why the client may not do something that needs the role `least`."""
-        return f"for {least}s; you are {self.role}"
+        return f"for {least}s; your role is {self.role}"
 
 
 class Asked(Struct, frozen=True):
@@ -123,7 +123,11 @@ def place(asked: Asked, names: Collection[str]) -> Place:
             "http://localhost here, and https from another machine",
         )
     if host not in names:
-        raise RefusedError("host", f"{host or 'no name'!r} is not a name of this robot")
+        raise RefusedError(
+            "host",
+            f"{host or 'no name'!r} is not a name of this robot: use its host name, its address or "
+            "a name in its certificate",
+        )
     return "away"
 
 
@@ -132,7 +136,9 @@ def require_own_origin(asked: Asked) -> None:
     strange = asked.origin is not None and asked.origin.lower() != _own_origin(asked)
     if strange or asked.site not in (None, "same-origin", "none"):
         raise RefusedError(
-            "origin", "the request comes from a page of another site: open the robot's own page"
+            "origin",
+            "the request comes from a page of another site: open the robot's own page, or list the "
+            "site in web.origins",
         )
 
 

@@ -125,7 +125,7 @@ class Calls:
             else:
                 reply = await self._ask(request)
         except (MendableError, DecodeError, TimeoutError) as error:
-            return ServiceReply(False, str(error) or "no answer in time")
+            return ServiceReply(False, str(error) or "no answer in time: try again")
         if verb == "set" and reply.success:
             self._robots.ask_anew()
         return reply
@@ -161,7 +161,11 @@ class Calls:
             ),
             ANSWER_S,
         )
-        return ServiceReply(False, f"{robot} was told to stop; check that it did: {BUSY}")
+        return ServiceReply(
+            False,
+            f"the stop was sent to {robot}, but too many queries are running to wait for its "
+            "answer: check that it stopped",
+        )
 
     def _require_few(self, who: Who) -> None:
         """Raise `RefusedError` if the client stops too many robots that may not exist."""
@@ -253,7 +257,9 @@ class Stops:
 def require(who: Who, verb: str) -> None:
     """Raise `RefusedError` unless the service exists and the role of `who` may call it."""
     if verb not in SERVICES:
-        raise RefusedError("malformed", f"no service {verb!r}; there are {', '.join(SERVICES)}")
+        raise RefusedError(
+            "malformed", f"{verb!r} is not a service; choose one of {', '.join(SERVICES)}"
+        )
     who.require(SERVICE_ROLES[verb], verb)
 
 

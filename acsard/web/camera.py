@@ -116,7 +116,9 @@ class Camera:
         has no camera, or its stream cannot be read.
         """
         if not self._url:
-            raise TroubleError(404, "this robot has no camera: web.camera names its MJPEG stream")
+            raise TroubleError(
+                404, "this robot has no camera: to show one, set web.camera to its MJPEG stream"
+            )
         self._asked_ns = clock.mono_ns()
         if self._reading is None or self._reading.done():
             self._reading = asyncio.create_task(self._read_again_and_again())
@@ -140,8 +142,8 @@ class Camera:
                 while not self._sends.enter(token):
                     await self._sent.wait()
         except TimeoutError:
-            text = f"{SENDS_OF_TOKEN} pictures are on their way to this token already, or {SENDS}"
-            raise TroubleError(503, f"{text} in all: wait for them") from None
+            text = f"{SENDS_OF_TOKEN} pictures are being sent to this token, or {SENDS} in all"
+            raise TroubleError(503, f"{text}: ask again when one has arrived") from None
         try:
             yield
         finally:
@@ -172,7 +174,10 @@ class Camera:
             kind["Content-Type"] = answer.headers.get("Content-Type", "")
             boundary = kind.get_boundary()
             if answer.status != 200 or boundary is None:
-                raise ValueError(f"{answer.status} {answer.content_type} is not an MJPEG stream")
+                raise ValueError(
+                    f"the answer {answer.status} {answer.content_type} is not an MJPEG stream: "
+                    "correct web.camera"
+                )
             parts = Parts(boundary)
             async for data in answer.content.iter_any():
                 if self._idle():

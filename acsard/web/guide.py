@@ -128,7 +128,8 @@ class Guide:
         """
         if self._errand is not None:
             return (
-                f"{self._errand.name} already runs ({self._errand.by}); only one can run at a time"
+                f"{self._errand.name} already runs ({self._errand.by}), and only one can run at a "
+                "time: wait until it ends"
             )
         self._errand = _Errand(viewer, by, asked.begin, self._viewers[viewer])
         self._tell_all()
@@ -139,7 +140,7 @@ class Guide:
         """Pass a viewer's answer to the child. Return "" or the reason for a refusal."""
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
-            return f"the question {reply.reply} is not open"
+            return f"the question {reply.reply} is not open: answer the newest one of this page"
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
@@ -192,7 +193,7 @@ class Guide:
         try:
             code, text = await errand.run(words(asked, self._reach, await self._ports(asked)))
         except (FrameError, OSError, TimeoutError) as error:
-            code, text = int(Exit.USAGE), str(error) or "the list of serial ports does not arrive"
+            code, text = int(Exit.USAGE), str(error) or "no list of serial ports arrived: try again"
         finally:
             self._errand = None
         meaning = WORDS.get(code, "ended") if not errand.left else "stopped"
@@ -248,7 +249,7 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
         if begin.method or begin.positions:
             raise FrameError("begin", "`method` and `positions` are only for a calibration")
         if begin.port not in ports:
-            raise FrameError("begin", f"port is one of {', '.join(sorted(ports))}")
+            raise FrameError("begin", f"port must be one of {', '.join(sorted(ports))}")
         return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
     if begin.port:
         raise FrameError("begin", "`port` is only for the check of a board")
@@ -260,9 +261,11 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
 
 def _method(begin: Begin) -> list[str]:
     if begin.method and begin.method not in NEEDS:
-        raise FrameError("begin", f"method is one of {', '.join(NEEDS)}")
+        raise FrameError("begin", f"method must be one of {', '.join(NEEDS)}")
     if (begin.method == POSITIONS) != bool(begin.positions):
-        raise FrameError("begin", f"`positions` is a key; it belongs to the method {POSITIONS}")
+        raise FrameError(
+            "begin", f"give `positions`, a key, with the method {POSITIONS} and no other"
+        )
     if begin.positions and not KEY.match(begin.positions):
         raise FrameError("begin", "`positions` must be a key like sim/pose: letters, digits, _ / -")
     options = {"method": begin.method, "positions": begin.positions}

@@ -243,13 +243,13 @@ class Seats:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
         alike = (
-            f"with this token {CONNECTIONS_ALIKE} pages are open at {address} already: close "
+            f"{CONNECTIONS_ALIKE} pages with this token are open at {address} already: close "
             "some, or ask for a token of your own"
         )
-        spread = f"with this token {CONNECTIONS_OF_TOKEN} pages are open already: close some"
+        spread = f"{CONNECTIONS_OF_TOKEN} pages with this token are open already: close some"
         full = (
-            f"only {CONNECTIONS} pages can be open, {CONNECTIONS_OF_ONE} of them from one "
-            "address: close some"
+            f"{CONNECTIONS} pages are open already, or {CONNECTIONS_OF_ONE} from this address: "
+            "close some"
         )
         return [
             (self._alike, f"{address} {token}", alike),

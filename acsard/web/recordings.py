@@ -124,7 +124,10 @@ class BlackBox:
                 "open the page that the robot serves",
             )
         if not self._robots.about.recordings:
-            raise TroubleError(404, "nothing is recorded, because record.directory is empty")
+            raise TroubleError(
+                404,
+                "nothing is recorded: record.directory is not set. Set it and restart the daemon",
+            )
         return Path(self._robots.about.recordings)
 
 
@@ -167,7 +170,7 @@ def _begun(path: Path) -> float | None:
 
 
 def _unread(place: Path, error: Exception) -> TroubleError:
-    words = getattr(error, "strerror", None) or "no answer in time"
+    words = getattr(error, "strerror", None) or "the disk does not answer; try again"
     return TroubleError(503, f"cannot read {place}: {words}")
 
 
@@ -232,7 +235,7 @@ class Reports:
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
-            return ReportState("busy", f"another report is being drawn: {one.path.name}")
+            return ReportState("busy", f"the report of {one.path.name} is being drawn: wait for it")
         if one is None or one.path != path or (one.told and (one.failed or one.stamp != stamp)):
             one = self._one = _Drawing(path, stamp)
             self._work = asyncio.get_running_loop().create_task(self._draw(one))

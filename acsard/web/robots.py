@@ -158,7 +158,7 @@ class Robots:
             try:
                 return await call()
             except UNREADY:
-                self.gone = "the bus is stuck; the page tries again"
+                self.gone = "the bus is stuck; the page tries again by itself"
                 await asyncio.sleep(AGAIN_S)
 
     async def _follow(self, watch: Watch) -> None:
@@ -175,10 +175,14 @@ class Robots:
             quiet = watch.silent(now)
             if quiet and watch.unreadable:
                 self.gone = (
-                    "the daemon's state cannot be read: does the daemon have another version?"
+                    "the daemon's state cannot be read: does the daemon have another version? Use "
+                    "the same version here"
                 )
             elif quiet and (watch.heard or not self.gone):
-                self.gone = f"nothing is received from the daemon at {self.endpoint}: does it run?"
+                self.gone = (
+                    f"nothing is received from the daemon at {self.endpoint}: does it run? "
+                    "`acsard doctor` on the robot checks it"
+                )
             elif watch.heard and not quiet and self.gone:
                 self.gone = ""
                 self.ask_anew()

@@ -160,7 +160,7 @@ def decode(text: str) -> Frame:
     try:
         meant = [name for name in _heads.decode(text) if name in KINDS]
         if len(meant) != 1:
-            raise FrameError(about, f"a message needs one of the fields {', '.join(KINDS)}")
+            raise FrameError(about, f"a message needs exactly one of the fields {', '.join(KINDS)}")
         about = meant[0]
         frame = _decoders[about].decode(text)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:

@@ -208,7 +208,7 @@ class Keys:
             self._out.refuse("subscribe", "malformed", str(error))
             return
         if key not in KEYS:
-            text = f"{key!r} is not one of {', '.join(sorted(KEYS))}"
+            text = f"{key!r} is not a key to follow; choose one of {', '.join(sorted(KEYS))}"
             self._out.refuse("subscribe", "malformed", text)
             return
         known = self._out.following.get((robot, key))
@@ -217,19 +217,21 @@ class Keys:
             self._out.refuse(
                 "subscribe",
                 "too_many",
-                f"at most {FRAMES_HZ:g} messages a second in all: lower the rates",
+                f"more than {FRAMES_HZ:g} messages a second in all: lower the rates",
             )
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
         elif len(self._out.following) >= MOST:
-            self._out.refuse("subscribe", "too_many", f"at most {MOST} keys: unsubscribe some")
+            self._out.refuse(
+                "subscribe", "too_many", f"more than {MOST} keys: unsubscribe from some"
+            )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
                 f"one token may follow {STREAMS_OF_ONE} keys of other robots at once, "
                 f"and all tokens together {STREAMS}"
             )
-            self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe some")
+            self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe from some")
         else:
             one = Following(robot, key, self._robots.id, 1.0 / frame.rate)
             self._out.following[robot, key] = one
@@ -283,7 +285,9 @@ class Keys:
         try:
             return await self._robots.streams.follow(client, one.robot, one.name)
         except UNREADY:
-            self._out.refuse("subscribe", "stuck", "the bus is stuck; the page tries again")
+            self._out.refuse(
+                "subscribe", "stuck", "the bus is stuck; the page tries again by itself"
+            )
             await asyncio.sleep(AGAIN_S)
             return None
 

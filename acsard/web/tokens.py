@@ -105,8 +105,8 @@ class Vault:
         if self.path.parent == service or not os.path.lexists(service):
             return ""
         return (
-            f"written to {self.path}, which the service on this machine does not read: for the "
-            "page of the service use sudo"
+            f"this token is in {self.path}, which the service on this machine does not read: to "
+            "invite to the page of the service, run this command with sudo"
         )
 
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
@@ -120,10 +120,11 @@ class Vault:
             ours = [one for one in tokens if one.robot == self.robot]
             if any(one.name == name for one in ours):
                 raise UsageError(
-                    f"a token {name} exists already: choose another --name, or --revoke it"
+                    f"a token {name} exists already: give another --name, or end it with --revoke "
+                    f"{name}"
                 )
             if len(ours) >= MOST:
-                raise UsageError(f"there are {MOST} tokens already: --revoke some")
+                raise UsageError(f"there are {MOST} tokens already: end some with --revoke NAME")
             text = secrets.token_urlsafe(32)
             ends = now_s + days * DAY_S + hours * HOUR_S
             token = Token(name, role, _digest(text), now_s, ends, self.robot)
@@ -156,7 +157,9 @@ class Vault:
             finally:
                 os.close(handle)
         except PermissionError:
-            raise NotPermittedError(f"no permission to write {self.path}: use sudo") from None
+            raise NotPermittedError(
+                f"no permission to write {self.path}: run this command with sudo"
+            ) from None
 
     def _kept(self) -> list[Token]:
         """Return the tokens in the file, none if it does not exist; raises `UsageError`."""
@@ -166,7 +169,7 @@ class Vault:
             return []
         except msgspec.MsgspecError as error:
             raise UsageError(
-                f"{self.path} cannot be read as tokens ({error}): correct it, or move it away "
+                f"{self.path} is not a list of tokens ({error}): correct it, or move it away "
                 "and invite all users again"
             ) from None
 

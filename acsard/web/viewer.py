@@ -215,7 +215,7 @@ class Viewer:
             if room or urgent:
                 self._obey(frame)
             else:
-                self._refuse(frame, f"more than {MESSAGES.hz:g} messages a second")
+                self._refuse(frame, f"more than {MESSAGES.hz:g} messages a second: send fewer")
         if self._overruns >= OVERRUNS:
             self.end("too many messages")
 
@@ -278,7 +278,7 @@ class Viewer:
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._commands.give(owner, frame.source, commander, self._sender, wish):
-            text = f"more than {COMMANDS.hz:g} commands a second with this token"
+            text = f"more than {COMMANDS.hz:g} commands a second with this token: send fewer"
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
@@ -297,7 +297,9 @@ class Viewer:
             self._start(self._answer(frame), self._stops)
         else:
             if self._calling >= CALLS_AT_ONCE:
-                self._refuse(frame, f"{CALLS_AT_ONCE} calls are running already")
+                self._refuse(
+                    frame, f"{CALLS_AT_ONCE} calls are running already: wait for an answer"
+                )
                 return
             self._calling += 1
             self._start(self._answer(frame))

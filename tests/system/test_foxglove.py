@@ -447,7 +447,7 @@ def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: B
         first = driving(bus, 0.1)["sender"]
         with Viewer(shows.port) as other, Panel(other, speed(-0.2)):
             other.status(
-                f"your commands do not drive: another program drives the robot as app, {first}"
+                f"your commands do not drive: another program, {first}, drives the robot as app"
             )
             assert (bus.state()["linear"] or 0.0) > 0.0
     bus.at_rest()

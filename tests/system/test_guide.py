@@ -62,7 +62,7 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
             # has turned.
             await guided.answer(question, "yes")
             question = await guided.asks("lifted")
-            assert question["wrong"] == "one of: lifted"
+            assert question["wrong"] == "answer with one of: lifted"
             await guided.answer(question, "lifted")
             await guided.sees(("fl", "fr", "rl", "rr"))
             result = await guided.says(lambda said: "result" in said)

@@ -1255,10 +1255,10 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             off = "one => [one.disabled || one.getAttribute('aria-disabled') === 'true', one.title]"
             told = browser.js(f"[...document.querySelectorAll('[data-does]')].map({off})")
             assert len(told) >= 6
-            assert {tuple(one) for one in told} == {(True, "for operators; you are viewer")}
+            assert {tuple(one) for one in told} == {(True, "for operators; your role is viewer")}
             described = browser.js(f"[...document.querySelectorAll('[data-does]')].map({WORDS})")
-            assert all("for operators; you are viewer" in one for one in described)
-            page.shows("barred", "for operators; you are viewer")
+            assert all("for operators; your role is viewer" in one for one in described)
+            page.shows("barred", "for operators; your role is viewer")
             page.shows("hint", "You may watch and stop, but not drive")
             assert browser.js("document.getElementById('tab-set').checkVisibility()") is False
             browser.tap("tab-events")

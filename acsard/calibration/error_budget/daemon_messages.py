@@ -83,7 +83,8 @@ def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> N
                     feed.add(decoders[key].decode(*encoded(sample)))
                 except DecodeError as error:
                     raise ReplyError(
-                        f"cannot read {key} ({error}); does the daemon have another version?"
+                        f"cannot read {key} ({error}); does the daemon have another version? Use "
+                        "the same version here"
                     ) from None
 
 

@@ -148,7 +148,7 @@ class LegDriver:
         elif now - self._received > QUIET_S:
             late = held_up > QUIET_S / 2
             self.silent = self.silent or not (late or self.over)
-            silence = "nothing received from the daemon: does it run?"
+            silence = "nothing received from the daemon: does it run (`acsard doctor`)?"
             self._halt(HELD_UP if late else silence, disturbed=late)
         if self.phase is Phase.OPENING:
             self._open(now)

@@ -230,7 +230,8 @@ class RobotOnBus:
                 self._client.send(0.0, 0.0)
         if driver.halted and self._watch.unreadable:
             raise GuideError(
-                "the daemon's state cannot be read: does another version of acsard run?"
+                "the daemon's state cannot be read: does the daemon have another version? Use the "
+                "same version here"
             )
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."

@@ -175,7 +175,7 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
             if not 0.1 < by_wheels / reading.value < 10.0:
                 raise RefusedError(
                     f"the wheels report {math.degrees(by_wheels):.0f} deg, but you measured "
-                    f"{math.degrees(reading.value):.0f} deg: start again, and let it turn "
+                    f"{math.degrees(reading.value):.0f} deg: start again, and let the robot turn "
                     "one full circle to the left"
                 )
             start[P.INVERSE_TRACK] *= reading.value / by_wheels

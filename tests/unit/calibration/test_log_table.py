@@ -278,8 +278,8 @@ def test_a_spike_counts_as_missing_and_a_fast_drive_does_not() -> None:
     assert np.flatnonzero(np.isnan(columns["yaw_rate"])).tolist() == [70]
     assert not np.isnan(columns["right"]).any()
     assert notes == [
-        "1 cell of left left out because no robot has such a value, like 900",
-        "1 cell of yaw_rate left out because no robot has such a value, like -40",
+        "1 cell of left left out: no robot has a value like 900",
+        "1 cell of yaw_rate left out: no robot has a value like -40",
     ]
 
 
@@ -287,9 +287,7 @@ def test_a_spike_is_found_between_rows_of_other_sensors() -> None:
     columns = table()
     columns["yaw_rate"][1::2] = np.nan
     columns["yaw_rate"][100] = 40.0
-    assert list(bounded(columns)) == [
-        "1 cell of yaw_rate left out because no robot has such a value, like 40"
-    ]
+    assert list(bounded(columns)) == ["1 cell of yaw_rate left out: no robot has a value like 40"]
 
 
 def mostly_standing(rng: np.random.Generator) -> dict[str, Floats]:

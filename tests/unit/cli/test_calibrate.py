@@ -239,7 +239,7 @@ def test_a_directory_that_is_no_bag_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("word", ["--topic=/imu", "--yaw-axis=x"])
 def test_the_options_of_a_bag_are_refused_for_a_csv_file(word: str, tmp_path: Path) -> None:
-    with pytest.raises(MendableError, match="choose within a ROS 2 bag, and this is none"):
+    with pytest.raises(MendableError, match="are for a ROS 2 bag, and this is not one"):
         called(tmp_path, GOOD, word)
 
 

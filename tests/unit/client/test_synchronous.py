@@ -10,7 +10,7 @@ import zenoh
 
 from acsard import client
 from acsard.client import Client, NoAnswerError
-from acsard.client.commander import LONGEST_S, SPACING_S
+from acsard.client.commander import LONGEST_S, SPACING_S, no_command
 from acsard.client.driving import UnheardError
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
@@ -179,7 +179,7 @@ def test_a_key_that_there_is_not_is_the_one_reason_that_is_reported(
         ("fault: rear_left wheel is stuck", False),
         ("stopped by request", False),
         ("app is not one of commands.sources: nav", False),
-        ("the daemon receives no command of source app", True),
+        (no_command("app"), True),
     ],
 )
 def test_over_tls_the_role_is_named_only_if_no_command_arrives(
@@ -207,6 +207,6 @@ def test_over_tls_a_viewer_is_refused_whatever_the_robot_objects(
 def test_a_drive_of_which_nothing_arrives_ends_with_an_error_that_the_docs_name(
     session: Session,
 ) -> None:
-    found = client_of(session).unheard(UnheardError("the daemon receives no command of source app"))
+    found = client_of(session).unheard(UnheardError(no_command("app")))
     assert type(found).__name__ in client.__doc__.split()
     assert isinstance(found, client.NotDrivenError)

@@ -87,7 +87,7 @@ def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> Non
 def test_what_is_no_option_of_run_is_a_warning() -> None:
     (finding,) = compared(running(replace(FILE, odometry=replace(FILE.odometry, gyro=True))), FILE)
     assert (finding.level, "odometry.gyro = true, not false" in finding.text) == ("warning", True)
-    assert "if it runs with another file, name that with --config" in finding.mend
+    assert "if it runs with another file, name that file with --config" in finding.mend
 
 
 def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:
@@ -359,7 +359,9 @@ def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() ->
     config = replace(CONFIG, safety=SafetyConfig(bumpers=("front",), bumper="away"))
     state = replace(STATE, bumpers=[True])
     *_, finding = link(Running(INFO, config, state, state, 0))
-    assert finding.mend.startswith("drive straight away from it, or release it there; if none")
+    assert finding.mend.startswith(
+        "drive straight away from it; if the robot is stopped, release it there"
+    )
 
 
 CHECK = check(Running(INFO, CONFIG, STATE, STATE, 0))

@@ -121,7 +121,7 @@ def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> Non
 
 def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
     found = there(unit=b"mine", own=None)
-    with pytest.raises(MendableError, match=f"would overwrite {UNIT_FILE.path};"):
+    with pytest.raises(MendableError, match=f"those of this version: {UNIT_FILE.path};"):
         installing(ALL, found, force=False)
     steps = installing(ALL, found, force=True)
     assert [step for step in steps if isinstance(step, Write)] == [Write(UNIT_FILE), Write(OWN)]

@@ -140,7 +140,7 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     before, after = bench.end()
     told = [event.text for event in bench.said if event.text != f"to {bench.where}"]
     assert told == [
-        "the disk is too slow; steps are lost",
+        "the disk is too slow, so steps are missing in the recording",
         f"the disk goes on; {missing} steps are missing",
     ]
     numbers = [step.number for path in (before, after) for step in steps(Recording(path))]

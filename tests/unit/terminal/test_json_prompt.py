@@ -91,7 +91,7 @@ def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Progra
     with program.hears(JsonPrompt()) as person:
         assert person.number(DISTANCE) == 1.75
     assert program.told("question") == [1, 2, 3, 4, 5]
-    assert program.told("wrong") == ["a number of m from 0.5 to 3"] * 4
+    assert program.told("wrong") == ["type a number of m from 0.5 to 3"] * 4
     assert {key: program.said[0][key] for key in ("words", "unit", "least", "most")} == {
         "words": "How far?", "unit": "m", "least": 0.5, "most": 3.0,
     }  # fmt: skip
@@ -112,7 +112,7 @@ def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program:
         assert person.keys(0.05) == ""
     assert [one.get("leg") for one in program.said] == [True, True]
     assert program.said[0]["by_key"] is True
-    assert program.said[1]["wrong"] == "one of: start"
+    assert program.said[1]["wrong"] == "answer with one of: start"
 
 
 def test_a_key_on_the_heels_of_the_start_stops(program: Program) -> None:

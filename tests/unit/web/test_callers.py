@@ -126,7 +126,7 @@ def test_a_role_may_what_those_below_it_may() -> None:
     assert [operator.may("operator"), operator.may("maintainer")] == [True, False]
     assert MAINTAINER.may("maintainer")
     operator.require("operator", "clear")
-    with pytest.raises(RefusedError, match="clear is for operators; you are viewer") as found:
+    with pytest.raises(RefusedError, match="clear is for operators; your role is viewer") as found:
         viewer.require("operator", "clear")
     assert found.value.reason == "role"
 

@@ -159,7 +159,7 @@ async def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for
             while not told:
                 await asyncio.sleep(0.01)
         assert not beyond.success
-        assert "r3 was told to stop" in beyond.message
+        assert "the stop was sent to r3" in beyond.message
         assert told == ["acsard/r3/stop"]
         answer = encode(ServiceReply(True, "stopped"), "msgpack")
         while held:

@@ -59,7 +59,7 @@ def test_a_token_has_a_share_of_its_address_and_leaves_others_theirs() -> None:
     seats = Seats()
     told = [seats.enter("10.0.0.1", "broken") for _ in range(CONNECTIONS_OF_ONE)]
     assert told.count("") == CONNECTIONS_ALIKE < CONNECTIONS_OF_ONE
-    assert f"{CONNECTIONS_ALIKE} pages are open at 10.0.0.1" in told[-1]
+    assert f"{CONNECTIONS_ALIKE} pages with this token are open at 10.0.0.1" in told[-1]
     assert "broken" not in told[-1]
     assert not seats.enter("10.0.0.1", "phone")
     assert not seats.enter("10.0.0.2", "broken")
@@ -71,7 +71,7 @@ def test_an_address_has_a_share_of_the_pages_with_however_many_tokens() -> None:
     seats = Seats()
     told = [seats.enter("10.0.0.1", f"token{n}") for n in range(CONNECTIONS)]
     assert told.count("") == CONNECTIONS_OF_ONE
-    assert f"{CONNECTIONS_OF_ONE} of them from one address" in told[-1]
+    assert f"{CONNECTIONS_OF_ONE} from this address" in told[-1]
     assert not seats.enter("10.0.0.2", "token0")
 
 

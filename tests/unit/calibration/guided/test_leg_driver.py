@@ -168,7 +168,7 @@ def test_of_two_calibrations_the_one_that_is_followed_goes_on() -> None:
 def test_of_two_calibrations_the_other_says_who_drives_and_moves_nothing() -> None:
     world = of_two(LEG, OTHER).run(OPENED_S + 0.5)
     assert set(world.said) == {REST}
-    assert world.driver.halted.startswith(f"another program drives the robot as app, {OTHER}")
+    assert world.driver.halted.startswith(f"another program, {OTHER}, drives the robot as app")
     assert "end it, or wait" in world.driver.halted
 
 
@@ -190,7 +190,7 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.speaks = False
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
-    assert world.driver.halted == "nothing received from the daemon: does it run?"
+    assert world.driver.halted == "nothing received from the daemon: does it run (`acsard doctor`)?"
     assert world.driver.silent
     assert not world.driver.disturbed
 
