@@ -1334,6 +1334,27 @@ def test_a_second_sender_that_is_followed_before_the_first_is_silent_is_a_findin
         followed_in_turn((4.0, "a", 0.3, 0.0), (4.05, "b", 0.3, 0.0))
 
 
+@pytest.mark.parametrize("late_s", [0.0, 1.0])
+def test_all_programs_of_an_identity_lose_the_robot_if_the_network_of_one_became_slow(
+    late_s: float,
+) -> None:
+    """The daemon takes a delay that jumped for a clock that was set."""
+    witness, followed_ns = witnessed(), None
+    followed = Followed(witness)
+    stamped, plain = {"way": "header"}, {"way": "plain"}
+    sent = ((stamped, 0.0, False), (plain, 0.0, True), (stamped, late_s, False))
+    with nullcontext() if late_s else pytest.raises(BrokenError, match="first of equal"):
+        for number, (way, age_s, counts) in enumerate([*sent, ({"id": "b"}, 0.0, True)]):
+            at_ns, sender = 4 * NS + number * NS // 100, SIGNED | way
+            sent_ns = at_ns - int(age_s * NS)
+            one = Message(sent_ns, at_ns, 0.3, 0.0, sent_ns, number, "")
+            found = sample(sender, one, PLAIN["config"], 0)
+            wish = witness.command(sender, one, found, at_ns)
+            followed.command(sender, one, found, at_ns, wish)
+            followed_ns = at_ns if counts else followed_ns
+            followed.step(at_ns + 1, at_ns + 1, followed_ns, "driving", "up")
+
+
 @pytest.mark.parametrize("adjusted", [True, False])
 def test_all_programs_of_an_identity_lose_the_robot_if_the_clock_of_one_was_set(
     adjusted: bool,
