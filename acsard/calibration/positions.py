@@ -7,9 +7,11 @@ complex numbers x + iy in m.
 `search` finds parameters from which the fit to positions can start, because the fit needs a track
 that is nearly right. The search tries tracks from a tenth to thirty times the configured one, with
 turns to either side and with one side of the wheels reversed. For each of them, the size of the
-path gives the radius. A turn on the spot does not change the position. Positions therefore often
-determine such a turn only up to whole turns: the robot faces the same way after 90 deg to the left
-as after 270 deg to the right. If several starting points explain the positions about equally well,
+path gives the wheel radius.
+
+A turn on the spot does not change the position. Positions therefore often determine such a turn
+only up to whole turns: the robot faces the same way after 90 deg to the left as after 270 deg to
+the right. If several starting points explain the positions about equally well,
 the search chooses the one that describes the more usual robot.
 """
 

@@ -149,7 +149,7 @@ def _require_fitting(args: argparse.Namespace) -> None:
             "--distance goes with --log: a guided drive asks for the distances that it needs"
         )
     if not args.log and _choice(args) != Choice():
-        raise UsageError("--topic and --yaw-axis go with --log: they choose within a ROS 2 bag")
+        raise UsageError("--topic and --yaw-axis need --log: they select data in a ROS 2 bag")
     for name in DRIVE_OPTIONS if args.log else ():
         if getattr(args, name):
             option = "--" + name.replace("_", "-")

@@ -64,7 +64,7 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
 
     @property
     def computed(self) -> bool:
-        """Whether the loop's thread ran or waited for a processor for `SHARE` of the lateness."""
+        """Whether the thread ran, or was ready without a processor, for `SHARE` of the lateness."""
         return self.explains(self.loop.ran_ns + self.loop.waited_ns)
 
     @property

@@ -154,7 +154,11 @@ class Recorder:
             if self._slow and ended and self._waited_ns <= SLOW_NS:
                 self._slow = False
                 missing = many(self._lost - self._lost_before, "step is", "steps are")
-                self._report(Event("recording", f"the disk goes on; {missing} missing"))
+                self._report(
+                    Event(
+                        "recording", f"the disk keeps up again; {missing} missing in the recording"
+                    )
+                )
             self._waited_ns = 0
         elif before % 2:
             self._waited_ns += min(now_ns - self._now_ns, PAUSE_NS)

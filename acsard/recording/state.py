@@ -119,7 +119,7 @@ def thaw(data: bytes) -> State:
     match made:
         case (Robot() as robot, Memory() as memory):
             return State(robot, memory)
-    raise StateError("the state at its start is not the state of a robot")
+    raise StateError("the state at its start is not that of a robot")
 
 
 def short(error: Exception) -> str:

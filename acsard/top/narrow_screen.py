@@ -57,7 +57,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return priority and age of each source, and below them why it does not drive.
+    """Return a line with priority and age for each source, and why it does not drive, if so.
 
     There are about `room` lines. If the sources do not fit, the last line names the others.
     """

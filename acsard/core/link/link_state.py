@@ -97,7 +97,7 @@ class Link:
             self.excuse()
 
     def silent(self, now_ns: int) -> bool:
-        """Return whether no good line came within `quiet_ns`, or none at all in this session."""
+        """Return whether the last good line is older than `quiet_ns`, or there was none yet."""
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
 
     def good(self, at_ns: int) -> int | None:

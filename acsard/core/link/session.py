@@ -199,7 +199,7 @@ class McuSession:
 
     @property
     def note(self) -> str:
-        """Text about the present form of the lines, to append to a reason.
+        """Text that says whether lines are checked or plain now, to append to the reason of a mode.
 
         It is "" with `mcu.link_check = "off"`.
         """

@@ -176,9 +176,9 @@ class TwistUncertainty:
     - q is the quantization step of the wheel speeds. Each wheel has the variance q^2 / 12. a_v and
       a_w follow from the kinematics, with two wheels on each side.
     - T is the mean period of the feedback lines. A line reports the mean speed over one period.
-    - var(d) and var(dyaw) are the noise of one period. Therefore the integral of the twists has the
-      noise of the pose.
-    - The sums are over the parameters, and c_1 to c_4 are the numbers of a column (`columns`).
+    - var(d) and var(dyaw) are the noise of one period, so that the integrated twists are as
+      uncertain as the pose.
+    - The sums are over the uncertain parameters of the kinematics (c_1 to c_4: see `columns`).
 
     If the wheels slip, the variances are multiplied by `SLIPPING`. If the robot rests, only a
     motion that is too small for the encoders remains uncertain.

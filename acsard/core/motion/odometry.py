@@ -157,9 +157,9 @@ class Odometry:
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
-        """Remember an impossible line, so that the next possible line includes the motion in it.
+        """Do not use the speeds of an impossible line, but keep its counts and its duration.
 
-        The counts of the line are kept, so none is lost. Of a line without counts, only the
+        So the next possible line covers the motion of both. Of a line without counts, only the
         duration is kept.
         """
         self._rolling.skip(feedback)

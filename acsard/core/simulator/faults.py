@@ -186,7 +186,7 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Obey each value that a comma follows, as old firmware does, and ignore the checksum."""
+        """Obey each value as soon as its comma arrives, like old firmware; ignore checksums."""
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:

@@ -171,8 +171,9 @@ class ZenohBus:
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
         """Declare the topic's JSON key, for clients without msgpack.
 
-        Its publisher is never latched, because a latched publisher encodes every message even
-        without subscribers. A query on the key returns the present value instead.
+        Its publisher never keeps its last message for late subscribers, because then it would
+        encode every message even without subscribers. A query on the key returns the present value
+        instead.
         """
         below = json_key(topic.key)
         key, encoding = full_key(self._id, below), encoding_name("json", topic.type)

@@ -141,7 +141,7 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     told = [event.text for event in bench.said if event.text != f"to {bench.where}"]
     assert told == [
         "the disk is too slow, so steps are missing in the recording",
-        f"the disk goes on; {missing} steps are missing",
+        f"the disk keeps up again; {missing} steps are missing in the recording",
     ]
     numbers = [step.number for path in (before, after) for step in steps(Recording(path))]
     assert len(numbers) == bench.world.steps - missing
@@ -184,7 +184,9 @@ def test_a_disk_that_hangs_is_reported_after_three_seconds_and_so_is_its_return(
     bench.drive(2.0)
     bench.world.run(0.1)
     assert bench.recorder.status.trouble == ""
-    assert bench.said[1:] == [Event("recording", "the disk goes on; no steps are missing")]
+    assert bench.said[1:] == [
+        Event("recording", "the disk keeps up again; no steps are missing in the recording")
+    ]
 
 
 def test_a_disk_that_takes_long_for_every_sync_is_reported_once(bench: Bench) -> None:
