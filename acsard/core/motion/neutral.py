@@ -118,9 +118,8 @@ class Sender:
             self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
             if zero and unarmed:
-                # The sender is armed now, but an earlier speed must not count. With a shared
-                # identity, another program may have sent that speed, and the source keeps its
-                # priority.
+                # When this zero arms the sender, an earlier speed must not count. With a shared
+                # identity, another program may have sent it, and the source keeps its priority.
                 if command.shared:
                     self.twist = REST
                 else:
