@@ -30,7 +30,7 @@ from acsard.core.motion.wheel_witness import SLACK, Expected, Witness
 from acsard.core.values import Twist
 
 TRIED = np.geomspace(0.01, 5.0, 60)
-"""Response times that the module tries, s. They cover the range of the setting."""
+"""Response times that are tried, s. They cover the range of `feedback.response_time`."""
 
 LEAST_ROWS, MOST_ROWS = 200, 30_000
 """Minimum number of wheel samples in a log, and maximum number that the module uses.
@@ -39,7 +39,7 @@ The maximum is five minutes at 100 Hz. More samples would only take memory.
 """
 
 FOLLOWS = 0.5
-"""Largest fraction of the sum of the squared speeds that the model may leave unexplained."""
+"""Largest fraction of the sum of squared wheel speeds that the model may leave unexplained."""
 
 SPARE = 0.5
 """Longest time for which a wheel may look faulty with the proposed response time.
@@ -48,14 +48,14 @@ It is given as a fraction of `feedback.fault_time`.
 """
 
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
-"""Criterion for the highest speed of a wheel.
+"""Criterion for a wheel that turns as fast as it can.
 
-A wheel has reached it if its speed stays below the fraction `REACHED` of its command for at least
-twice `STEADY_S` s, and changes by less than the fraction `CONSTANT` in the last `STEADY_S` s.
+For at least twice `STEADY_S` s, its speed is below the fraction `REACHED` of its command. In the
+last `STEADY_S` s, the speed changes by less than the fraction `CONSTANT`.
 """
 
 SAME = 1.5
-"""Largest ratio of the fitted and the configured response time that the report calls equal."""
+"""Largest factor between the fitted and the configured response time that counts as equal."""
 
 
 class WheelResponse(Struct, frozen=True):
@@ -63,26 +63,31 @@ class WheelResponse(Struct, frozen=True):
 
     seconds: float
     """Response time that fits best, s."""
-    proposed: float
-    """Response time that causes no fault in this log, s."""
+    proposed: float | None
+    """Response time to configure if `false_fault` is true, s. It causes no fault in this log. It is
+    None if every tried response time causes a fault."""
     present: float
     """Configured response time, s."""
     false_fault: bool
-    """Whether the configured response time makes healthy wheels of this log look faulty."""
+    """Whether healthy wheels look faulty with the configured response time."""
     fastest: float
     """Highest speed that the wheels reach, rad/s, or infinity if the log shows no such limit."""
 
     def settings(self) -> dict[str, float]:
-        """Return the settings of `[feedback]` that must change."""
-        return {"response_time": self.proposed} if self.false_fault else {}
+        """Return the settings of `[feedback]` that must change, by name."""
+        if not self.false_fault or self.proposed is None:
+            return {}
+        return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
         """Return a sentence about the response time and, if it is finite, one about `fastest`."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
-            then = (
-                f", and feedback.response_time = {self.present:g} would take them for faulty: "
-                f"the new value is {self.proposed:g}"
+            then = f", and feedback.response_time = {self.present:g} would take them for faulty: "
+            then += (
+                "so would every other value; if they are healthy, raise feedback.fault_time"
+                if self.proposed is None
+                else f"the new value is {self.proposed:g}"
             )
         elif max(self.seconds / self.present, self.present / self.seconds) > SAME:
             then = f". feedback.response_time is {self.present:g}, and causes no fault in this log"
@@ -100,9 +105,9 @@ class WheelResponse(Struct, frozen=True):
 def response(
     driven: Sequence[Run], drive: DriveConfig, feedback: FeedbackConfig
 ) -> WheelResponse | None:
-    """Return the response of the wheels, or None if they follow no commands in the log.
+    """Return the response of the wheels to the commands in the runs `driven`.
 
-    `driven` contains the runs of the log.
+    The result is None if the log has too few commands, or if the wheels do not follow them.
     """
     parts: list[tuple[Floats, Floats, Floats]] = []
     room = MOST_ROWS
@@ -122,15 +127,12 @@ def response(
     best = int(np.argmin(squares))
     if not squares[best] < FOLLOWS * whole:
         return None
-    limit, proposed = feedback.fault_time, float(TRIED[best])
+    limit, proposed = feedback.fault_time, None
     false_fault = limit > 0.0 and _evidence(parts, feedback.response_time, limit) > limit
     if false_fault:
         good = (t for t in TRIED[best:].tolist() if _evidence(parts, t, limit) <= SPARE * limit)
-        proposed = next(good, 0.0)
-        false_fault = proposed > 0.0
-    return WheelResponse(
-        float(TRIED[best]), float(f"{proposed:.2g}"), feedback.response_time, false_fault, fastest
-    )
+        proposed = next((float(f"{t:.2g}") for t in good), None)
+    return WheelResponse(float(TRIED[best]), proposed, feedback.response_time, false_fault, fastest)
 
 
 def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
@@ -172,10 +174,10 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time, s, for which a wheel looks faulty with the time `response_time`, s.
+    """Return the longest time, s, for which a wheel looks faulty to the daemon's fault detection.
 
-    `parts` contains the results of `_commanded` for each run. `fault_time` is the setting of this
-    name, s.
+    `parts` contains the results of `_commanded` for each run. `response_time` and `fault_time` are
+    the settings of these names, s.
     """
     longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
     for steps, wanted, seen in parts:

@@ -94,13 +94,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 class Quota:
-    """The messages that may still be printed, counted for each robot."""
+    """Limit of the number of messages that are printed, counted for each robot."""
 
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
         """Allow `most` messages of each robot, or any number if `most` is None.
 
-        `used_up` considers the robots with the ids `robots`. If there are none, it considers the
-        robots of which a message has been printed.
+        The limit is used up when each robot in `robots` has reached it. If `robots` is empty, this
+        applies to the robots of which a message has been printed.
         """
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 
@@ -114,7 +114,9 @@ class Quota:
 
     @property
     def used_up(self) -> bool:
-        """True if all allowed messages of each robot have been printed."""
+        """True if there is a limit and each robot has reached it."""
+        if self._most is None:
+            return False
         return all(self._counts.get(one) == self._most for one in self._robots or self._counts)
 
 
@@ -131,7 +133,7 @@ def _print(
     Args:
         samples: the messages. The iterator ends if no message arrives for `timeout`.
         decoder: decodes messages for their short form; None prints JSON.
-        quota: the messages that are printed. Messages beyond it are skipped.
+        quota: limits the number of printed messages. Messages beyond it are skipped.
         of_many: whether each line names its robot.
         timeout: time, s, after which the function returns if it has printed no message, or None.
         heard: called for each message.
@@ -207,9 +209,10 @@ def _record(
 
 
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
-    """Return the robots that are to be printed: those in `ids`, or for "*" those present now.
+    """Return the ids of the robots to print: those in `ids`, or for "*" the robots present now.
 
-    Print which robots are present now, because a silent robot looks like a missing one.
+    Also print on standard error which robots are present, because a present robot that sends
+    nothing looks like an absent one.
     """
     there: list[str] = []
     try:

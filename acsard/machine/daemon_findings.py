@@ -1,6 +1,6 @@
-"""Examines whether the running daemon can be reached, and the reports that it returns to queries.
+"""Examines whether the daemon can be reached, and evaluates what it reports about itself.
 
-The doctor queries the daemon's configuration once, and its state twice, a second apart. The
+`acsard doctor` queries the daemon's configuration once, and its state twice, a second apart. The
 difference between the counters of the two states shows how well the serial link works.
 """
 
@@ -37,7 +37,7 @@ from acsard.core.motion.battery import words as battery_words
 from acsard.core.motion.emergency_stop import CHECK, MISSING, PRESSED, RELEASE, SILENT
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.lifecycle import utc
-from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus
+from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus, GyroDoes
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.daemon.late_causes import cause_in
@@ -47,15 +47,15 @@ from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
 SHOWN = 6
-"""Largest number of differing keys that a finding names. If more differ, another file is in use."""
+"""Largest number of keys with different values that a finding names."""
 
 
 OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""Keys that `acsard run` takes as options. If such a value differs from the file's, that is
-intended."""
+"""Keys that `acsard run` takes as options. If the daemon's value of such a key differs from the
+file's, that is probably intended."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
@@ -79,42 +79,41 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         "the file",
     ),
 )
-"""Possible reasons why a value of the daemon differs from the value in the file.
+"""Possible reasons why the daemon uses another value of a key than the configuration file has.
 
-Each row has a function that says whether the row applies to a key, the level of the finding, the
-reason, and the remedy.
+Each row has four items: a function that says whether the row applies to a key, the level of the
+finding, the reason, and the remedy.
 """
 
 
 class Running(Struct, frozen=True):
-    """Reports of a daemon: its identity, its configuration, and two of its states."""
+    """The answers of a running daemon to the doctor's queries."""
 
     info: Info
     config: Config
     before: RobotState
     state: RobotState
     looked_ns: int
-    """Time halfway between the request for `state` and its answer, by this host's wall clock, ns.
+    """Wall-clock time of this machine, halfway between the request for `state` and its answer, ns.
     """
     trip_ns: int = 0
     """Time from the request for `state` to its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
-    """Rows of the daemon's diagnostics."""
+    """The rows of the daemon's diagnostics."""
     here: bool = True
-    """Whether the daemon runs on this machine, that is, whether its process is found here.
+    """Whether the daemon's process is found on this machine.
 
-    The address does not show that, because it may lead to a tunnel or a router.
+    The daemon's address does not show this, because it may lead to a tunnel or a router.
     """
     events: tuple[LogEvent, ...] = ()
     """The daemon's last events."""
 
 
 def asked(config: Config, address: Address) -> Running:
-    """Query the daemon at this address for its configuration, its state and its events.
+    """Query the daemon at this address for its configuration, its states and its events.
 
-    `config` is the content of the configuration file. It is used in place of the daemon's
-    configuration if this client may not query that. Raises an `AcsardError` if the daemon does not
-    answer.
+    If this client may not query the daemon's configuration, the result contains `config`, that of
+    the local file, instead. Raises an `AcsardError` if the daemon does not answer.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -132,7 +131,8 @@ def asked(config: Config, address: Address) -> Running:
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
     """Return the daemon's configuration.
 
-    If this client may not query it, return the configuration `file` with the values in `info`.
+    If this client cannot query it, return the local configuration `file` with the values that
+    `info` gives.
     """
     try:
         return from_builtins(robot.get("config"))
@@ -161,13 +161,13 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(its: Mapping[str, Difference]) -> str:
-    """Return the daemon's values in the form of the configuration file."""
+    """Return the daemon's values as lines of the configuration file."""
     parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
 def answers(endpoint: str) -> bool:
-    """Return whether a program listens at this endpoint; raise `UsageError` if it is not valid."""
+    """Return whether a program listens at an endpoint. Raises `UsageError` if it is not valid."""
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)
@@ -179,7 +179,7 @@ def answers(endpoint: str) -> bool:
 
 
 def link(running: Running) -> Iterator[Finding]:
-    """Yield findings about the serial link, from the counters and reports of the daemon."""
+    """Yield findings about the serial link, and about the board's inputs and battery."""
     config, state = running.config, running.state
     mend = check(running)
     if state.link != "up":
@@ -197,11 +197,11 @@ def link(running: Running) -> Iterator[Finding]:
     passed = {
         key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
     }
-    # A fault that occurs at most once a day on average is reported as ok. One that is more frequent
-    # is a warning. `often` is the number of days that the daemon has run.
+    # A fault is a warning only if it occurs more than once a day on average. `often` is the number
+    # of days that the daemon has run.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / 86400
-    # The built-in simulator is late whenever the daemon is, and it is never unplugged. So this
-    # computer has caused every loss of its link.
+    # The built-in simulator runs in the daemon and is never unplugged. So this computer has caused
+    # every loss of a link to it.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = f"lost {late_times} since the daemon's start because this computer did not run"
@@ -222,7 +222,6 @@ def link(running: Running) -> Iterator[Finding]:
 
 
 def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
-    """Yield a finding about an emergency stop that the board reports or should report."""
     if state.emergency_stop == "pressed":
         yield Finding("emergency stop", "warning", PRESSED, f"{RELEASE}, then `acsard call clear`")
     elif state.emergency_stop == "silent":
@@ -234,7 +233,6 @@ def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Fi
 
 
 def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
-    """Yield a finding about bumpers that the board reports or should report."""
     safety, pressed = config.safety, state.bumpers
     if pressed is not None and any(pressed):
         # If the board has fallen silent, all bumpers count as pressed.
@@ -250,7 +248,6 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
 
 
 def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -> Iterator[Finding]:
-    """Yield a finding about the battery that the board reports or should report."""
     if battery is None:
         if config.bounds:
             yield Finding("battery", "warning", NO_BATTERY, mend)
@@ -270,24 +267,24 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Yield a warning if too few of the lines sent between the two states were answered.
+    """Yield a warning if the board has not replied to enough of the daemon's lines.
 
-    `passed` gives the increase of each counter between the two states.
+    `passed` gives the increase of each of the daemon's counters in a second.
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
-    # With fewer than 40 lines between both states the fraction means nothing.
+    # With fewer than 40 lines, a fraction means nothing.
     if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
         return
     yield (
-        f"only {came} of {sent} lines that were sent in a second were answered: the others are "
-        "lost on the way there or back, or the board reports by its own clock"
+        f"the board answered only {came} of {sent} lines that were sent in a second: lines or "
+        "answers get lost, or it reports by its own clock"
     )
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a list with a warning about lines that the daemon refused, [] if they are few.
+    """Return a list with one warning if the daemon rejected many lines of the board, else [].
 
-    `counters` are the daemon's counters, or the increases of its counters.
+    `counters` are the daemon's counters, or their increases in some time.
     """
     kinds = {
         name.removeprefix("line_"): count
@@ -301,20 +298,21 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return the number of link losses that this computer did not cause, with a description.
+    """Return how often the link was lost without the fault of this computer, and a description.
 
-    The result is a list with this pair, or [] if there were no such losses.
+    The result is a list with this pair, or [] if there were no such losses. `counters` are the
+    daemon's counters.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
-        f"it was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
+        f"the link was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
         "silent at times or was unplugged; the log says when (link_stale, link_down)"
     )
     return [(times, text)] if times > 0 else []
 
 
 def check(running: Running) -> str:
-    """Return the command that examines the board more closely, and its preconditions."""
+    """Return a text with the command that examines the board, and what to do before."""
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds the cause, with the wheels lifted; stop the "
@@ -322,20 +320,22 @@ def check(running: Running) -> str:
     )
 
 
-GYRO_MENDS = {
+GYRO_MENDS: dict[GyroDoes, str] = {
     "used": "",
     "waiting for rest": "",
-    "silent": "is its driver running, and does it send to the key imu (ROS: imu/data)?",
+    "silent": "is its driver running, and does it publish on the key `imu` (ROS topic imu/data)?",
     "disagrees": "turn more slowly, or drive on other ground; if that does not help, check that "
     "its z axis points up and that it sends rad/s",
+    "reversed": "mount it with its z axis up, or let its driver negate angular_velocity.z",
+    "in degrees": "let its driver send rad/s: divide the degrees per second by 57.3",
+    "dead": "check its cable and its driver: does angular_velocity.z change when the robot turns?",
     "not believed": "check that its z axis points up and that it sends rad/s; then `acsard "
     "calibrate` measures the track width",
 }
-"""Remedy for each gyro status in `state`; "" if the status is good."""
+"""Maps the gyro's status in `state` to the remedy; "" if the status is good."""
 
 CAUSES_SHOWN = 3
-"""Largest number of events with a cause of lateness that are shown. If there are more, only the
-last ones are shown."""
+"""Largest number of late control periods whose causes are shown. Older ones are left out."""
 
 CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
@@ -363,7 +363,7 @@ PUT_ROUTER = (
 
 
 def routers(config: Config) -> Iterator[Finding]:
-    """Yield findings about the routers: whether they listen, and which rights they give."""
+    """Yield a warning for each configured router that does not listen or is used without TLS."""
     for endpoint in config.bus.connect:
         if not answers(endpoint):
             yield Finding("router", "warning", f"no program listens at {endpoint}", START_ROUTER)
@@ -377,9 +377,9 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the answers of the daemon at this address, or a finding if it cannot be queried.
+    """Return the answers of the daemon at this address, or a finding if it does not answer.
 
-    Raises `UsageError` if the address has no valid endpoint.
+    Raises `UsageError` if the endpoint of the address is not valid.
     """
     endpoint = address.endpoint
     if not answers(endpoint):
@@ -400,7 +400,7 @@ def found(config: Config, address: Address) -> Running | Finding:
 
 
 def daemon(running: Running) -> Iterator[Finding]:
-    """Yield the findings that follow from the daemon's reports."""
+    """Yield the findings that follow from the daemon's answers."""
     state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
     mend = f"see the reason; `acsard call clear` releases it; {check(running)}"
@@ -419,7 +419,7 @@ def daemon(running: Running) -> Iterator[Finding]:
     if state.latch_file_error:
         mend = "free disk space, or name a writable directory: control.state_directory"
         yield Finding("latch file", "warning", state.latch_file_error, mend)
-    # On this machine `compared` has read the file itself.
+    # If the daemon runs on this machine, `compared` has read its file.
     if state.settings_differ and not running.here:
         mend = (
             "a restart of the daemon uses the file's values; `acsard set KEY VALUE --keep` writes "
@@ -434,7 +434,7 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     """Yield a finding if a certificate that the daemon or its gateway uses expires soon.
 
     `row` is the row about certificates in the daemon's diagnostics, or None. `here` says whether
-    the daemon runs on this machine, so that its files are examined as well.
+    the daemon runs on this machine; the remedy depends on it.
     """
     if row is None or not row.level:
         return
@@ -443,18 +443,18 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
         mend = (
             "if the files above are new, give the services their copies: `sudo systemctl "
             "try-reload-or-restart acsard-gateway acsard-web`, and `sudo systemctl reload acsard` "
-            "on a robot that connects to a router. It uses them for its next connection; a restart "
-            "of its daemon, which stops the robot, ends this warning at once"
+            "on a robot that connects to a router. The robot uses them for its next connection; a "
+            "restart of its daemon, which stops the robot, ends this warning at once"
         )
     text = f"the daemon's certificate that ends first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 
 def late(running: Running) -> Iterator[Finding]:
-    """Yield a warning if the daemon misses control periods, over its whole run or recently.
+    """Yield a warning if the daemon misses control periods, and the last known causes.
 
-    The counters cover the whole run, and the diagnostics cover the recent time. Also yield the last
-    causes of lateness that the daemon's events name.
+    The daemon's counters cover its whole run, and its diagnostics the recent time. The causes come
+    from its events.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -476,14 +476,15 @@ def late(running: Running) -> Iterator[Finding]:
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Yield warnings if the daemon's clock differs from this machine's, or if stamps were replaced.
+    """Yield a warning if the daemon's clock differs from this machine's.
 
-    The daemon read its clock at an unknown moment between the request and the answer. A daemon on
-    this machine has the same clock as the doctor.
+    The daemon read its clock at an unknown moment between the request and the answer, so half of
+    that time is tolerated. Also yield a warning if commands came with stamps from the future, which
+    Zenoh replaces.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
-    # From a difference of 0.5 s on, Zenoh replaces the stamps of the clock that is ahead.
+    # If a clock is ahead by more than 0.5 s, Zenoh replaces its stamps.
     if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
@@ -495,14 +496,15 @@ def clocks(running: Running) -> Iterator[Finding]:
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield findings about the gyro and about its refused samples.
+    """Yield a finding about the gyro's status, and one if the daemon rejected its samples.
 
-    `does` is the status of the gyro in the daemon's `state`.
+    `does` is the status in the daemon's `state`. `counters` are the daemon's counters.
     """
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
-        mend = GYRO_MENDS.get(
-            does, "does the daemon have another version? Use the same version here"
+        mend = next(
+            (text for name, text in GYRO_MENDS.items() if name == does),
+            "does the daemon have another version? Use the same version here",
         )
         yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
@@ -514,7 +516,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
 
 
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
-    """Yield a finding about the daemon's connection to its routers, if any are configured."""
+    """Yield a finding about the connection to routers, if the daemon's diagnostics report it."""
     row = rows.get("acsard: router")
     if row is not None:
         mend = START_ROUTER if row.level else ""
@@ -524,7 +526,7 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
 
 
 def gateway(config: Config) -> Iterator[Finding]:
-    """Yield a finding for each endpoint of the TLS gateway."""
+    """Yield a finding for each configured endpoint of the TLS gateway: whether it listens there."""
     for endpoint in config.bus.outside:
         if answers(endpoint):
             yield Finding("gateway", "ok", f"open at {endpoint}")

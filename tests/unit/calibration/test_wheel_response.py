@@ -77,10 +77,26 @@ def test_a_slow_robot_that_reverses_would_be_faulty_and_its_response_time_is_pro
     """Its wheels roll on behind the command for longer than the fault time allows."""
     made = found(REVERSING, 2.0)
     assert made.false_fault
+    assert made.proposed is not None
     assert 1.0 < made.proposed < 3.0
     assert made.settings() == {"response_time": made.proposed}
     assert "would take them for faulty" in made.sentences()[0]
     assert not found(REVERSING, 2.0, response_time=made.proposed).false_fault
+
+
+def test_if_every_response_time_causes_a_fault_the_sentence_names_the_fault_time() -> None:
+    """Something holds the wheels for 1.5 s in the middle of the drive."""
+    rest, ahead = (3.0, 0.0, 0.0), (4.0, 0.5, 0.0)
+    (run,) = log([rest, ahead, (1.5, 0.0, 0.0), ahead, rest], 0.2).runs
+    (wished,) = log([rest, ahead, (1.5, 0.5, 0.0), ahead, rest], 0.2).runs
+    held = structs.replace(run, linear=wished.linear, angular=wished.angular)
+    made = response([held], DriveConfig(), FeedbackConfig())
+    assert made is not None
+    assert (made.false_fault, made.proposed, made.settings()) == (True, None, {})
+    assert (
+        "so would every other value; if they are healthy, raise feedback.fault_time"
+        in (made.sentences()[0])
+    )
 
 
 def test_a_response_time_that_causes_no_fault_is_one_sentence() -> None:

@@ -114,6 +114,8 @@ def printed(robots: str, senders: str, most: int | None, timeout: float | None =
         ("", "ba", 1, 0, "b"),
         ("abc", "aaab", 1, 1, "ab"),
         ("ab", "aaab", None, 1, "aaab"),
+        # Without a number, a robot that joined after the start does not end the command.
+        ("ab", "cab", None, 1, "cab"),
     ],
 )
 def test_a_number_of_messages_counts_for_each_robot(

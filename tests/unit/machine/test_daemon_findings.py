@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
+from typing import get_args
 
 import pytest
 from msgspec.structs import replace
@@ -27,7 +28,9 @@ from acsard.core.messages.schema import (
     RobotState,
     Time,
 )
+from acsard.core.values import GyroDoes
 from acsard.machine.daemon_findings import (
+    GYRO_MENDS,
     SHOWN,
     Running,
     certificate,
@@ -188,7 +191,11 @@ def test_a_gyro_that_does_what_it_should_is_no_warning(does: str) -> None:
     assert [one.level for one in gyro(does, {})] == ([] if does == "off" else ["ok"])
 
 
-@each("does", ["silent", "disagrees", "not believed", "what a later one does"])
+def test_each_state_of_the_gyro_has_its_own_remedy() -> None:
+    assert set(GYRO_MENDS) == set(get_args(GyroDoes)) - {"off"}
+
+
+@each("does", [*get_args(GyroDoes)[3:], "what a later one does"])
 def test_a_gyro_that_does_not_is_a_warning_with_its_mend(does: str) -> None:
     (finding,) = gyro(does, {})
     assert (finding.subject, finding.level) == ("gyro", "warning")
@@ -205,7 +212,7 @@ def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None
 
 
 def test_a_stop_that_would_be_lost_at_a_restart_is_a_warning_with_its_mend() -> None:
-    trouble = "a stop cannot be kept over a restart: /x/a.latches.json: Read-only file system"
+    trouble = "a stop would not survive a restart: /x/a.latches.json: Read-only file system"
     running = seen(0.0)
     running = replace(running, state=replace(running.state, latch_file_error=trouble))
     (finding,) = (one for one in daemon(running) if one.subject == "latch file")
@@ -225,7 +232,7 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
     ],
 )
 def test_a_certificate_in_use_that_ends_is_a_warning_with_its_mend(here: bool, mend: str) -> None:
-    words = "ends in 9 days (that of the router tls/router.local:7447)"
+    words = "ends in 9 days (certificate of the router tls/router.local:7447)"
     row = DiagnosticStatus(1, "acsard: certificate", words, "acsar", [])
     (told,) = certificate(row, here)
     assert (told.subject, told.level) == ("certificates", "warning")
@@ -271,7 +278,7 @@ def test_a_port_that_is_closed_is_mended_at_the_port() -> None:
 def test_lines_that_are_not_answered_are_a_warning() -> None:
     (finding,) = found({"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200})
     assert finding.level == "warning"
-    assert "only 80 of 100 lines that were sent in a second were answered" in finding.text
+    assert "answered only 80 of 100 lines that were sent in a second" in finding.text
     assert "mcu check" in finding.mend
 
 
@@ -352,7 +359,7 @@ def test_the_bumpers_of_the_board_are_reported(
     *_, finding = link(Running(INFO, config, state, state, 0))
     assert (finding.subject, finding.level) == ("bumpers", level)
     assert finding.text.startswith(text)
-    assert finding.mend.startswith("release it there; if none") == (level == "warning")
+    assert finding.mend.startswith("release it at the robot; if none") == (level == "warning")
 
 
 def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() -> None:
@@ -360,7 +367,7 @@ def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() ->
     state = replace(STATE, bumpers=[True])
     *_, finding = link(Running(INFO, config, state, state, 0))
     assert finding.mend.startswith(
-        "drive straight away from it; if the robot is stopped, release it there"
+        "drive straight away from it; if the robot is stopped, release it at the robot"
     )
 
 
