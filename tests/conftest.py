@@ -24,7 +24,7 @@ from tests.each import run
 # examples.
 settings.register_profile("default", deadline=None, max_examples=10, derandomize=True)
 settings.register_profile("thorough", deadline=None, max_examples=100, derandomize=True)
-"""`pytest --hypothesis-profile thorough`, as `.ci/run` does."""
+"""`pytest --hypothesis-profile thorough`, as the nightly job does."""
 settings.register_profile("explore", deadline=None, max_examples=3000)
 """`pytest --hypothesis-profile explore tests/unit`: 8 minutes, other examples each time."""
 settings.load_profile("default")

@@ -30,7 +30,7 @@ from tests.system.harness import Bus, Daemon, Peer, Program, until
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
 ]
 
 

@@ -41,7 +41,7 @@ def filmed(tmp_path: Path) -> Iterator[Filmed]:
     stream.close()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
 def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_within_a_second(
     filmed: Filmed,
 ) -> None:

@@ -22,7 +22,7 @@ from tests.system.test_calibrate import RIDES_S, SKIDDING
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
 ]
 
 
@@ -120,7 +120,7 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
             if n == 0:
                 sound(browser)
             person.press(wheel)
-            person.asked("how did it turn")
+            person.asked("which way did the wheel turn")
             person.press("forward")
         person.asked("Write these lines")
         person.shows("guide-result", 'front_left = "+a"')

@@ -14,7 +14,7 @@ from tests.system.harness import running, until
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
 ]
 
 NEXT_MS = 1200

@@ -31,7 +31,7 @@ from tests.system.chromium import CHROMIUM, PHONE, browsing
 from tests.system.harness import ZERO_LINE, Daemon, FarPeer, Heard, until, wheels
 from tests.system.hosts import Hosts, inside, on
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
 
 TIMEOUT_S, TICK_S = 0.25, 0.01
 """The timeout of source teleop, and the period of the control loop."""

@@ -16,7 +16,7 @@ from tests.system.harness import Bus, running, until
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
 ]
 
 WHOLE = {"index.html", *INLINED["index.html"]}

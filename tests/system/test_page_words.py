@@ -17,7 +17,7 @@ from tests.system.harness import PLAIN, Bus, Daemon, Peer, Tables, running, unti
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
 ]
 
 HIDDEN = "document.getElementById('clear').hidden"
@@ -299,7 +299,7 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_th
         assert browser.text("estop") == "⬢ E-STOP"
         shows(browser, "hint", "Emergency stop: release it at the robot first.")
         browser.tap("clear")
-        shows(browser, "alarm", "release it there, then")
+        shows(browser, "alarm", "release it at the robot, then")
         says(b"estop=ok")
         until(lambda: not browser.js(shown), 5.0, "the button is released")
         shows(browser, "hint", "Stopped. Press Release STOP first.")

@@ -186,7 +186,7 @@ LATE = """(() => {
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
 def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
     server: Page, bus: Bus, origin: str, tmp_path: Path
 ) -> None:

@@ -106,7 +106,7 @@ async def test_beside_a_daemon_it_says_why_it_sees_no_others(two: Two, tmp_path:
             assert f"acsard web --connect ROUTER --id {OURS}" in seen["note"]
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
 def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two: Two) -> None:
     with browsing() as browser:
         browser.size(*PHONE)

@@ -194,7 +194,7 @@ async def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_ro
         ended = time.monotonic()
         assert (message.type, message.extra) == (
             aiohttp.WSMsgType.CLOSE,
-            "your token has expired",
+            "your token has expired or was revoked: ask for a new one",
         )
         # The server looks it up that often, and may wait for a core as this process does.
         assert ended - begun < TIDY_S + PASSES_S + 4 * lost(begun, ended)
@@ -393,4 +393,4 @@ async def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(
                 await asyncio.sleep(0.01)
 
     told = await asyncio.gather(plain("trusted2"), other("trusted3"))
-    assert set(told) == {(1008, "your token has expired")}
+    assert set(told) == {(1008, "your token has expired or was revoked: ask for a new one")}
