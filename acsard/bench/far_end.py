@@ -35,7 +35,7 @@ class Part(msgspec.Struct, frozen=True):
     0 means that the board answers each line.
     """
     baud_rate: int = 0
-    """Baud rate of the far end, which the configuration need not allow; 0: as configured."""
+    """Baud rate of the simulated board, even if no configuration allows it; 0: as configured."""
 
 
 class NumberedMcu(FakeMcu):
@@ -51,7 +51,7 @@ class NumberedMcu(FakeMcu):
         return [forward * speed for _, forward in self._wiring]
 
     def _pass(self, now_ns: int) -> None:
-        # Advance only the time: the reported speeds do not depend on a simulated vehicle.
+        # Advance only the time, because the reported speeds do not come from a simulated vehicle.
         self._now_ns = max(self._now_ns, now_ns)
 
 

@@ -1,8 +1,8 @@
 """The record of a benchmark, and the figures that are computed from it. This module is pure.
 
-Successive commands and feedback lines of a benchmark have different speeds. So each output of the
-measured daemon is matched with its input by the speed, and not by the time. Times are monotonic, in
-ns.
+The far end is the process that simulates the board. Successive commands and feedback lines have
+different speeds. So each output of the measured daemon is matched with its input by the speed, and
+not by the time. Times are monotonic, in ns.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Instant
 
 STEPS = 1000
-"""Number of different speeds. Two lines with the same speed are distinguished by their time."""
+"""Number of different speeds. Lines with equal speeds are distinguished by their times."""
 
 LOWEST, STEP = 5.0, 0.02
-"""Lowest speed and step of the speeds, rad/s. Successive speeds are so close to each other that the
-limits on acceleration do not change them.
+"""Lowest wheel speed, and difference of successive wheel speeds, rad/s.
+
+The difference is so small that the limits on acceleration do not change the speeds.
 """
 
 PATIENCE_NS = 1_000_000_000
@@ -42,19 +43,19 @@ class Summary(Struct, frozen=True):
 
 
 class Fed(Struct, frozen=True):
-    """A feedback line that became an odometry sample."""
+    """A feedback line from which the measured daemon published an odometry sample."""
 
     delay_ns: int
     """Time from the line's last byte to the sample, ns."""
     waiting: int
-    """Number of newer lines that the far end had already written at the time of the sample."""
+    """Number of newer lines that the simulated board had written before the sample arrived."""
 
 
 def staircase(number: int) -> float:
-    """Return the speed of all wheels, rad/s, that encodes the number of a command or a line.
+    """Return the speed of all wheels, rad/s, for the command or feedback line with this number.
 
-    The speeds rise and fall with a period of `STEPS`. Rising speeds use the even steps of the scale
-    and falling speeds the odd ones, so that all speeds of a period differ.
+    The speeds rise and fall with a period of `STEPS`. The falling speeds lie between the rising
+    ones, so that all speeds of a period differ.
     """
     half = STEPS // 2
     place = number % STEPS
@@ -63,9 +64,9 @@ def staircase(number: int) -> float:
 
 
 def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
-    """Return the lines in these bytes, each with the time of its first byte.
+    """Return the lines in these bytes, each with the time of its first byte, ns.
 
-    The lines have no line end and no trailing comma. Empty lines are left out.
+    Line ends, trailing commas and empty lines are removed.
     """
     lines, held, began_ns = [], b"", 0
     for at_ns, data in chunks:
@@ -80,7 +81,9 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 
 
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
-    """Return the time from each command to its first line, ns. Lost commands are left out.
+    """Return the time from each command to the first line with its content, ns.
+
+    A command without such a line within `PATIENCE_NS` is lost and is left out.
 
     `sent` gives the time of each command and the line that the daemon must make of it. `lines`
     gives the time and the content of each line on the wire.
@@ -102,7 +105,7 @@ def lines_to_samples(
 ) -> list[Fed]:
     """Return the delay of each feedback line that became an odometry sample.
 
-    Lines and samples are matched by their linear speed. A sample that repeats a line is left out.
+    Lines and samples are matched by their linear speed. A second sample of a line is left out.
 
     Args:
         said: the time, ns, and the linear speed, m/s, of each feedback line.
@@ -142,16 +145,16 @@ def summary(durations_ns: Sequence[int]) -> Summary | None:
 
 
 class Seen(Struct, frozen=True):
-    """All data that the far end received and sent, with monotonic times in ns."""
+    """All data that the simulated board received and sent, with monotonic times in ns."""
 
     heard: list[Chunk] = []
-    """Bytes from the daemon, with the times at which the far end could read them."""
+    """Bytes from the daemon, each chunk with the time at which the board could read it."""
     said: list[Chunk] = []
-    """Bytes to the daemon, each chunk with the time just before the far end wrote it."""
+    """Bytes to the daemon, each chunk with the time just before the board wrote it."""
 
 
 class Sent(Struct, frozen=True):
-    """A command: the time at which it was published, and the line that it must become."""
+    """A command: the monotonic time of its publication, ns, and the line that it must become."""
 
     at_ns: int
     line: bytes
@@ -168,12 +171,15 @@ class Sample(Struct, frozen=True):
 
 
 class Record(Struct, frozen=True):
-    """The raw times of one run."""
+    """The raw times of one benchmark."""
 
     began_ns: int
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """The time that is evaluated, ns: from the end of the start-up to the start of the shutdown."""
+    """Monotonic times of the end of the start-up and of the start of the shutdown, ns.
+
+    Only the time between them is evaluated.
+    """
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]
@@ -181,7 +187,7 @@ class Record(Struct, frozen=True):
 
     @property
     def said(self) -> list[Chunk]:
-        """The feedback lines within the window."""
+        """Feedback lines that the board began to send within `window_ns`, with their times, ns."""
         first_ns, last_ns = self.window_ns
         lines = lines_of(self.seen.said) if self.seen else []
         return [line for line in lines if first_ns <= line[0] < last_ns]

@@ -46,9 +46,9 @@ from acsard.host.errors import MendableError
 def bench_config(config: Config, *, simulated: bool) -> Config:
     """Return the configuration of the measured daemon, with its own robot id, bus and source.
 
-    With the simulated board, three more things change. The limits let each command reach the next
-    line unchanged. Feedback that contradicts the commands is not a fault. Lines have no sequence
-    number, because each line is recognized by its text.
+    With the simulated board, more settings change. The limits are so high that each command reaches
+    the next line unchanged. Feedback that contradicts the commands is not a fault. Lines have no
+    sequence number, because the benchmark recognizes each line by its text.
     """
     own = replace(
         config,

@@ -20,7 +20,10 @@ POINTS = {
     "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
-"""The figures measured from outside, and between which points; "here" is the benchmark process."""
+"""Maps each figure that the benchmark measures to the events between which it measures the time.
+
+"Here" is the process of the benchmark.
+"""
 
 OWN = {
     "period_lateness": "period due (the first of several missed) -> its step",
@@ -30,9 +33,9 @@ OWN = {
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
     "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
-"""The figures that the daemon measures itself, and between which points.
+"""Maps each figure that the daemon measures to the events between which it measures the time.
 
-Their names are those of `latencies.Name`.
+The names of the figures are those of `latencies.Name`.
 """
 
 
@@ -60,24 +63,21 @@ class Result(Struct, frozen=True, omit_defaults=False):
     realtime: bool
     """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Figures by the names of `POINTS`; null for those that could not be measured."""
+    """Figures by the names of `POINTS`. A figure that was not measured is absent or null."""
     own: dict[str, Summary]
     """Figures by the names of `OWN`; their percentiles are accurate to 12 %."""
     commands_sent: int
     commands_seen: int | None
-    """Number of commands whose line was seen on the wire; null on a real port."""
+    """Number of commands whose line arrived at the simulated board; null on a real port."""
     lines_said: int | None
-    """Number of feedback lines that the far end wrote; null on a real port."""
+    """Number of feedback lines that the simulated board wrote; null on a real port."""
     lines_told: int
-    """Number of feedback lines of which the benchmark received the odometry."""
+    """Number of feedback lines whose odometry the benchmark received."""
     lines_waiting_max: int | None
-    """Largest number of newer feedback lines already written when a sample arrived.
-
-    Null on a real port.
-    """
+    """Largest number of feedback lines that the simulated board wrote between a line and the
+    arrival of its odometry here. Null on a real port."""
     lines_sent: int
-    """Number of lines that the daemon wrote to the port, read at the same time as
-    `missed_periods`."""
+    """Number of lines that the daemon wrote to the port, read together with `missed_periods`."""
     missed_periods: int
     cpu_percent_following: float
     """Processor use with one subscriber to the odometry and without commands, % of one core."""
@@ -100,7 +100,7 @@ def this_machine() -> Machine:
 
 
 def _cpu_model() -> str:
-    """Return the name of the computer board from the device tree, else that of the processor."""
+    """Return the name of the computer from the device tree, or the name of its processor."""
     try:
         board = Path("/proc/device-tree/model").read_text().strip("\0\n ")
         if board:

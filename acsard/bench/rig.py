@@ -48,9 +48,9 @@ END_S = 5.0
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
-    """Return an error that describes the unexpected end of the process `who`.
+    """Return an error which says that the process named `who` ended unexpectedly.
 
-    `code` is its return code, and `said` its own message, or "" without one.
+    `code` is the return code of the process, and `said` its error message or "".
     """
     return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
@@ -58,8 +58,8 @@ def ended(who: str, code: int, said: str = "") -> MendableError:
 def daemon_ended(code: int, log: Path) -> MendableError:
     """Return an error that says why the daemon ended by itself.
 
-    The error has the daemon's own message from the file `log`, and its exit code, if these are
-    known.
+    The error has the daemon's last message in the file `log`, if there is one. If the daemon's exit
+    code `code` is also known, the benchmark ends with that code.
     """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
@@ -78,7 +78,6 @@ def processor_ns(pid: int) -> int:
 
 
 def resident_mb(pid: int) -> float:
-    """Return the resident memory of a process, MB."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int(status.partition("VmRSS:")[2].split()[0]) / 1024
 
@@ -92,10 +91,10 @@ START_S = 15.0
 the board."""
 
 SETTLED = 10
-"""Number of odometry samples after which the link is up and the start is over."""
+"""Number of odometry samples after which the start of the daemon counts as complete."""
 
 LOOK_S = 0.5
-"""Interval at which the rig checks that all processes are running, s."""
+"""Interval at which the benchmark checks that all its processes are running, s."""
 
 FAR_END = "the simulated microcontroller's process"
 
@@ -115,8 +114,9 @@ class Rig:
         file: the configuration file of the measured program.
         words: the command line that starts the measured program.
         port: the serial port; "" starts a far end that simulates the board.
-        free_running: as `Part.free_running`.
-        wire_baud_rate: as `Part.baud_rate`.
+        free_running: period of the reports of a simulated board that reports without being asked,
+            s; 0 simulates a board that answers each line.
+        wire_baud_rate: baud rate of the simulated board; 0 means the configured one.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class Rig:
             time.sleep(0.01)
 
     def _why(self) -> str:
-        """Return the daemon's reason for its state, to complete an error; "" without a reply."""
+        """Return the reason of the daemon's mode for an error message; "" if it does not answer."""
         try:
             return f": {self.state().reason}"
         except NoAnswerError:
@@ -264,8 +264,8 @@ class Rig:
 
         Args:
             seconds: the duration, s.
-            wheel_speed: a function that returns the speed of all wheels, rad/s, for the number of a
-                command, which counts from 0.
+            wheel_speed: a function that takes the number of a command, which counts from 0, and
+                returns the speed of all wheels, rad/s.
             seed: the seed of the random intervals.
         """
         phases, number = random.Random(seed), 0
@@ -282,7 +282,10 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zeros until the daemon accepts one. It first checks the delays of a new sender."""
+        """Send zeros until the daemon accepts one.
+
+        The daemon ignores the first commands of a new sender while it checks their delays.
+        """
         before = self._counted()
 
         def look() -> bool | None:

@@ -1,4 +1,4 @@
-"""A calibration as text, as an object for programs, and as lines for `acsard.toml`."""
+"""Shows a calibration as text, as an object for `--json`, and as lines for `acsard.toml`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Refusal(Struct, frozen=True):
 
 
 class Report(Struct, frozen=True):
-    """The object that `--json` prints.
+    """The object that `--json` prints for a calibration.
 
     A field `..._error_before` gives the error with the configured multipliers, and
     `..._error_after` the error with the new multipliers. Both are measured on parts of the log that
@@ -49,7 +49,7 @@ class Report(Struct, frozen=True):
     reference: str
     """Sensors or measuring tool with which the wheels were compared, in words."""
     scale: str
-    """Sources of the size of the wheels, in words; "" if the mean radius stays as configured."""
+    """Measurements that show the size of the wheels; "" if the mean radius stays as configured."""
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
@@ -176,9 +176,9 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the standard deviations of heading (deg) and distance (m) that noise causes.
+    """Return the standard deviations of heading (deg) and distance (m) after `METRES`.
 
-    They are `NOTHING` if the noise settings stay as configured.
+    Noise causes them. They are `NOTHING` if the noise settings stay as configured.
     """
     noise = calibration.noise
     if noise is None or not noise.better:
@@ -205,7 +205,7 @@ def keys(calibration: Calibration) -> dict[str, object]:
 
 
 def odometry(calibration: Calibration) -> dict[str, float]:
-    """Return the settings of `[odometry]`, with `DIGITS` significant digits."""
+    """Return the new settings of `[odometry]` by name, rounded to `DIGITS` significant digits."""
     return {name: float(f"{value:.{DIGITS - 1}g}") for name, value in calibration.odometry.items()}
 
 

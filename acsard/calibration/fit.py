@@ -1,11 +1,11 @@
 """Fits the parameters of the calibration to the evidence of all sensors.
 
-The evidence of a sensor is the normal equations that it contributes. The fit is a Gauss-Newton fit
-on sums over blocks (a block is a few seconds of driving). The standard deviations come from a
-jackknife over the blocks (Quenouille and Tukey): each block is left out in turn, and the changes of
-the parameters show the effect of chance. These deviations are right even if the errors within a
-block are correlated. Each change is computed by one linear step from the whole fit. If there are
-few blocks, the standard deviation is widened to that of Student's t.
+The fit is a Gauss-Newton fit. The evidence of a sensor is its contribution to the normal equations,
+summed over each block (a few seconds of driving). The standard deviations come from a jackknife
+over the blocks (Quenouille and Tukey): each block is left out in turn, and the changes of the
+parameters show the effect of chance. These deviations are right even if the errors within a block
+are correlated. Each change is computed by one linear step from the whole fit. If there are few
+blocks, the standard deviation is widened to that of Student's t.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from acsard.core.config.settings import DriveConfig
 
 
 class P(IntEnum):
-    """Indices into the array of parameters, which contains `COUNT` numbers."""
+    """Indices of the fitted parameters in their array, which contains `COUNT` numbers."""
 
     LEFT = 0
     """Ratio of the left wheels' radius to the configured wheel radius."""
     RIGHT = 1
     """Ratio of the right wheels' radius to the configured wheel radius."""
     INVERSE_TRACK = 2
-    """Ratio of the wheel separation to the effective track. Turns are linear in this ratio."""
+    """Ratio of the configured wheel separation to the effective track. Turns are linear in it."""
     TRACK_GROWTH = 3
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     DELAY = 4
-    """Delay of the times of the positions relative to those of the wheels, s."""
+    """Delay of the positions' recorded times behind those of the wheels, s."""
     SENSOR_X = 5
     """Distance by which the position sensor is ahead of the robot's middle, m."""
     SENSOR_Y = 6
     """Distance by which the position sensor is to the left of the robot's middle, m."""
     BIAS_ERROR = 7
-    """Error of the gyro's bias, rad/s."""
+    """Gyro bias that remains after the bias measured at rest was subtracted, rad/s."""
     SCALE_ERROR = 8
-    """Error of the gyro's scale, a fraction."""
+    """Relative error of the gyro's scale: with 0.01, the gyro shows turns 1 % too large."""
 
 
 COUNT = len(P)
 
 HUBER = 2.0
-"""Huber's threshold: the weight of a residual falls above this multiple of the usual size."""
+"""Size of a residual, in standard deviations, above which it gets a smaller weight (Huber)."""
 
 
 class Base(Struct, frozen=True):
-    """The configured geometry, to which the parameters are relative. Lengths are in m."""
+    """The configured geometry, to which the fitted parameters are relative. Lengths are in m."""
 
     radius: float
     separation: float
@@ -65,14 +65,13 @@ class Base(Struct, frozen=True):
 
     @classmethod
     def of(cls, drive: DriveConfig) -> Base:
-        """Return the geometry of a configuration."""
         return cls(
             drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
             drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return the parameters that agree with the configured multipliers."""
+        """Return the parameters of the configured multipliers; all other parameters are 0."""
         return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - P.TRACK_GROWTH)])
 
     @property
@@ -106,11 +105,14 @@ class Evidence(Struct, frozen=True):
 def of_rows(
     jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
 ) -> Evidence:
-    """Return the evidence of one sensor from its rows, summed by block.
+    """Return the evidence of one sensor from its measurements, summed by block.
 
-    Each row gives the derivatives of its prediction (`jacobian`, shape (rows, COUNT)), its measured
-    minus its predicted value (`residual`), its weight and the number of its block. `blocks` is the
-    number of blocks.
+    Args:
+        jacobian: derivatives of each prediction by the parameters, shape (measurements, COUNT).
+        residual: measured minus predicted values.
+        weight: weights of the measurements.
+        block: number of the block of each measurement.
+        blocks: number of blocks.
     """
     normal = np.zeros((blocks, COUNT, COUNT))
     score = np.zeros((blocks, COUNT))
@@ -125,7 +127,7 @@ def of_rows(
 def condition(normal: Floats) -> float:
     """Return the condition number of normal equations, independent of the parameters' units.
 
-    It is infinite if the equations do not contain one of the parameters.
+    It is infinite if one of the parameters does not occur in the equations.
     """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
@@ -134,9 +136,9 @@ def condition(normal: Floats) -> float:
 
 
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
-    """Return Huber's weight of each residual: 1 up to `HUBER` usual sizes, less for an outlier.
+    """Return Huber's weight of each residual: 1 up to `HUBER` standard deviations, above it less.
 
-    The usual size is the standard deviation, estimated from the median, and at least `least`.
+    The standard deviation is estimated from the median of the sizes, and is at least `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
@@ -144,11 +146,11 @@ def huber(residuals: Floats | Complexes, least: float) -> Floats:
 
 
 Source = Callable[[Floats], Evidence]
-"""Function from parameters to the evidence of one sensor."""
+"""Function that returns the evidence of one sensor for given parameters."""
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Limits for the change of the radii and the track in one step of the fit.
+"""Limits for the relative change of the radii and the track in one step of the fit.
 
 A step below `SMALL` ends the fit. The fit has converged if its last step is below `SETTLED`.
 """
@@ -178,7 +180,7 @@ MANY = 16
 """Minimum number of blocks for a jackknife that also leaves out pairs of neighbouring blocks."""
 
 LEAST_BLOCKS = 5
-"""Minimum number of blocks, or of runs, that a jackknife needs to show how much they differ."""
+"""Minimum number of blocks, or of runs, for a jackknife that leaves out one of them in turn."""
 
 
 def student_factor(free: Floats | float) -> Floats:
@@ -207,7 +209,7 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters without the evidence of the blocks in the mask `blocks`.
+        """Return the parameters that fit the evidence without the blocks in the mask `blocks`.
 
         They are computed from the fit to all blocks by one linear step.
         """
@@ -219,8 +221,8 @@ class Fit(Struct, frozen=True):
     def marginal(self) -> Floats:
         """Return the normal equations of both radii and the inverse track.
 
-        All other parameters are eliminated. If no sensor measures the mean radius, the equations
-        have only two unknowns: the difference of the radii, and the inverse track.
+        The other parameters are eliminated. If no sensor measures the mean radius, there are only
+        two unknowns: the difference of the radii, and the inverse track.
         """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > P.INVERSE_TRACK]
@@ -253,10 +255,10 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return how the parameters change without each group of blocks, and their variances.
+        """Return the changes of the parameters without each group, and the parameters' variances.
 
-        `group` gives the number of the group of each block. The variances are those of the
-        jackknife, widened to those of Student's t. A variance that a few groups cause has few
+        `group` gives the number of the group of each block. The variances are those of a jackknife
+        over the groups, widened to those of Student's t. If few groups cause a variance, it has few
         degrees of freedom. Their number is Satterthwaite's estimate (An approximate distribution of
         estimates of variance components, 1946).
         """
@@ -313,10 +315,10 @@ def fit(
 
 
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
-    """Return the sums of the normal equations and of the scores of all sensors.
+    """Return the weighted sums of the normal equations and of the scores of all sensors.
 
     The weight of a sensor follows from the scatter of its scores from block to block. Unlike the
-    residuals themselves, this scatter shows how much less information correlated residuals contain.
+    size of the residuals, this scatter becomes larger if the residuals are correlated.
     """
     normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
     for part in evidence:
@@ -357,6 +359,5 @@ def _known(
 
 
 def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
-    """Solve normal equations for the parameters with the indices `active`."""
     part = normal[np.ix_(active, active)]
     return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])

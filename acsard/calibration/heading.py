@@ -1,8 +1,7 @@
-"""Evidence from a heading sensor: a gyro, or the yaw of a source of positions.
+"""Compares the turns of the wheels with a heading sensor: a gyro, or the yaw of a position source.
 
-The turns of the sensor are compared with the turns of the wheels. The equation is that of
-Antonelli, Chiaverini & Fusco (A calibration method for odometry of mobile robots based on the
-least-squares technique, 2005):
+The comparison uses the equation of Antonelli, Chiaverini & Fusco (A calibration method for odometry
+of mobile robots based on the least-squares technique, 2005):
 
     turn = g_r phi_r - g_l phi_l,    g_r = R_r / L,    g_l = R_l / L
 
@@ -29,7 +28,7 @@ In the margin, the robot may still shake.
 """
 
 TURNED_BY_HAND = 0.05
-"""Largest difference between the bias in a rest and the median bias, rad/s.
+"""Largest difference between the gyro bias in a rest and the median bias of all rests, rad/s.
 
 A larger difference shows that a person turned the robot, so the rest is not used.
 """
@@ -38,25 +37,22 @@ LEAST_SAMPLES = 5
 """Minimum number of gyro samples in a rest."""
 
 OUTLIER = 6.0
-"""Multiple of the median deviation above which a gyro sample at rest is left out."""
+"""Deviation of a gyro sample at rest, in median deviations, above which it is left out."""
 
 WALK = 5e-5
 """Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
 
 UNSEEN_WALK = 2e-4
-"""Random walk assumed for the gyro bias if no run has two rests.
-
-It is in rad/s per square root of a second.
-"""
+"""Random walk of the gyro bias if no run has two rests, rad/s per square root of a second."""
 
 ROW_S = 1.0
 """Approximate length of the intervals over which turns are compared, s."""
 
 GRID_S, FURTHEST_S = 0.02, 2.0
-"""Step and range of the search for the sensor's delay, s."""
+"""Step of the search for the heading sensor's delay, and the largest delay that it tries, s."""
 
 DEGREES = 10.0
-"""Ratio of the turns of a yaw to those of the wheels above which the yaw must be in degrees."""
+"""Ratio of the yaw's turns to the wheels' turns above which the yaw must be in degrees."""
 
 
 class Heading(Struct, frozen=True):
@@ -80,9 +76,9 @@ class Headings(Struct, frozen=True):
     delay: float
     """Delay of the sensor's times behind those of the wheels for the same event, s."""
     bias: float
-    """Median of the gyro's bias in all rests, rad/s; 0 without a gyro.
+    """Median of the gyro's bias in all rests, rad/s; 0 without a gyro or without a rest.
 
-    The correction of the turn rates does not use this median, but interpolates between the rests.
+    The turn rates of a run with rests are corrected by the bias interpolated between its rests.
     """
     bias_unknown: bool
     """Whether the robot never rested, so that only a comparison with the wheels shows the bias."""
@@ -97,21 +93,21 @@ TURNING = 0.05
 """Turn rate up to which the robot is considered to drive straight, rad/s."""
 
 FASTEST = 0.95
-"""Fraction of the whole turned angle that the robot turned at a rate below `Rates.fastest`."""
+"""Fraction of the robot's turned angle that it turned at a rate below `Rates.fastest`."""
 
 
 class Rows(Struct, frozen=True):
     """The motion of the robot in intervals of about a second."""
 
     block: npt.NDArray[np.int64]
-    """Number of the block of each interval."""
+    """Number of the block (a few seconds of driving) to which each interval belongs."""
     turned: Floats
     """Turn according to the heading sensor, rad; 0 without one."""
     left: Floats
     """Angle by which the left wheels rolled, rad."""
     right: Floats
     fast: Floats
-    """Integral of |w| w, rad2/s, where w is the speed of the right minus the left wheels, rad/s.
+    """Integral of |w| w over each interval, rad2/s. w is the right minus the left wheels' speed.
 
     If the track grows with the turn rate, the turn changes in proportion to this integral.
     """
@@ -125,7 +121,7 @@ class Rates(Struct, frozen=True):
     mean: float
     """Mean turn rate, weighted by the turned angle."""
     fastest: float
-    """Rate below which the robot turned the fraction `FASTEST` of the angle."""
+    """Rate of the fastest turns: the robot turned 95 % of its angle (`FASTEST`) more slowly."""
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
@@ -248,8 +244,8 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    `found` contains the sensor's heading of each run. A turn of the wheels is the difference of
-    both sides. If the sign of one side is wrong, it is the sum, so the function tries both.
+    `found` contains the sensor's heading of each run. The turn of the wheels is proportional to the
+    right minus the left angle. In case one side has the wrong sign, the sum is tried as well.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -287,10 +283,10 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Divide the blocks `parts` into rows of about `ROW_S` s, and return the motion in each row.
+    """Divide the blocks `parts` into intervals of about `ROW_S` s, and return the motion in each.
 
-    A row is left out if the heading sensor has no samples there. If `headings` is None, all rows
-    are returned.
+    An interval is left out if the heading sensor has no samples there. If `headings` is None, there
+    is no sensor, and all intervals are returned.
     """
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
@@ -316,7 +312,7 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of a log. `by_wheels` is the turn of the wheels in each row, rad."""
+    """Return the turn rates of a log. `by_wheels` is the wheels' turn in each interval, rad."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -330,7 +326,7 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def level(rows: Rows) -> Rows:
-    """Return the rows without the part of the motion that is proportional to time.
+    """Return `rows` without the part of each column that is proportional to time.
 
     An unknown constant gyro bias then has no effect on a comparison with the wheels.
     """
@@ -349,29 +345,32 @@ def _fast(run: Run) -> Floats:
 
 
 NOISE, SHARE = 0.01, 0.03
-"""The two parts of a row's usual residual: `NOISE` rad/s, and the fraction `SHARE` of its turn.
+"""Usual difference between the sensor's and the wheels' turn in an interval of the log.
 
-The usual residual is the root of the sum of their squares. A row with a much larger residual is an
-outlier.
+It is the root of the sum of two squares: `NOISE` rad/s over the interval, and the fraction `SHARE`
+of the turn. A much larger difference is an outlier.
 """
 
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """Return the robot's turn in each row, rad, computed from the wheels and these parameters."""
+    """Return the turn in each interval, rad, that the wheels and these parameters give."""
     left, right, inverse, growth = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
     constant = base.gain * inverse * (right * rows.right - left * rows.left)
     return np.asarray(constant + growth * _by_growth(rows, base, parameters))
 
 
 def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """Return the derivative of each row's turn with respect to TRACK_GROWTH, rad2/s."""
+    """Return the derivative of the turn in each interval with respect to TRACK_GROWTH, rad2/s."""
     left, right, inverse = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK]]
     gain = base.gain * inverse * (left + right) / 2
     return np.asarray(-gain * abs(gain) * rows.fast)
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence of the rows at these parameters. `blocks` is the number of blocks."""
+    """Return the evidence of a heading sensor: how its turns in `rows` contribute to the fit.
+
+    The evidence is linearized at `parameters`. `blocks` is the number of blocks of the log.
+    """
     turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), COUNT))
@@ -389,14 +388,14 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
 
 
 def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
-    """Return Huber's weight of each row. `by_wheels` contains the turns of the wheels, rad."""
+    """Return Huber's weight of each interval. `by_wheels` contains the turns of the wheels, rad."""
     return huber(residual / np.hypot(NOISE * rows.seconds, SHARE * by_wheels), 1.0)
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the bias of the heading sensor, rad/s: its turn rate minus that of the wheels.
+    """Return the bias of the gyro, rad/s: its mean turn rate minus that of the wheels.
 
-    `by_wheels` contains the turn of the wheels in each row, rad.
+    `by_wheels` contains the turn of the wheels in each interval of `rows`, rad.
     """
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
@@ -409,9 +408,9 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 def first(rows: Rows, base: Base) -> Floats:
     """Return the factors of the left and of the right wheels that fit the sensor's turns best.
 
-    A factor is radius / effective track (g_l and g_r in the module's equation), divided by
-    `base.gain`. The robust least-squares fit needs no starting values. A negative factor means that
-    the sign of this side's wheels, or of the sensor, is wrong.
+    A factor is wheel radius / effective track, divided by `base.gain`. A negative factor means that
+    the sign of this side's wheels, or of the sensor, is wrong. The robust least-squares fit needs
+    no starting values.
     """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))
@@ -425,5 +424,5 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the turn of the wheels in each row, rad. `sides` contains the factors from `first`."""
+    """Return the wheels' turn in each interval, rad. `sides` contains the factors from `first`."""
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

@@ -1,9 +1,9 @@
-"""The improvement that a calibration brings, measured on whole drives that the fit did not use.
+"""Measures the improvement that a calibration brings, on drives that the fit did not use.
 
-Each run is left out in turn: the parameters are fitted without it, and then tested on it. If the
-log has fewer than three runs, each fifth of the log is left out instead. The errors in these tests
-decide between several fits. A calibration never proposes values that are worse in these tests than
-the configured ones.
+This is a cross-validation. Each run (one drive in the log) is left out in turn: the parameters are
+fitted to the other runs, and the odometry error is measured on this run. If the log has fewer than
+three runs, each fifth of the log is left out instead. The errors decide between several fits. The
+configured values are kept unless the new ones are surely better.
 """
 
 from __future__ import annotations
@@ -26,17 +26,20 @@ LEAST_RUNS = 3
 """Minimum number of runs for leaving out whole runs. With fewer, fifths of the log are left out."""
 
 STRAIGHT = 0.1
-"""Largest curvature, according to the wheels, at which a drive counts as straight, rad/m."""
+"""Largest curvature of straight driving, rad/m: turn divided by distance, by the wheels."""
 
 STRAIGHT_M = 1.0
-"""Minimum total length of the straight drives, m. If they are shorter, their error is not given.
+"""Distance of straight driving in a log, m, below which its heading error is not reported.
 
-The error is given per 10 m, and an extrapolation from a few millimetres would be noise.
+The error is reported per 10 m, and an extrapolation from a few millimetres would be noise.
 """
 
 
 class BeforeAfter(Struct, frozen=True):
-    """An error with the configured and the new multipliers. Both are None if no sensor shows it."""
+    """One odometry error, with the configured and with the new multipliers of radii and track.
+
+    Both numbers are None if the log does not show this error.
+    """
 
     before: float | None
     """The error with the configured multipliers."""
@@ -47,24 +50,25 @@ class BeforeAfter(Struct, frozen=True):
 NOTHING = BeforeAfter(None, None)
 
 SURE = 2.0
-"""Number of standard deviations by which a gain must exceed 0 to be sure (95 % confidence)."""
+"""Number of standard deviations by which a gain must exceed 0 to count as sure (95 %)."""
 
 HALVED = float(np.log(2.0))
-"""Gain at which the error is halved. It is sure even if its standard deviation is large.
+"""The value of `Improvement.gain` if the calibration halves one error. It always counts as sure.
 
-In a guided drive, a single leg may show nearly all of the error, so the deviation is large.
+In a guided drive, one leg may show nearly all of the error. The standard deviation of the gain is
+then large although the gain is real.
 """
 
 NEAR, FAR = 2.0, 3.0
-"""Distances of the new multipliers from the configured ones, in standard deviations.
+"""Limits for the distance of the new multipliers from the configured ones, in standard deviations.
 
-Up to `NEAR`, the log does not contradict the configured multipliers. Chance causes a distance
-above `FAR` in one log of thirty. Above `FAR`, the smallest gain that is sure falls with the
-distance: at twice `FAR` it is half as large.
+Up to `NEAR`, the log does not contradict the configured multipliers, so they are kept. Chance
+causes a distance above `FAR` in one log of thirty. Above `FAR`, a smaller gain is enough to accept
+the new multipliers: at twice `FAR`, half of the usual gain.
 """
 
 LEAST_SQUARE = 1e-9
-"""Constant, m2 or deg2, that is added to both sums of squared errors so that neither is 0."""
+"""Constant, m2 or deg2, that is added to sums of squared errors so that their logarithm exists."""
 
 
 class Improvement(Struct, frozen=True):
@@ -75,19 +79,23 @@ class Improvement(Struct, frozen=True):
     straight: BeforeAfter
     """Heading error after 10 m straight ahead, deg: the turn that the wheels do not show.
 
-    It is None if the straight drives together are shorter than `STRAIGHT_M`.
+    Both numbers are None if the log has less than `STRAIGHT_M` of straight driving.
     """
     heading: BeforeAfter
-    """RMS error of the heading over whole drives, deg. Each drive is rotated to fit best."""
+    """RMS error of the heading over whole drives, deg, after each drive was rotated to fit best."""
     place: BeforeAfter
-    """RMS error of the position over whole drives, m. Each drive is shifted and rotated to fit."""
-    gain: float = np.inf
-    """Logarithm of the ratio of the error before to the error after, over whole drives.
+    """RMS error of the position over whole drives, m.
 
-    If the log has headings and positions, it is the sum of both logarithms.
+    The path of each drive is first shifted and rotated so that it fits the positions best.
+    """
+    gain: float = np.inf
+    """Natural logarithm of the error before divided by the error after; inf if not computed.
+
+    The errors are RMS errors over whole drives. If the log has headings and positions, the two
+    logarithms are added.
     """
     chance: float = 0.0
-    """Standard deviation of `gain`, from the differences between drives.
+    """Standard deviation of `gain`, from the differences between drives; inf for a single drive.
 
     If there are few drives, it is widened to that of Student's t.
     """
@@ -105,7 +113,7 @@ UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
 
 
 class Fold(Struct, frozen=True):
-    """A drive that is left out, and the parameters of a fit without it."""
+    """One step of the cross-validation: a drive that is left out, and the fit without it."""
 
     drive: Block
     blocks: Mask
@@ -114,7 +122,7 @@ class Fold(Struct, frozen=True):
 
 
 def drives(driven: Sequence[Run]) -> list[Block]:
-    """Return the drives that are left out in turn: whole runs, or fifths of the log."""
+    """Return the drives to leave out in turn: whole runs, or fifths of a log with few runs."""
     longest = np.inf
     if len(driven) < LEAST_RUNS:
         longest = sum(float(run.t[-1]) for run in driven) / FOLDS
@@ -134,11 +142,11 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 
 
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
-    """Return a fold for each drive of `left_out`.
+    """Return the fold of each drive in `left_out`, with the parameters of `fit` without this drive.
 
-    Its parameters are those of `fit` without the blocks that overlap the drive. Their track is
-    constant, and fits the mean of the turn rates `rate`. `parts` contains all blocks of the fit. A
-    drive that overlaps no block, or all of them, has no fold.
+    `parts` contains the blocks of the fit (a few seconds of driving each). A fold leaves out the
+    blocks that overlap its drive. If no block or every block overlaps, the drive gets no fold.
+    `with_constant_track` adapts the track of each fold to the turn rates `rate`.
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
@@ -152,9 +160,10 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
-    """Return the parameters with the track at the mean turn rate, constant for all turn rates.
+    """Return the parameters with a track that is the same for all turn rates.
 
-    The odometry also uses one track for all turn rates.
+    It is the fitted track at the mean turn rate of the log. The odometry of the daemon also uses
+    one track for all turn rates.
     """
     fixed = parameters.copy()
     fixed[P.INVERSE_TRACK] *= 1.0 - fixed[P.TRACK_GROWTH] * rate.mean
@@ -166,15 +175,15 @@ def improvement(
     held: Sequence[Fold], configured: Floats, base: Base, rows: Rows,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Improvement:  # fmt: skip
-    """Return the errors before and after the calibration.
+    """Return the odometry errors before and after the calibration, on drives that were left out.
 
     Args:
-        held: the folds of the fit.
+        held: the folds: each drive, with the parameters that were fitted without it.
         configured: the parameters with the configured multipliers.
         base: the configured geometry.
-        rows: the log's rows, with the turns of the heading sensor. Without a sensor they are 0.
-        places: for each fold, the measured positions of the drive that it left out.
-        steps: the wheel steps of each run.
+        rows: the motion in intervals of about a second. The measured turns are 0 without a sensor.
+        places: for each fold, the measured positions of its drive.
+        steps: the wheel steps of each run; empty if the log has no positions.
     """
     by_wheels = turned(rows, base, configured)
     before = rows.turned - by_wheels
@@ -205,9 +214,9 @@ def improvement(
 
 
 def rms(sums: Floats) -> BeforeAfter:
-    """Return the RMS errors before and after.
+    """Return the RMS errors before and after the calibration.
 
-    `sums` contains the sum of squares before, the sum of squares after, and the number of samples.
+    `sums` contains the sum of squared errors before, the same sum after, and the number of samples.
     """
     before, after, count = sums.tolist()
     if not count:
@@ -216,10 +225,10 @@ def rms(sums: Floats) -> BeforeAfter:
 
 
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
-    """Return the errors before and after, scaled to a drive over the angle or distance `unit`.
+    """Return the errors before and after the calibration, in proportion to the driven amount.
 
-    `sums` contains the sum of errors before, the sum of errors after, and the angle or distance
-    that was driven.
+    `sums` contains the sum of errors before, the same sum after, and the angle or distance driven.
+    Their ratios are multiplied by `unit`: 360 gives deg for each full turn.
     """
     before, after, amount = sums.tolist()
     if not amount:
@@ -230,8 +239,8 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     """Return `Improvement.gain` and `Improvement.chance`.
 
-    `kinds` contains one array for each kind of error. Its row for each drive gives the sum of
-    squares before, the sum of squares after, and the number of samples.
+    `kinds` contains one array for each kind of error. Each row of an array belongs to a drive: the
+    sum of squared errors before, the same sum after, and the number of samples.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -245,10 +254,10 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 
 
 def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
-    """Return the gain of the drives in the mask `drives`, and its standard deviation.
+    """Return `gain(drives)` and its standard deviation, which is infinite for a single drive.
 
-    `gain` is the function that computes the gain of the drives in a mask. The standard deviation is
-    that of the jackknife over the drives. It is infinite for a single drive.
+    `gain` is a function of a mask of drives. The standard deviation is that of a jackknife: each
+    drive is left out in turn. It is widened to that of Student's t.
     """
     count = int(drives.sum())
     if count == 1:
@@ -263,8 +272,8 @@ def _by_group(
 ) -> Floats:
     """Return the sum of the groups' absolute errors before, the same sum after, and `amount`.
 
-    `before` and `after` contain the error of each row, and `group` the number of its group. The
-    error of a group is the sum over its rows. Only the rows in the mask `among` are used.
+    `before` and `after` contain the error of each interval, and `group` the number of its group.
+    The error of a group is the sum over its intervals. Only those in the mask `among` are used.
     """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
@@ -274,7 +283,7 @@ def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows
     """Return the sums of squared heading errors before and after, deg2, and their number.
 
     The result has a row for each fold. `before` and `after` contain the error of the turn in each
-    of the `rows`, rad.
+    interval of `rows`, rad.
     """
     found = np.zeros((len(held), 3))
     for number, fold in enumerate(held):
@@ -306,7 +315,7 @@ def _of_positions(
 
 
 def no_better(found: Improvement) -> str:
-    """Return the message that the new multipliers are not surely better. It states both errors."""
+    """Return the message of a calibration whose new multipliers are not surely better."""
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} then"
         for name, error, unit, factor in (

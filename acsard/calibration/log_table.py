@@ -34,10 +34,10 @@ RATE = {f"{unit}/s": size for unit, size in ANGLE.items()} | TURNS
 
 SPEED = {f"{unit}/s": size for unit, size in LENGTH.items()}
 APPLIED = "applied_linear", "applied_angular"
-"""Columns of the commanded twist, in m/s and rad/s."""
+"""Columns of the twist that the daemon commands to the wheels, in m/s and rad/s."""
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
-"""Factors from known units to SI, by column. Columns that are not listed have units of `RATE`."""
+"""Factors from known units to SI, by column. All other columns have the units of `RATE`."""
 
 SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad", APPLIED[0]: "m/s"}
 
@@ -59,7 +59,7 @@ def parted(cell: str) -> tuple[str, str]:
 def factor(name: str, unit: str) -> float | None:
     """Return the factor from a unit of the column `name` to SI, or None for an unknown unit.
 
-    If `unit` is "", the column is in SI units.
+    "" means that the column is in SI units.
     """
     known = UNITS.get(name, RATE)
     return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
@@ -71,10 +71,10 @@ WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Absolute values above which a value is impossible, in the SI unit of its column.
+"""Largest possible absolute value of a cell, in the SI unit of its column.
 
-`BOUNDS` lists them by column, and `PLACE_BOUND` is for all other columns. Values in degrees and
-nanoseconds stay below these bounds, so that later checks can name the wrong unit.
+`BOUNDS` lists the limits by column, and `PLACE_BOUND` is that of all other columns. Values in
+degrees or nanoseconds stay below the limits, so that later checks can name the wrong unit.
 """
 
 RATES = frozenset((*WHEELS, "yaw_rate"))
@@ -83,9 +83,9 @@ RATES = frozenset((*WHEELS, "yaw_rate"))
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as each of its neighbours and as the usual rate. Only
-the fraction `FEW_VALUES` of the rates above `SLOW` rad/s exceeds this usual rate. A robot that
-rarely moves can also exceed the usual rate by this factor, but not in a single sample.
+A spike is more than `SPIKE` times as large as each of its neighbours and as the usual rate. Of the
+rates above `SLOW` rad/s, only the fraction `FEW_VALUES` exceeds the usual rate. A true motion can
+also be this much faster than usual, but never for a single sample.
 """
 
 
@@ -109,11 +109,11 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 
 
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Return a mask of the rows that are spikes. `order` contains their indices, sorted by time.
+    """Return a mask of the values that are spikes. `order` contains the indices sorted by time.
 
     A spike stands out from its neighbours both in the order of the file and in the order of time.
-    If rows are shuffled or come from several drives, a true turn may stand out in one of these
-    orders.
+    In one of these orders alone, a true value may stand out as well, for example if the file is
+    shuffled.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]
@@ -149,18 +149,18 @@ MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a"
 """Contents of a cell without a value, in lower case."""
 
 COUNTS = re.compile(r"tick|count|(?:^|_)enc")
-"""Pattern for names of columns with encoder counts. Renaming such a column does not help."""
+"""Pattern for names of columns with encoder counts, which the user must convert to speeds."""
 
 COMMENTS = ("#", "%")
 """First characters of the comment lines above the table."""
 
 BEHIND = re.compile(r"(?:^|\s)#")
-"""Pattern for the start of a comment after a number. It does not match "1.#QNAN"."""
+"""Pattern for the start of a comment after a number, but not for "1.#QNAN", which means NaN."""
 
 FEW, SHARE = 3, 0.01
 """Limits for unreadable rows: a number of rows, and a fraction of the readable rows.
 
-The larger limit applies. A file with more unreadable rows is refused.
+The larger of the two limits applies. A file with more unreadable rows is refused.
 """
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
@@ -177,7 +177,7 @@ class RefusedError(AcsardError):
 
 
 def noted(error: Exception, notes: Iterable[str]) -> None:
-    """Add the notes about a log to an error, because they may explain it."""
+    """Add the notes about a log to an error, because the notes may explain the error."""
     for note in notes:
         error.add_note(note)
 
@@ -317,7 +317,7 @@ def _columns(header: list[str], number: int) -> list[str]:
 
 
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
-    """Return a hint at a column of `header` that is probably one of the missing `names`, or ""."""
+    """Return a hint at a column of `header` that may be one of the missing `names`, or ""."""
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (is {times[0][:40]} it? rename it t, in s)"

@@ -1,8 +1,8 @@
-"""The multipliers that the parameters of a fit give, and their correction by a tape measure.
+"""Computes the multipliers from the parameters of a fit, and corrects them by a tape measure.
 
 The multipliers scale the configured wheel separation and wheel radii. A log of turn rates alone
-shows the ratios of the multipliers. A distance that was measured by tape shows how large the wheels
-are.
+shows only the ratios of the multipliers. A distance that was measured by tape shows how large the
+wheels are.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SAME = 1e-4
 
 
 class Deviations(Struct, frozen=True):
-    """Standard deviations of the geometry, as fractions."""
+    """Relative standard deviations of the robot's geometry: track and wheel radii."""
 
     track: float
     """Relative standard deviation of the ratio of effective track to mean radius."""
@@ -67,10 +67,9 @@ class Multipliers(Struct, frozen=True):
         return self.own().ratio
 
     def apart(self, base: Base) -> float:
-        """Return how far these multipliers are from the configured ones, in standard deviations.
+        """Return how far these multipliers are from those of `base`, in standard deviations.
 
-        A combination of multipliers that no sensor measures is equal in both sets, and adds
-        nothing.
+        A combination of multipliers that no sensor measures stays as configured: it adds nothing.
         """
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
@@ -78,7 +77,7 @@ class Multipliers(Struct, frozen=True):
     def own(self) -> Deviations:
         """Return the standard deviations of these multipliers in the form that `[odometry]` uses.
 
-        The odometry treats the three deviations as independent.
+        The odometry treats the errors of track, ratio and scale as independent.
         """
         shares = self.covariance / np.outer(self.values, self.values)
         rows = np.array([[1.0, -0.5, -0.5], [0.0, -1.0, 1.0], [0.0, 0.5, 0.5]])
@@ -94,9 +93,8 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
     """Return the multipliers that fit best at the turn rates of the log.
 
     `parameters` and `covariance` are those of a fit, and `rate` gives the turn rates of the log.
-    The variance of the track is that of the constant track that fits best at these rates. It does
-    not cover the differences in skidding from turn to turn: these belong to the noise of the
-    odometry.
+    The multiplier of the separation describes a track that is the same for all turn rates. Its
+    variance does not cover skidding that differs from turn to turn, which is noise of the odometry.
     """
     inverse, growth = parameters[P.INVERSE_TRACK], parameters[P.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -117,18 +115,18 @@ It includes the error with which a person chooses the point on the robot.
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
 """Limits for the difference between a distance by tape and the same distance by positions.
 
-They are a fraction of the distance, and a number of standard deviations. If the difference exceeds
-both, one of the distances is wrong.
+The limits are a fraction of the distance, and a number of standard deviations. If the difference
+exceeds both limits, one of the distances is wrong.
 """
 
 UNKNOWN = 1.0
-"""Standard deviation of the logarithm of the scale if no sensor has measured the scale."""
+"""Standard deviation of the logarithm of the wheels' size if no sensor has measured the size."""
 
 LEAST_M = 0.5
 """Shortest distance between start and end of a run, m, that a tape may measure."""
 
 STRAIGHT = 0.8
-"""Minimum of `Extent.straight` for a run whose distance a tape may measure."""
+"""Smallest distance / path length (`Extent.straight`) of a run that may be measured by tape."""
 
 
 class Tape(Struct, frozen=True):
@@ -154,9 +152,9 @@ class Extent(Struct, frozen=True):
 
 
 Follow = Callable[[Floats, int], Extent]
-"""Function that computes the extent of a run.
+"""Function that computes the extent of a run's path.
 
-Its arguments are multipliers, as in `Multipliers.values`, and the number of the run.
+Its arguments are the multipliers, as in `Multipliers.values`, and the number of the run.
 """
 
 
@@ -171,8 +169,8 @@ def scaled(
         found: the multipliers before the correction.
         tape: the distance.
         names: the names of the runs.
-        follow: the function that computes the extent of a run.
-        known: whether positions have already measured the scale.
+        follow: the function that computes the extent of a run's path.
+        known: whether positions have already shown the size of the wheels.
 
     Returns:
         The corrected multipliers, and the name of the run that the distance belongs to.

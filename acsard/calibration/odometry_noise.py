@@ -1,9 +1,8 @@
-"""Fits the noise of `[odometry]` to drives that the fit of the geometry did not use.
+"""Fits the noise settings of `[odometry]` to drives that the fit of the geometry did not use.
 
 A window is about half a minute of a drive. Its residuals are the headings or the positions of a
 sensor minus those of the wheels, at times that lie seconds apart. An error that lasts for a whole
-turn therefore has the same effect as in a whole drive. For example, a track that changes with the
-turn rate causes such an error.
+turn, such as that of a track that changes with the turn rate, is therefore seen as a whole.
 
 The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
 contains one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is
@@ -41,20 +40,20 @@ from acsard.core.config.settings import OdometryConfig
 
 
 class Source(IntEnum):
-    """Indices of the sources of noise. Up to `TRACK` the source is the robot, after it a sensor."""
+    """Sources of noise, as indices of arrays: the robot's up to `TRACK`, then those of sensors."""
 
     DISTANCE = 0
-    """Variance of the distance per metre, m."""
+    """Variance of the distance per metre driven, m2/m."""
     YAW = 1
-    """Variance of the heading per metre that a side rolls, rad2/m."""
+    """Variance of the heading per metre that the two sides roll on average, rad2/m."""
     SKID = 2
-    """Variance of the heading per radian turned, rad."""
+    """Variance of the heading per radian turned, rad2/rad."""
     SLIP = 3
-    """Variance of the fraction of the distance that is lost. It is constant within a window."""
+    """Variance of the fraction of the distance that is lost in a window (half a minute)."""
     RATIO = 4
-    """Relative variance of the ratio of both radii. The ratio is constant within a window."""
+    """Relative variance of the ratio of both wheel radii from window to window (half a minute)."""
     TRACK = 5
-    """Relative variance of the effective track. The track is constant within a window."""
+    """Relative variance of the effective track from window to window (half a minute)."""
     HEADING = 6
     """Variance of a measured heading, rad2."""
     DRIFT = 7
@@ -67,16 +66,16 @@ COUNT = len(Source)
 SENSORS = np.arange(COUNT) > Source.TRACK
 RATES = np.arange(COUNT) < Source.SLIP
 START = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
-"""Noise by `Source`, from which the search starts. The numbers only have to be positive."""
+"""Noise of each `Source` from which the search starts. The numbers only have to be positive."""
 
 WINDOW_S, APART_S = 32.0, 4.0
-"""Length of a window and time between its residuals, s. A shorter drive is one window."""
+"""Length of a window, and time between its residuals, s. A shorter drive is one window."""
 
 LEAST = 4
 """Minimum number of intervals between the residuals of a window."""
 
 MOST_WINDOWS = 80
-"""Largest number of windows that are used. A longer log contributes every n-th of its windows."""
+"""Largest number of windows that are used. From a longer log, only every n-th window is used."""
 
 FINE_S = 0.5
 """Length of the steps into which the motion of a window is divided, s.
@@ -91,41 +90,44 @@ STEPS, FEWER_STEPS = 150, 60
 """Number of steps of a search, and of a search that starts from the noise of the whole log."""
 
 OUTLIER = 9.0
-"""Mean square of a window's normalized residuals above which the window has a smaller weight."""
+"""Mean square of a window's normalized residuals above which the window weighs less."""
 
 ROUNDING = 1e-12
 """Variance that is added to each residual, so that a perfect sensor has a regular covariance."""
 
 FLOOR = 0.25
-"""Minimum of each variance rate in the result, as a multiple of the rate's standard deviation.
+"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a multiple of its standard deviation.
 
-In a log of a minute, the geometry often explains all errors, and the fit finds a rate of 0. The
+In a log of a minute, the geometry often explains all errors, and the fit finds a noise of 0. The
 covariance of the pose would then claim that some directions have no error at all.
 """
 
 CHANGES = 0.1
-"""Minimum of each variance rate, as a fraction of the rate to which lasting noise corresponds.
+"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a fraction of `SLIP`, `RATIO` and `TRACK`.
 
-Lasting noise is `SLIP`, `RATIO` or `TRACK`. `Windows.lasting` gives the factor from it to the rate
-with the same effect. A window does not show how long an error lasts beyond the window's end.
-Without this minimum, the pose covariance of one robot in eight had no width in some direction.
+`Windows.lasting` converts the last three to the units of the first three. A window does not show
+how long an error lasts beyond the window's end. Without this minimum, the pose covariance of one
+robot in eight had no width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
-"""Gain of log likelihood per residual that is significant even if its deviation is large.
+"""Gain of log likelihood per residual that counts as sure, whatever its standard deviation is.
 
-A residual whose stated standard deviation is twice the true one loses this much likelihood.
+A stated standard deviation of twice the true one loses this much likelihood per residual.
 """
 
 MOST = 1.0
-"""Largest value of a setting in the result. The configuration accepts it for every setting."""
+"""Largest value of a proposed setting. The configuration accepts this value for every setting."""
 
 METRES = 10.0
-"""Distance for which the uncertainty that noise causes is reported, m."""
+"""Distance for which the report states the uncertainty that noise causes, m."""
 
 
 class Windows(Struct, frozen=True):
-    """Windows with n residuals each. A smaller window is padded with residuals without effect."""
+    """The windows of a log (half a minute each). All are padded to the same number n of residuals.
+
+    The padding has no effect.
+    """
 
     drive: npt.NDArray[np.int64]
     """Number of the drive of each window."""
@@ -138,7 +140,7 @@ class Windows(Struct, frozen=True):
     known: Floats
     """Covariance of the residuals from the known uncertainties, shape (windows, n, n)."""
     lasting: Floats
-    """Factors from lasting noise to a variance rate with the same effect over a mean window.
+    """Factors that convert noise of one source to another with the same effect in a mean window.
 
     They convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad).
     """
@@ -151,13 +153,14 @@ class Windows(Struct, frozen=True):
         )  # fmt: skip
 
     def covariance(self, noise: Floats) -> Floats:
-        """Return the covariance of the residuals, shape (windows, n, n), for noise by `Source`."""
+        """Return the covariance of the residuals for this noise, shape (windows, n, n)."""
         return np.asarray(np.tensordot(self.effects, noise, (1, 0)) + self.known)
 
     def search(self, start: Floats, free: Mask, steps: int = STEPS) -> Floats:
         """Return the noise with the greatest likelihood, found in `steps` steps from `start`.
 
-        Sources outside the mask `free` keep the noise of `start`.
+        `start` and the result contain a number for each `Source`. Sources outside the mask `free`
+        keep their number.
         """
         noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(COUNT, -1)
         for _ in range(steps):
@@ -172,11 +175,11 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return the noise to state for other drives, with each variance rate at least its minimum.
+        """Return the noise to state for other drives: `noise`, with a minimum for some sources.
 
-        `FLOOR` and `CHANGES` define the minimum. If only a few residuals show a rate, the rate is
-        widened like the variance of Student's t. Windows overlap by half, so each residual counts
-        as half a degree of freedom.
+        `FLOOR` and `CHANGES` define the minimum of `DISTANCE`, `YAW` and `SKID`. If few residuals
+        show one of these three, it is widened like the variance of Student's t. Windows overlap by
+        half, so each residual counts as half a degree of freedom.
         """
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
@@ -189,7 +192,7 @@ class Windows(Struct, frozen=True):
         return np.asarray(np.maximum(noise, least))
 
     def likelihood(self, noise: Floats) -> Floats:
-        """Return the log likelihood of each window for this noise, without its constant term."""
+        """Return the log likelihood of each window for this noise, up to a constant."""
         covariance = self.covariance(noise)
         solved = np.linalg.solve(covariance, self.residual[:, :, None])[:, :, 0]
         squares = np.einsum("wi,wi->w", solved, self.residual)
@@ -201,11 +204,11 @@ class Noise(Struct, frozen=True):
     """The noise of the odometry that a log shows, compared with the configured noise."""
 
     found: Floats
-    """The noise that the log shows, by `Source`."""
+    """The noise that the log shows, a number for each `Source`."""
     present: Floats
-    """The configured noise of the robot, by `Source`."""
+    """The configured noise of the robot, a number for each `Source`."""
     gain: float
-    """Gain of log likelihood per residual of the found over the configured noise.
+    """Log likelihood per residual with the found noise, minus that with the configured noise.
 
     It is measured on drives that the fit did not use.
     """
@@ -217,7 +220,7 @@ class Noise(Struct, frozen=True):
     places: bool
     """Whether the log has positions. Without them, it does not show the noise of the distance."""
     turning: float
-    """Turn per metre in this log, rad/m."""
+    """Turn of the robot per metre driven in this log, rad/m."""
     track: float
     """Effective track, m."""
 
@@ -227,16 +230,16 @@ class Noise(Struct, frozen=True):
         return self.gain > min(SURE * self.chance, TWICE)
 
     def heading(self) -> tuple[float, float]:
-        """Return two standard deviations of the heading after `METRES`, rad.
+        """Return the standard deviations of the heading after `METRES` m, rad.
 
-        The configured noise causes the first one, and the found noise the second one.
+        The first one is for the configured noise, the second one for the noise that the log shows.
         """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return two standard deviations of the distance after `METRES`, m.
+        """Return the standard deviations of the distance after `METRES` m, m.
 
-        The configured noise causes the first one, and the found noise the second one.
+        The first one is for the configured noise, the second one for the noise that the log shows.
         """
         return self._after(Source.DISTANCE, Source.SLIP, None)
 
@@ -298,13 +301,13 @@ class Reference(Struct, frozen=True):
     """The wheel steps of each run."""
     base: Base
     parameters: Floats
-    """The parameters of the fit. Those from `P.DELAY` on describe the sensors."""
+    """The fitted parameters. Those with an index of at least `P.DELAY` describe the sensors."""
 
 
 def noise(
     held: Sequence[Fold], seen: Reference, known: Deviations, odometry: OdometryConfig
 ) -> Noise | None:
-    """Return the noise that a log shows, or None if fewer than two drives have windows.
+    """Return the noise that a log shows, or None if fewer than two drives show it.
 
     Args:
         held: the drives, each with the parameters that were fitted without it.
@@ -378,26 +381,26 @@ class _Motion(Struct, frozen=True):
 
 
 class _Window(Struct, frozen=True):
-    """The residuals of a window, and the effect of each step's errors on them."""
+    """The residuals of half a minute of a drive, and the effect of each step's errors on them."""
 
     residual: Floats
     start: Floats
     """Effects of the unknown start pose on the residuals, shape (residuals, unknowns)."""
     motion: _Motion
     along: Floats
-    """Effect of an error of each step's distance, shape (residuals, steps)."""
+    """Effect of an error of each step's distance on each residual, shape (residuals, steps)."""
     yaw: Floats
-    """Effect of an error of each step's turn, shape (residuals, steps)."""
+    """Effect of an error of each step's turn on each residual, shape (residuals, steps)."""
     sensor: dict[Source, Floats]
-    """Covariance of the residuals if the noise of a sensor is 1, by source."""
+    """Covariance of the residuals if the noise of a sensor is 1, by the source of the noise."""
     bias: Floats | float = 0.0
     """Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
-        """Return the residuals, their covariance by source and their known covariance.
+        """Return the residuals, their covariance by source of noise, and their known covariance.
 
         The unknown start pose is projected out of all three. The known covariance comes from the
-        deviations `known` of the geometry and from the gyro's bias.
+        standard deviations `known` of the geometry, and from the gyro's bias.
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -487,10 +490,10 @@ def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
-    """Return the window with the residuals of the heading at the times `t` of the wheels, s.
+    """Return the window with the residuals of the heading at the times `t`, s.
 
-    `at` contains the same moments on the clock of the heading sensor, s. `way` is the path of the
-    wheels.
+    `t` are times of the wheels' clock, and `at` the same moments on the heading sensor's clock, s.
+    `way` is the path of the wheels.
     """
     motion, since = _Motion.of(t, way, track), t - t[0]
     turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since

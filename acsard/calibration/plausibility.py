@@ -21,22 +21,22 @@ from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
 
 LEAST_ANGLE = 2 * np.pi
-"""Smallest total turn of the robot, rad."""
+"""Minimum turn of the robot in a whole log, rad. Turns to both sides add up."""
 
 LEAST_ROLL = 3.0
-"""Minimum total angle of the wheels, rad.
+"""Minimum angle that the wheels roll in a whole log, rad.
 
 Both sides must roll this angle in the same direction, and this angle in opposite directions.
 """
 
 ALIKE = 0.98
-"""Largest squared correlation between the mean and the difference of the motion of both sides.
+"""Largest squared correlation between the mean and the difference of both sides' motion.
 
-Above it, the robot drives the same curve all the time, and the log is refused.
+If it is larger, the robot drives the same curve all the time, and the log is refused.
 """
 
 WORST = 0.2, 0.03
-"""Largest useful standard deviations, as fractions: of the track, and of the ratio of the radii."""
+"""Largest useful relative standard deviations: of the track, and of the ratio of the radii."""
 
 WORST_CONDITION = 1e4
 """Largest condition number of the normal equations at which radii and track can be separated."""
@@ -47,7 +47,7 @@ DRIVE = (
 )
 
 UNLIKE = 0.5
-"""Largest fraction of a sensor's sum of squares that the wheels may leave unexplained."""
+"""Largest fraction of a sensor's motion (sum of squares) that the wheels may not explain."""
 
 UNITS = 8.0
 """Largest factor by which a result may differ from the configuration.
@@ -75,7 +75,7 @@ A higher rate is in fact in deg/s.
 """
 
 LEAST_CHI = 0.4
-"""Smallest ratio of effective track to wheel separation.
+"""Smallest credible ratio of effective track to wheel separation.
 
 Wheels that skid make the effective track larger, and nothing makes it this much smaller.
 """
@@ -93,13 +93,13 @@ LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
 
 ONE_SIDED = 0.1
-"""Ratio of the turns to one side and to the other below which they are reported as one-sided."""
+"""Fraction of the turns to one side. If the other side has less, a remark says so."""
 
 ODD_SIZE = 1.25
 """Smallest factor between the measured and the configured radius that is reported."""
 
 ODD_RATIO = 1.1
-"""Smallest ratio of the radii of both sides that is reported. Equal wheels differ far less."""
+"""Smallest ratio of the larger to the smaller radius that is reported as unusual."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 """Usual range of the ratio of effective track to wheel separation.
@@ -118,8 +118,8 @@ def drives_enough(parts: Sequence[Block]) -> None:
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    The sides must roll in the same direction and in opposite directions, and the proportion of both
-    movements must vary. If `spins` is true, turns on the spot alone are enough.
+    The sides must roll in the same direction and in opposite directions, in varying proportions. If
+    `spins` is true, turns on the spot alone are enough. `rows` contains the motion of the log.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "against each other")):
@@ -139,7 +139,7 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `RefusedError` if the robot hardly turns. `turned` is the turn in each row, rad."""
+    """Raise `RefusedError` if the robot hardly turns. `turned` contains its turns, rad."""
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
@@ -157,8 +157,8 @@ def unsure(
     """Return the relative standard deviations that are too large to be useful, by quantity.
 
     The quantities are `TRACK` and `RATIO`, and `worst` contains their limits in this order.
-    `track_std` is the relative standard deviation of the track. It does not cover the variation of
-    the track itself, with the turn rate and from block to block.
+    `track_std` is the relative standard deviation of the mean track. The track itself varies more,
+    with the turn rate and from turn to turn.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -169,15 +169,15 @@ def unsure(
 
 
 def separates_track(fitted: Fit) -> bool:
-    """Return whether the log separates the radii from the track."""
+    """Return whether the log shows if an error comes from the wheel radii or from the track."""
     return condition(fitted.marginal()) <= WORST_CONDITION
 
 
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
-    """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
+    """Raise `RefusedError` if the heading sensor's turns differ much from those of the wheels.
 
     `source` names the sensor. `sides` is the result of `heading.first`, which fits the wheels to
-    the sensor best.
+    the sensor.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
@@ -248,10 +248,10 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 
 
 def _wrong_sign(sides: Floats) -> str:
-    """Return the side with a wrong sign, "turn" if both signs are wrong, or "" if both are right.
+    """Return which sign is wrong: "left", "right", "turn" for both sides, or "" for none.
 
     `sides` contains a factor for the left and one for the right wheels. A negative factor means a
-    wrong sign. The side is "left" or "right".
+    wrong sign.
     """
     left, right = (sides > 0.0).tolist()
     if left:
@@ -274,10 +274,10 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
 
 def turn_rates(source: str, rows: Rows) -> None:
-    """Raise `RefusedError` if the sensor's turns are so fast that they must be in degrees.
+    """Raise `RefusedError` if the heading sensor turns so fast that its unit must be degrees.
 
-    `source` names the sensor. The turns are not compared with those of the wheels: if the wheel
-    speeds are in degrees too, both errors hide each other.
+    `source` names the sensor. The turns are not compared with those of the wheels, because the
+    wheel speeds may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > FASTEST_TURN:
@@ -289,7 +289,7 @@ def turn_rates(source: str, rows: Rows) -> None:
 
 
 def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
-    """Raise `RefusedError` if the turns differ so much from the wheels' that a unit must be wrong.
+    """Raise `RefusedError` if sensor and wheels turn so differently that a unit must be wrong.
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
@@ -315,7 +315,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
 
 def distance_units(size: float, base: Base) -> None:
-    """Raise `RefusedError` if distances differ so much from the wheels' that a unit must be wrong.
+    """Raise `RefusedError` if positions and wheels differ so much that a unit must be wrong.
 
     `size` is the ratio of the measured radius to the configured one.
     """
@@ -361,7 +361,7 @@ def remarks(
     Args:
         delays: the delay of each sensor's times relative to those of the wheels, s.
         bias: the gyro bias, rad/s.
-        turned: the turn of each row, rad, positive to the left.
+        turned: the turn in each interval of the log, rad, positive to the left.
         values: the multipliers, as in `Multipliers.values`.
         base: the configured geometry.
         sized: whether the size of the wheels was measured.

@@ -1,8 +1,8 @@
-"""Evidence from positions of any source, which are compared with the path of the wheels.
+"""Compares the path of the wheels with positions from any source.
 
-The path of each block is first shifted and rotated so that it fits the positions best. The
-residuals of this alignment are the evidence, so no start pose, frame or yaw is needed. Places are
-complex numbers x + iy in m.
+The path of each block (a few seconds) is first shifted and rotated so that it fits the positions
+best. The remaining differences are the evidence for the fit, so no start pose, frame or yaw is
+needed. Places are complex numbers x + iy in m.
 
 `search` finds parameters from which the fit to positions can start, because the fit needs a track
 that is nearly right. The search tries tracks from a tenth to thirty times the configured one, with
@@ -11,8 +11,8 @@ path gives the wheel radius.
 
 A turn on the spot does not change the position. Positions therefore often determine such a turn
 only up to whole turns: the robot faces the same way after 90 deg to the left as after 270 deg to
-the right. If several starting points explain the positions about equally well,
-the search chooses the one that describes the more usual robot.
+the right. If several starting points explain the positions about equally well, the search chooses
+the one that describes the more usual robot.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
 LEAST_POINTS = 5
-"""Minimum number of positions in a segment.
+"""Minimum number of positions in a segment (the positions between two jumps).
 
-A segment has three unknowns: a shift along two axes, and a rotation.
+The alignment of a segment has three unknowns: a shift along two axes, and a rotation.
 """
 
 FINE_S = 0.02
 """Time step in which the path is summed, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Largest excess of the distance between two positions over the distance that the wheels rolled.
+"""Limit above which the step from one position to the next is a jump of the source.
 
-It is `JUMP` standard deviations plus `JUMP_M` m. A larger excess is a jump: the position after
-it is an outlier, or the source has relocalized.
+A step is a jump if it exceeds the distance that the wheels rolled by more than `JUMP` standard
+deviations plus `JUMP_M` m. The next position is then an outlier, or the source has relocalized.
 """
 
 SPEED_S = 0.05
@@ -76,14 +76,11 @@ class WheelSteps(Struct, frozen=True):
     right: Floats
     """Angle that the right wheels roll in each step, rad."""
     fast: Floats
-    """Integral of |w| w over each step, rad2/s.
-
-    w is the speed of the right minus that of the left wheels, rad/s.
-    """
+    """Integral of |w| w over each step, rad2/s. w is the right minus the left wheels' speed."""
 
 
 class Path(Struct, frozen=True):
-    """The path of a run according to the wheels. It is linear between the times `t`."""
+    """The path of a run according to the wheels, interpolated linearly between the times `t`."""
 
     t: Floats
     """Times of the points of the path, s."""
@@ -92,15 +89,15 @@ class Path(Struct, frozen=True):
     heading: Floats
     """Heading at these times, rad."""
     derivatives: dict[P, Complexes]
-    """Derivatives of `place` with respect to parameters, by the index of the parameter."""
+    """Derivatives of `place` with respect to the radii, the inverse track and its growth."""
     heading_derivatives: dict[P, Floats]
-    """Derivatives of `heading`, with respect to the same parameters as in `derivatives`."""
+    """Derivatives of `heading` with respect to the radii, the inverse track and its growth."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Return the places of the sensor, m, and their derivatives, at the times of positions.
+        """Return the places of the position sensor, m, and their derivatives by the parameters.
 
-        `t` contains the recorded times of the positions, s, which are late by the parameter
-        `P.DELAY`. The derivatives with respect to the parameters have the shape (times, COUNT).
+        `t` contains the recorded times of positions, s, which are late by the parameter `P.DELAY`.
+        The derivatives have the shape (times, COUNT).
         """
         t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
@@ -153,7 +150,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
-    """Return the wheel steps of a run. A step lasts about `fine_s` s, and at least one sample."""
+    """Return the motion of the wheels in steps of about `fine_s` s, and at least one sample."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -189,7 +186,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the places of `path` if the track is constant. This function is faster than `path`."""
+    """Return the same places as `path`, but faster, if TRACK_GROWTH is 0."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
@@ -210,7 +207,7 @@ def _sums(steps: Complexes) -> Complexes:
 
 
 Paths = Sequence[Path] | Mapping[int, Path]
-"""Paths by the number of the run."""
+"""Paths of the wheels, by the number of their run."""
 
 
 class Aligned(Struct, frozen=True):
@@ -221,15 +218,14 @@ class Aligned(Struct, frozen=True):
     residual: Complexes
     """Position minus aligned path, m, times the root of the position's weight."""
     derivatives: Complexes
-    """Derivatives of the aligned path, times the root of the position's weight.
+    """Derivatives of the aligned path by the parameters, times the root of the position's weight.
 
-    They are taken with respect to the parameters, shape (positions, COUNT), and include the change
-    of the alignment: its shift and rotation depend on each parameter.
+    Their shape is (positions, COUNT). They include the change of the aligning shift and rotation.
     """
 
 
 def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
-    """Align the path of the wheels with the positions of each segment.
+    """Shift and rotate the path of the wheels so that it fits the positions of each segment best.
 
     Outliers among the positions have a smaller weight.
     """
@@ -256,9 +252,9 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
 def evidence(
     segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
 ) -> Evidence:
-    """Return the evidence of the positions at these parameters.
+    """Return the evidence of the positions: how they contribute to the fit at these parameters.
 
-    `paths` must be computed with the same parameters. `blocks` is the number of blocks.
+    `paths` must be computed with the same parameters. `blocks` is the number of blocks of the log.
     """
     normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
     squares, counts = np.zeros(blocks), np.zeros(blocks)
@@ -282,19 +278,19 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
 
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
-"""Ratios of configured to true track that the search tries, spaced closer in the usual range."""
+"""Ratios of configured to true track that the search tries, closer together in the usual range."""
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that the search tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Maximum numbers of segments: to try starting points, and to refine the best of them.
+"""Maximum number of segments with which starting points are tried, and with which they are refined.
 
 The segments with the largest extent are used.
 """
 
 MOST_POINTS = 80
-"""Approximate number of positions per segment that are used, evenly spaced."""
+"""Approximate number of positions of a segment that the search uses, evenly spaced."""
 
 MOST_REFINED, FAR_WORSE = 4, 20.0
 """Limits for the starting points that are refined.
@@ -310,10 +306,10 @@ The lower end is that of a robot that skids much, the upper end that of a robot 
 """
 
 NEAR_HEADING = 0.8, 1.25
-"""Usual range of the turn according to positions, divided by that of a heading sensor."""
+"""Usual range of the robot's turn according to positions, divided by that of a heading sensor."""
 
 WRONG_WAY = 4.0
-"""Factor by which a starting point counts as worse if the signs of its sides are unusual.
+"""Factor by which a starting point counts as worse if it describes a robot with a wrong sign.
 
 Such a robot has one side reversed, or turns in the opposite direction to its wheels.
 """
@@ -321,19 +317,19 @@ Such a robot has one side reversed, or turns in the opposite direction to its wh
 NOTHING = 1e-3
 """Constant that is added to `StartingPoint.unexplained` before starting points are compared.
 
-It stands for the noise of the positions, which no starting point explains. Smaller differences
-therefore hardly matter.
+It stands for the noise of the positions, which no starting point explains. Differences that are
+much smaller therefore hardly matter.
 """
 
 STRAYED = 1.3
-"""Largest factor by which refinement may change the turn. Otherwise its result is discarded."""
+"""Factor by which a refinement may change the robot's turn. Beyond it, the result is discarded."""
 
 COARSE_S = 0.1
 """Time step in which paths are summed during the search, s."""
 
 
 class StartingPoint(Struct, frozen=True):
-    """Parameters from which a fit can start."""
+    """Parameters from which a fit to positions can start."""
 
     parameters: Floats
     unexplained: float
@@ -389,7 +385,7 @@ def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return a factor of at least 1, which is larger for a less usual robot.
+    """Return a factor of at least 1, which is larger if the parameters describe an unusual robot.
 
     `sides` is the result of `heading.first`, or None without a heading sensor.
     """
@@ -404,14 +400,17 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the robot's turn per radian of the right wheels alone, divided by `Base.gain`."""
+    """Return the angle that the robot turns if only the right wheels turn by one radian.
+
+    The angle is in radians, divided by `Base.gain`.
+    """
     return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
 
 
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the starting point with the delay of the positions, from `DELAYS`, that fits best."""
+    """Return the starting point with the delay of the positions that fits best, from `DELAYS`."""
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
@@ -452,7 +451,7 @@ def _tried(
 def _refined(
     point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the starting point after a fit to a few segments.
+    """Return the starting point after a fit to a few segments, if this fit explains more.
 
     The fit also finds where on the robot the position sensor is. Outliers have less weight.
     """

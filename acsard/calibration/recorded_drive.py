@@ -28,15 +28,15 @@ from acsard.recording.file import Recording
 from acsard.recording.mcap_records import DAMAGE, MAGIC
 
 MOST_BYTES = 1 << 30
-"""Maximum size of a CSV file or of a recording of acsard, bytes. They are read into memory."""
+"""Maximum size of a CSV file or of a recording of acsard, bytes. Both are read into memory."""
 
 MOST_RECORD_BYTES = 1 << 28
 """Maximum size of a record in a bag, bytes. rosbag2 writes chunks of less than 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
-"""Exceptions that reading a damaged bag raises.
+"""Exceptions that the MCAP reader and LZ4 raise for a damaged bag.
 
-They come from the MCAP reader and from LZ4. A channel whose schema is missing causes a `KeyError`.
+A channel whose schema is missing causes a `KeyError`.
 """
 
 OTHER_BAGS = {
@@ -46,8 +46,7 @@ OTHER_BAGS = {
 }
 """Kinds of bags that this module cannot read, by the suffix of their files.
 
-The value gives the first bytes of such a file, and a phrase that names the kind and says how to
-convert it.
+Each value contains the first bytes of such a file, and a phrase with its format and the conversion.
 """
 
 
@@ -115,9 +114,9 @@ def _other_bag(what: str) -> str:
 
 
 def _is_ours(log: Path) -> bool:
-    """Return whether an MCAP file is a recording of acsard, according to its header.
+    """Return whether the header of an MCAP file says that acsard recorded it.
 
-    A file with a damaged header is treated as a recording.
+    A file with a damaged header counts as a recording of acsard.
     """
     with log.open("rb") as stream:
         try:

@@ -65,13 +65,13 @@ or down, and the log is refused.
 """
 
 OWN = 3e-3
-"""Largest RMS difference between an odometry and the wheels from which it was computed.
+"""Largest RMS difference at which the turns of an `Odometry` count as computed from the wheels.
 
-It is a fraction of the RMS turn.
+The difference is a fraction of the RMS turn.
 """
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
-"""Delays of an odometry relative to the wheels, s, that `_computed_from` tries."""
+"""Delays of an `Odometry` relative to the wheels that are tried, s."""
 
 
 class RosMessage(NamedTuple):
@@ -153,10 +153,10 @@ class _Topic:
         return pose.position.x, pose.position.y, _yaw(pose.orientation)
 
     def _joints(self, message: JointState, joints: Sequence[str]) -> Sequence[float]:
-        """Return the angles (rad) of all columns, then the speeds (rad/s) of all columns.
+        """Return the angles of all wheels, rad, and then their speeds, rad/s.
 
-        Angles or speeds that the message does not contain are NaN. The result is () if no column
-        belongs to the joints, or if the columns differ from those of the topic's first message.
+        Angles or speeds that the message does not contain are NaN. The result is () if no joint is
+        a wheel, or if the wheels differ from those of the topic's first message.
         """
         columns = wheel_joints(tuple(message.name), tuple(joints))
         self.joints.update(message.name[:8])
@@ -195,7 +195,7 @@ _SHORT = {
     "fl": ("fl", "lf"), "fr": ("fr", "rf"), "rl": ("rl", "lr", "bl", "lb"),
     "rr": ("rr", "br", "rb"), "left": ("l",), "right": ("r",),
 }  # fmt: skip
-"""Abbreviations of a wheel or a side in joint names, by the column of the log."""
+"""Abbreviations of a wheel or a side in joint names, by the name of its column in a log."""
 
 _COLUMN = {word: column for column, words in _SHORT.items() for word in words}
 
@@ -203,7 +203,7 @@ _NO_WHEEL = ("caster", "castor", "steer")
 
 
 def wheel_of(joint: str) -> str:
-    """Return the column of the log, such as "fl" or "left", for a joint's name; "" if unclear."""
+    """Return the column of a log, such as "fl" or "left", for a joint's name; "" if unclear."""
     name = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint).lower()
     if any(word in name for word in _NO_WHEEL):
         return ""
@@ -217,9 +217,10 @@ def wheel_of(joint: str) -> str:
 
 @cache
 def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, list[int]]:
-    """Return the indices of the wheel joints in `names`, by the column of the log.
+    """Return the indices of the wheel joints in `names`, by their columns in a log.
 
-    The result is empty unless both sides have a wheel joint.
+    The columns are those of `FOUR`, or "left" and "right". The result is empty unless both sides
+    have a wheel joint.
 
     Args:
         names: the names of the joints in a message.
@@ -337,8 +338,9 @@ class _Log:
     def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
         """Return the topic to use among `fit`, or None. Topics that the user named take precedence.
 
-        `what` describes the topic in error messages. If `free` is false, only a named topic is
-        used. Raises `LogError` if several topics can be used, or if the topic has too few messages.
+        `what` names the topic's role in error messages. If `free` is false, only a topic that the
+        user named is used. Raises `LogError` if several topics remain, or if the topic has too few
+        messages.
         """
         named = [topic for topic in fit if topic.name in self._choice.topics]
         for topic in named:
@@ -471,8 +473,8 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
     """Compute wheel speeds from recorded angles. Return their times, s, and the speeds, rad/s.
 
     Each speed is the mean over one sample period. The speeds therefore add up to exactly the angle
-    that the wheel turned, even if the sample times are uneven. No speed is computed across a gap or
-    across a jump. The angle jumps when a driver restarts at 0.
+    that the wheel turned, even if the sample times are uneven. No speed is computed across a gap in
+    the samples, or across a jump of an angle (a driver that restarts begins at 0).
 
     Args:
         t: the times of the angles, s.
@@ -537,7 +539,7 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
     """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown.
 
-    `rates` contains the sensor's turn rates at the times `t`, and `sides` is the result of
+    `rates` contains the sensor's turn rates, rad/s, at the times `t`, s. `sides` is the result of
     `_sides`.
     """
     order = np.argsort(t, kind="stable")
@@ -553,9 +555,9 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether a yaw was computed from the wheels: its turns differ by at most `OWN`.
+    """Return whether the yaw was computed from the wheels: their turns differ by at most `OWN`.
 
-    `yaw` contains the yaw at the times `t`, rad, and `sides` is the result of `_sides`.
+    `yaw` contains the yaw, rad, at the times `t`, s. `sides` is the result of `_sides`.
     """
     held = np.isfinite(yaw)
     order = np.argsort(t[held], kind="stable")

@@ -1,7 +1,7 @@
 """Splits the table of a log into runs, and runs into blocks.
 
-A run contains the samples of one drive. The times of a log may have any origin. Within a run they
-begin at 0. Rows that are out of order are sorted. A new run begins where the times jump back, or
+A run contains the samples of one drive. Its times begin at 0, whatever the origin of the log's
+times is. Rows that are out of order are sorted. A new run begins where the times jump back, or
 where the wheels have no sample for a minute.
 
 A block is a few seconds of driving. Every estimate of the calibration is a sum over blocks, and the
@@ -27,10 +27,10 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 RESTART_S = 1.0
-"""Backward step of the times, s, above which the times may have restarted."""
+"""Smallest backward step of the times in a log, s, that may be a restart of the recording."""
 
 FEW_RESTARTS = 100
-"""Largest number of restarts. If there are more, the rows are just unsorted: no run is split."""
+"""Largest number of restarts. More backward steps of the times show that rows are unsorted."""
 
 SLOWEST_S = 0.7
 """Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
@@ -39,34 +39,33 @@ LEAST_ROWS = 20
 """Minimum number of wheel samples in a run."""
 
 PAUSE_S = 60.0
-"""Time without a wheel sample after which a new drive begins, s."""
+"""Time without a wheel sample after which a new run begins, s."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
-"""Limits for rounded times: the median interval, s, and the mean number of rows per time.
+"""Limits for times that were rounded in the log.
 
-The median interval is that between the different times of a run. If both limits are exceeded, the
-column t was rounded.
+They are the median interval between different times, s, and the mean number of rows that share a
+time. If both limits are exceeded, the column t was rounded.
 """
 
 ROLLING, AGAIN = 0.2, 0.4
 """Criterion for a logger that repeats a position or a yaw until the next one arrives.
 
-While the wheel speeds of both sides add up to more than `ROLLING` rad/s, a true position changes
-from row to row. The logger repeats values if more than the fraction `AGAIN` of these rows have the
-same value as the row before. For example, rows at 20 Hz repeat about half of the positions of a
-10 Hz source.
+While the wheel speeds of both sides add up to more than `ROLLING` rad/s, true values change from
+row to row. If more than the fraction `AGAIN` of these rows have the value of the row before, the
+logger repeats values. For example, rows at 20 Hz repeat half of the positions of a 10 Hz source.
 """
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
 STREAMS = (WHEELS, "yaw_rate", "yaw", "x y", COMMANDS)
-"""Names of the sensors. Each name lists the sensor's columns, separated by spaces."""
+"""Names of the sensors. A name consists of the sensor's columns, separated by spaces."""
 
 Streams = dict[str, tuple[Floats, ...]]
-"""The times and values of each sensor, by its name in `STREAMS`."""
+"""The times and the values of each sensor, by the sensor's name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of different names in the column run. If there are more, they name no drives."""
+"""Largest number of different names in the column run. If there are more, they do not name runs."""
 
 TOGETHER = 50
 """Number of rows whose speeds are summed before the two wheels of a side are compared."""
@@ -91,7 +90,7 @@ BLOCKS = 16
 """Number of blocks into which a log is divided, unless they would be too short or too long."""
 
 LONGEST_S = 12.0
-"""Length of the longest blocks, s, unless the caller of `blocks` asks for longer ones."""
+"""Greatest length of a block, s, unless the caller of `blocks` asks for longer blocks."""
 
 SMOOTH_S = 0.3
 """Time over which a wheel speed is averaged before it is squared, s.
@@ -101,7 +100,7 @@ others.
 """
 
 LEAST_TURN = 0.2
-"""Minimum angle, rad, that the wheels of at least one side turn in a block that is used."""
+"""Angle, rad, that the wheels of one side must turn in a block. Other blocks are left out."""
 
 MOST_JITTER_S = 5.0
 """Largest variation of the delay from stamp to arrival, s.
@@ -143,9 +142,9 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def rolled(self) -> tuple[Floats, Floats]:
-        """The angles of the left and the right wheels at the times `t`, rad.
+        """The angles that the left and the right wheels have rolled since the start, rad.
 
-        The angles stay constant across a gap.
+        They are given at the times `t`, and stay constant across a gap in the samples.
         """
         steps = np.diff(self.t)
         steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
@@ -158,7 +157,7 @@ class Run(Struct, frozen=True, dict=True):
         return np.asarray((np.abs(self.left) > STILL) | (np.abs(self.right) > STILL))
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return the angles of the left and the right wheels at these times, rad."""
+        """Return the angles, rad, that the left and the right wheels have rolled up to `t`, s."""
         left, right = self.rolled
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
@@ -173,7 +172,7 @@ class Run(Struct, frozen=True, dict=True):
 class Notes:
     """Sentences about a log. A sentence that applies to several runs is listed once.
 
-    A sentence may contain "{}". A count, summed over all runs, replaces it.
+    A sentence may contain "{}", which a count replaces, summed over all runs.
     """
 
     def __init__(self, sentences: Iterable[str]) -> None:
@@ -189,7 +188,7 @@ class Notes:
             sums[0], sums[1] = sums[0] + count, sums[1] + 1
 
     def sentences(self) -> tuple[str, ...]:
-        """Return each sentence once, in the order in which the sentences were added."""
+        """Return each sentence once, in the order of their first addition, with its counts."""
         return tuple(
             sentence.replace("{}", str(count)) + (f" (in {runs} runs)" if 1 < runs < count else "")
             for sentence, (count, runs) in self._sentences.items()
@@ -262,11 +261,10 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return the difference between the wheels of a side, as a fraction of the rolled distance.
+    """Return the difference between two wheels of a side, as a fraction of the rolled distance.
 
-    `front` and `rear` name the columns of the two wheels. Both wheels roll over the same floor, so
-    a large difference means an error in the log. Raises `LogError` if the difference exceeds
-    `APART`.
+    `front` and `rear` name the columns of the wheels. Both roll over the same floor, so a large
+    difference means an error in the log. Raises `LogError` if the difference exceeds `APART`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
@@ -305,7 +303,7 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
-    """Return the sorted times of the rows with speeds of both sides. Times may repeat."""
+    """Return the sorted times, s, of those `rows` that have wheel speeds. Times may repeat."""
     held = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
     return np.sort(t[rows[held]])
 
@@ -372,7 +370,7 @@ def _run(name: str, streams: Streams) -> Run:
 
 
 def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
-    """Remove from `drives`, in place, the values that the logger repeated between two samples.
+    """Remove from `drives`, in place, the yaws and positions that the logger repeated.
 
     A short drive may not show whether the logger repeats values, so all drives are evaluated
     together.
@@ -441,7 +439,7 @@ def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
 
 
 class Block(Struct, frozen=True):
-    """A few seconds of a run, the unit of the jackknife."""
+    """A few seconds of a run. To find uncertainties, the fit leaves out one block at a time."""
 
     run: int
     """Number of the run."""
@@ -461,7 +459,7 @@ def gaps(t: Floats) -> Floats:
 
 
 def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
-    """Return a mask of the intervals from `begin` to `end` that touch none of the gaps `holes`."""
+    """Return a mask of the intervals from `begin` to `end` that touch no gap (a row of `holes`)."""
     after = np.searchsorted(holes[:, 1], begin, side="right")
     before = np.searchsorted(holes[:, 0], end, side="left")
     return np.asarray(after == before)
@@ -475,8 +473,8 @@ def cumulative(steps: Floats) -> Floats:
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
     """Return the times in which all wheels stand still, one row (begin, end) for each rest, in s.
 
-    A margin of `edge_s` is cut off both ends of each rest. If less than `least_s` remains, the rest
-    is left out.
+    `edge_s` is cut off both ends of each rest, and the rest is left out if less than `least_s`
+    remains, both in s.
     """
     moving = np.concatenate(([True], run.moving, [True])).astype(np.int8)
     changes = np.flatnonzero(np.diff(moving))
@@ -511,8 +509,8 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
     """Return whether the wheels of a side turned by at least `LEAST_TURN` from `begin` to `end`, s.
 
-    Turns ahead and back both add to the angle. `left` and `right` contain the angles of the two
-    sides at the two times, rad.
+    Turns ahead and back both add to the angle. `left` and `right` contain the angles of each side
+    at `begin` and at `end`, rad.
     """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
@@ -522,11 +520,11 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
 
 
 def on_arrival_clock(came: Floats, made: Floats) -> Floats:
-    """Return the sample times of one stream, s, on the clock of their arrival.
+    """Return the times at which a sender made its samples, s, on the receiver's clock.
 
     `came` contains the times of arrival, and `made` the stamps of the sender's clock, both in s. If
-    the delay from stamp to arrival varies by at most `MOST_JITTER_S`, the sample times are the
-    stamps plus the smallest delay. Otherwise they are the times of arrival.
+    the delay from stamp to arrival varies by at most `MOST_JITTER_S`, the result is the stamps plus
+    the smallest delay. Otherwise it is the times of arrival.
     """
     delay = came - made
     if float(np.ptp(delay)) > MOST_JITTER_S:

@@ -1,7 +1,8 @@
-"""Computes the calibration from a log: prepares the log, fits, checks and evaluates the result.
+"""Computes the calibration from a log.
 
-Preparing a log means cutting it into blocks, checking it and finding starting parameters for the
-fit. If a log gives no calibration, an error says why and what to do.
+First it cuts the log into blocks, checks it, and finds parameters from which the fit can start.
+Then it fits the parameters, checks them, and measures the improvement. If a log gives no
+calibration, an error says why and what to do.
 """
 
 from __future__ import annotations
@@ -47,19 +48,18 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryCon
 from acsard.core.values import AcsardError
 
 LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Lengths of blocks, s, that the tool tries if the log has positions.
+"""Lengths of blocks, s, that are tried. The tool uses the one that improves the odometry most.
 
 Many short blocks are better for accurate positions. Long blocks are better for coarse positions,
-and for wheels whose errors hide the small turns within a short block. The tool chooses the length
-that is best on drives that the fit did not use. Positions without a heading sensor need more than
-the shortest length. A heading sensor without positions needs only the shortest length.
+and for wheels whose errors hide the small turns within a short block. If the log has no positions,
+only the shortest length is tried. If it has no heading sensor, the shortest length is not tried.
 """
 
 ENOUGH_BLOCKS = 8
-"""Minimum number of blocks. A greater length is not tried if it gives fewer blocks.
+"""Minimum number of blocks. A block length that gives fewer is not tried after a shorter length.
 
-With six blocks, the standard deviation of the ratio of left to right was up to three times too
-small.
+With six blocks, the standard deviation of the ratio of left to right radius was up to three times
+too small.
 """
 
 PERFECT = 1e-4
@@ -78,7 +78,7 @@ class Drives(Struct, frozen=True):
     turns: float
     """Number of turns of 360 deg to both sides together, according to the calibrated wheels."""
     fastest: float
-    """Rate of the fastest turns, rad/s, as in `Rates.fastest`."""
+    """Rate of the fastest turns, rad/s: 95 % of the turned angle was turned more slowly."""
 
     @classmethod
     def of(
@@ -87,8 +87,8 @@ class Drives(Struct, frozen=True):
     ) -> Drives:  # fmt: skip
         """Return the totals of these runs.
 
-        `by_wheels` is the turn of each of the `rows` according to the calibrated wheels, rad.
-        `found` contains the new multipliers, and `rate` the turn rates of the log.
+        `by_wheels` is the turn of the calibrated wheels in each interval of `rows`, rad. `found`
+        contains the new multipliers, and `rate` the turn rates of the log.
         """
         size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
@@ -102,13 +102,13 @@ class Calibration(Struct, frozen=True):
     """The result of a calibration. Each standard deviation has the unit of its quantity."""
 
     reference: str
-    """The sensors or the measuring tool with which the wheels were compared, in words."""
+    """The sensors, or the measuring tool, with which the wheels were compared, in words."""
     drives: Drives
     configured: Multipliers
     multipliers: Multipliers
     """The new multipliers."""
     scale: str
-    """Sources of the size of the wheels: "positions", "distance" (a tape), both, or "" for none."""
+    """Measurements of the wheels' size: "positions", "distance" (by tape), both, or "" for none."""
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
@@ -122,10 +122,10 @@ class Calibration(Struct, frozen=True):
     odometry: dict[str, float]
     """New settings of `[odometry]` by name.
 
-    They are the standard deviations of the geometry and, if `Noise.better` is true, the noise.
+    They state the uncertainty of the geometry and, if `Noise.better` is true, the noise.
     """
     kept: tuple[str, ...] = ()
-    """Names of the quantities that stay as configured: `TRACK`, `RATIO` or both."""
+    """Names of the quantities that stay as configured: `plausibility.TRACK`, `RATIO` or both."""
     feedback: dict[str, float] = {}
     """New settings of `[feedback]` by name.
 
@@ -164,7 +164,7 @@ def calibrate(
 
 
 class Prepared(Struct, frozen=True):
-    """A log that was cut into blocks of one length, and the evidence that it gives."""
+    """A log that was cut into blocks of one length, and all that the fit needs from it."""
 
     runs: Sequence[Run]
     headings: Headings | None
@@ -173,7 +173,7 @@ class Prepared(Struct, frozen=True):
     """The configured geometry."""
     parts: list[Block]
     rows: Rows
-    """The motion in short intervals.
+    """The motion in intervals of about a second.
 
     If the robot never rested, the turns of the gyro still contain the gyro's bias.
     """
@@ -192,8 +192,8 @@ def prepared(
 ) -> Prepared:
     """Cut the runs into blocks of about `length` s, check the log, and find starting parameters.
 
-    `headings` are those of a sensor, or None if the log has none. Raises `RefusedError` if a check
-    fails.
+    `headings` contains the headings that a sensor measured, or is None if the log has none. Raises
+    `RefusedError` if a check fails.
     """
     parts = blocks(driven, length)
     plausibility.drives_enough(parts)
@@ -259,17 +259,17 @@ class Candidate(Struct, frozen=True):
     covariance: Floats
     """Covariance of the parameters, shape (COUNT, COUNT)."""
     rows: Rows
-    """The motion in short intervals. The turns of a gyro are corrected for its bias and scale."""
+    """The motion in intervals of about a second, with the gyro corrected for its bias and scale."""
     rate: Rates
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """Relative standard deviation of each quantity that stays as configured, by its name.
+    """The quantities that stay as configured, by name: `plausibility.TRACK`, `RATIO` or both.
 
-    The name is `TRACK` or `RATIO`. The deviation shows how well the log determines the quantity; it
-    is inf if unknown.
+    Each value is the relative standard deviation with which the log determines the quantity, or inf
+    if this is unknown.
     """
 
 
@@ -307,7 +307,7 @@ def _calibrated(
 
 
 def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
-    """Return the standard deviations of the geometry.
+    """Return the standard deviations of the geometry that the calibration proposes.
 
     A quantity that stays as configured also keeps its configured standard deviation.
     """
@@ -325,7 +325,8 @@ def _noise(
 ) -> Noise | None:
     """Return the noise that the log shows with the fitted geometry; None if it shows none.
 
-    If `present` is true, the configured geometry is used instead of the fitted one.
+    `known` contains the standard deviations of the geometry. If `present` is true, the configured
+    geometry is used instead of the fitted one.
     """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
@@ -345,7 +346,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
     """Return the fit of all parameters if it determines both the track and the ratio of the radii.
 
     Otherwise return up to two fits: one keeps the ratio as configured, the other one the track.
-    Raises `RefusedError` if these do not determine the rest either, or if no fit converges.
+    Raises `RefusedError` if these fits are too inaccurate as well, or if no fit converges.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
@@ -382,7 +383,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Return the constraints of each fit to try, by the quantity that the fit keeps as configured.
+    """Return the constraints of each fit to try, by the quantity that they keep as configured.
 
     The key "" is for the fit without constraints.
     """
@@ -393,7 +394,7 @@ def _held(base: Base) -> dict[str, list[Held]]:
 
 
 def _candidate(made: Prepared, fitted: Fit) -> Candidate:
-    """Return the evaluation of a fit. Raises `RefusedError` if the robot hardly turned."""
+    """Return a fit with its improvement. Raises `RefusedError` if the robot hardly turned."""
     headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
     gyro_scale = 1 + float(fitted.parameters[P.SCALE_ERROR])
@@ -470,8 +471,8 @@ def _of_noise(shown: Noise | None) -> Iterator[str]:
     """Yield a sentence if some noise stays as configured. `shown` is the noise of the log."""
     if shown is None or not shown.better:
         yield (
-            "the variances per metre and per radian stay as configured, because those of this log "
-            "may not describe the errors of other drives better"
+            "the variances per metre and per radian stay as configured, because another "
+            "drive may have other errors than this log"
         )
     elif not shown.places:
         yield (
@@ -481,10 +482,7 @@ def _of_noise(shown: Noise | None) -> Iterator[str]:
 
 
 def _cuts(driven: Sequence[Run]) -> Iterator[str]:
-    """Yield a sentence about gaps in the wheel speeds, and one about jumps of the positions.
-
-    A sentence is left out if the runs have no gaps or no jumps.
-    """
+    """Yield a sentence for gaps in the wheel speeds, and one for jumps of the positions, if any."""
     if gaps := sum(len(run.gaps) for run in driven):
         yield f"the wheel speeds have {gaps} gaps: the tool uses no data across them"
     if jumps := sum(len(positions.jumps(run)) for run in driven):
@@ -521,10 +519,9 @@ def _own(what: str) -> str:
 
 
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
-    """Return a function that computes the extent of a run's path.
+    """Return a function that computes the extent of a run's path from multipliers and its number.
 
-    The function takes multipliers and the number of the run. As in the fit, the track changes with
-    the turn rate.
+    As in the fit, the track changes with the turn rate.
     """
 
     def follow(values: Floats, number: int) -> Extent:

@@ -1,11 +1,10 @@
-"""The robot with lifted wheels: sends speeds to motors a to d and records the replies.
+"""Drives the board that is checked: sends speeds to its motors a to d and stores its replies.
 
-Each step of the check is an experiment. It sends lines for some time, all replies go into one
-recording, `replies`, and the step judges the recording. Speeds belong to motors, not to wheels: the
-check has to find out which wheel a motor turns. Three events end any experiment at once, with zeros
-and then silence: a motor runs away, the MCU falls silent while a motor turns, or the board
-restarts. The serial line (`Wire`) and the person (`Operator`) are interfaces that the caller
-implements.
+A step of the check sends lines through a `Board` for some time, and then evaluates the stored
+`replies`. Speeds belong to motors and not to wheels, because the check has to find out which wheel
+a motor turns. Three events interrupt a step at once: a motor runs away, the board falls silent
+while motors turn, or the board restarts. The first two end the check. The caller implements the
+interfaces `Wire` (the serial line) and `Operator` (the person at the robot).
 """
 
 from __future__ import annotations
@@ -32,38 +31,39 @@ from acsard.core.values import NS_PER_S, WheelSpeeds
 
 
 class Wire(Protocol):
-    """A serial line."""
+    """Interface of the serial connection between this computer and the board."""
 
     def open(self, baud_rate: int) -> None:
-        """Open the line, or change the rate of the open line. Raises `MendableError` on failure."""
+        """Open the connection or set its baud rate. Raises `MendableError` or `WireLostError`."""
 
     def close(self) -> None:
-        """Send the last bytes and close the line."""
+        """Send the last bytes and close the connection."""
 
     def now_ns(self) -> int:
         """Return the monotonic time, ns."""
 
     def send(self, data: bytes) -> None:
-        """Send bytes now. Raises `WireLostError` if the line is lost."""
+        """Send bytes now. Raises `WireLostError` if the connection is lost."""
 
     def late_ns(self) -> int:
-        """Return how long the board has waited for a processor since the last call, ns.
+        """Return how long a simulated board has waited for a processor since the last call, ns.
 
-        It is 0 unless the board is a program on this computer.
+        The result is 0 if the board is a real one and not a program on this computer.
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Receive until the monotonic time `until_ns`, and return each piece with its time, ns.
+        """Receive until the monotonic time `until_ns`, and return the received pieces of data.
 
-        Raises `WireLostError` if the line is lost.
+        Each piece has the monotonic time of its arrival, ns. Raises `WireLostError` if the
+        connection is lost.
         """
 
 
 class Operator(Protocol):
-    """The operator at the robot."""
+    """Interface through which the check asks and informs the operator, a person at the robot."""
 
     def doing(self, text: str) -> None:
-        """Show this text about the present activity of the check until the next call."""
+        """Show what the check does now, until the next call."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Return one of the answers, or None if no person watches the robot."""
@@ -76,17 +76,18 @@ BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
 """Interval at which the lateness of this computer is measured while listening, ns."""
 
 FAREWELL = 5
-"""Number of times that zeros are sent at the end of the check, with and without the comma."""
+"""Number of times that zeros are sent at the end of the check."""
 
 
 KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
-"""Names of the attributes of `Board` that contain results of earlier steps for later steps."""
+"""Names of the attributes of `Board` in which a step leaves results for later steps."""
 
 
 class Board:
-    """The board at the end of a wire.
+    """The board that is checked, with its replies and the results of the steps.
 
-    Entering this context opens the wire. Leaving it always sends zeros and then falls silent.
+    Entering this context opens the wire. Leaving it sends zeros and closes the wire. It sends no
+    more zeros if they make a motor run away (`fled`).
     """
 
     def __init__(
@@ -96,48 +97,50 @@ class Board:
         self.longest_reply_s = longest_reply
         """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """Whether all motors have been seen at rest. Only then does a runaway end the check."""
+        """Whether the motors have stood once. From then on, a motor that runs away ends the check.
+        """
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
         """Whether lines end with a comma."""
         self.latched = False
-        """Whether the last motor kept turning when zeros were sent with the opposite of `comma`."""
+        """Whether motor d kept turning after zeros whose line ending is not that of `comma`."""
         self.sealed = self.sampled = False
-        """Whether lines carry the checksum, and whether they ask for the sample fields."""
+        """`sealed`: lines have a checksum. `sampled`: they ask for the board's clock and counts."""
         self.identity: dict[str, str] = {}
         self.own_clock = False
-        """Whether the board reports by its own clock."""
+        """Whether the board sends reports by its own clock, and not in reply to lines."""
         self.gap_s = mcu.reply_period
-        """Time between two replies while lines are sent, s."""
+        """Mean time between two replies while lines are sent, s."""
         self.paced = False
-        """Whether `own_clock` and `gap_s` were measured."""
+        """Whether the reply rate was judged, so that `own_clock` and `gap_s` are known."""
         self.lost = 0.0
         """Fraction of the lines that are lost or damaged in either direction."""
-        # The recording
+        # Received lines
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
         """Lines that are not good replies."""
         self.inputs: dict[int, bool] = {}
-        """Whether each input was pressed, in the last status line that reported the input.
+        """Maps an input to whether it was pressed in the last status line that reported it.
 
-        Key 0 is the emergency stop. The bumpers have the keys from 1 on.
+        Key 0 is the emergency stop. The keys from 1 on are the bumpers.
         """
         self.heard = Heard()
-        """Everything that was received since the port was opened."""
+        """Statistics of all bytes and lines received since the port was opened."""
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
-        """Lateness of this computer, and of the board too if the board is a program on it."""
+        """The delays of this computer. A simulated board on it contributes its own delays."""
         self.fled = False
-        """Whether zeros fail to stop a motor, or make it run away.
+        """Whether a motor runs away, or keeps turning although zeros are sent.
 
-        Then the host must send nothing more, so that the MCU's watchdog can stop the motor.
+        The host then sends nothing more, so that the board's watchdog can stop the motor.
         """
 
         self._commanded = ZERO
         self._unanswered_s = 0.0
-        """Time for which `drive` has received no reply, s, without the pauses of this host."""
+        """Time for which `drive` has sent lines without any reply, s. Pauses of this computer do
+        not count."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -145,13 +148,13 @@ class Board:
         self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
 
     def open(self, baud_rate: int) -> None:
-        """Open the port at this rate and discard a line that was half received."""
+        """Open the port at this baud rate, and discard everything that was received before."""
         self.wire.open(baud_rate)
         self.baud_rate, self.heard = baud_rate, Heard()
         self.forget()
 
     def forget(self) -> None:
-        """Discard the recording after a restart, but keep the results about the board's dialect."""
+        """Discard all received lines, but keep the results of the steps. Called after a restart."""
         self.restarts, self._unanswered_s = Restarts(), 0.0
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
@@ -164,16 +167,16 @@ class Board:
         try:
             self._farewell()
         except BaseException:
-            self._farewell()  # a signal interrupted it; the zeros must still be sent
+            self._farewell()  # a signal interrupted the first call; zeros must still be sent
             raise
         finally:
             self.wire.close()
 
     def _farewell(self) -> None:
-        """Send zeros, then nothing more.
+        """Send zeros several times, but send no more once a motor runs away.
 
-        If the encoder of a motor is reversed, the firmware's speed control makes it run away on
-        zeros. Each further zero would then feed the watchdog that can cut the motor.
+        If an encoder is reversed, the firmware's speed control makes its motor run away even on
+        zeros. Each further line would then keep the watchdog from stopping the motor.
         """
         self.armed, self.restarts.watched = False, False
         try:
@@ -193,7 +196,7 @@ class Board:
 
     @property
     def known(self) -> dict[str, object]:
-        """The results so far. The check restores them before it repeats a check step."""
+        """The values of the attributes in `KNOWN`. The check restores them to repeat a step."""
         return {name: getattr(self, name) for name in KNOWN}
 
     @known.setter
@@ -203,7 +206,7 @@ class Board:
 
     @property
     def line_s(self) -> float:
-        """Time that the wire needs for a line, with some margin, s."""
+        """Time that the wire needs for the longest line, plus a quarter, s."""
         longest = line_bytes(True, self.sealed, self.sampled)
         return 1.25 * wire_ns(longest, self.baud_rate) / NS_PER_S
 
@@ -215,9 +218,9 @@ class Board:
     # Sending
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
-        """Return the line for these speeds, rad/s.
+        """Return the line that commands these speeds, rad/s.
 
-        `comma` says whether the line ends with a comma. None means the form `self.comma`.
+        `comma` says whether the line ends with a comma; None means `self.comma`.
         """
         line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
@@ -226,7 +229,7 @@ class Board:
         return seal(line, self._sequence, ASK_SAMPLE if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
-        """Send one line with these speeds, rad/s. `comma` has the same meaning as in `line`."""
+        """Send one line that commands these speeds, rad/s. The parameters are those of `line`."""
         turned, self._commanded = any(self._commanded), motors
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1
@@ -236,7 +239,7 @@ class Board:
         self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
-        """Send zeros that any firmware accepts: on their own line, with and without the comma."""
+        """Send zeros in all forms: with and without a comma, and with a checksum if `sealed`."""
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
@@ -253,9 +256,9 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send one line of zeros, and listen for its answer for `wait_s` s, at least one period.
+        """Send one line of zeros, and listen for the reply for `wait_s` s, at least one period.
 
-        `comma` has the same meaning as in `line`.
+        `comma` says whether the line ends with a comma; None means `self.comma`.
         """
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
@@ -265,8 +268,9 @@ class Board:
     ) -> list[tuple[float, Reply]]:
         """Send this many lines of zeros, and return the first reply to each with its delay, s.
 
-        After each line the host waits `wait_s` s, at least 1.5 periods. `comma` has the same
-        meaning as in `line`.
+        The wait for a reply takes `wait_s` s, at least 1.5 periods. A line without a reply has no
+        entry in the result. `comma` says whether the lines end with a comma; None means
+        `self.comma`.
         """
         # Replies to earlier lines must not be taken for replies to these lines.
         self.listen(max(motion.GLANCE_S / 4, wait_s))
@@ -280,8 +284,8 @@ class Board:
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
         """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies of that time.
 
-        The time between two lines is `period_s`; 0 means `self.period_s`.
-        Ends the check if the MCU falls silent in that time, because a runaway would go unseen.
+        The time between two lines is `period_s`; 0 means `self.period_s`. Raises `StoppedError` if
+        the board falls silent while `armed`, because this computer could not see a runaway then.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -302,7 +306,7 @@ class Board:
     def let_go(self, silent_s: float) -> None:
         """Send zeros once, then nothing for `silent_s` s.
 
-        In the silence, the watchdog cuts a motor that zeros do not stop.
+        If zeros do not stop a motor, the board's watchdog stops it in this silence.
         """
         self.zeros()
         self.listen(silent_s)
@@ -312,7 +316,8 @@ class Board:
     def listen(self, seconds: float) -> list[Reply]:
         """Receive for `seconds`, and return the replies of that time.
 
-        Raises `StoppedError` if a motor runs away, and `RestartedError` if the board restarts.
+        Raises `StoppedError` if a motor runs away while `armed`, and `RestartedError` if the board
+        restarts.
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
@@ -329,7 +334,6 @@ class Board:
                 return got
 
     def _hear(self, until_ns: int) -> list[Reply]:
-        """Receive until the monotonic time `until_ns`, and return the good replies."""
         got = []
         for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
@@ -376,7 +380,7 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Time since the last reply, s; 0 if there was none, or if nothing more may be sent."""
+        """Time since the last reply, s; 0 before the first reply, and always 0 if `fled`."""
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
@@ -403,10 +407,10 @@ class Board:
         return motion.moving(last, motion.STANDING)
 
     def rest(self) -> None:
-        """Stop all motors and wait until they stand. Ends the check if they do not.
+        """Send zeros until all motors stand. Raises `StoppedError` if a motor keeps turning.
 
-        If the last motor kept its speed, and zeros with the other form of the comma stop it, the
-        check uses that form from then on.
+        If only motor d keeps its speed, and zeros with the other line ending stop it, later lines
+        have that ending. The two endings are with a comma and without one.
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -425,8 +429,8 @@ class Board:
     def settles(self, comma: bool) -> bool:
         """Send zeros until at least two replies show that every motor stands.
 
-        `comma` says whether the lines end with a comma.
-        Returns False if this takes longer than `MOTOR_S`, or than `PATIENCE_S` while a motor slows.
+        `comma` says whether the lines end with a comma. Returns False if this takes longer than
+        `MOTOR_S`, or longer than `PATIENCE_S` while a motor still slows down.
         """
         began_s = self.now_s
         while True:

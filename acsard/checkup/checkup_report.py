@@ -20,21 +20,21 @@ Changes = dict[str, object]
 """New configuration values by dotted key, such as `mcu.port`."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
-"""Keys that only improve the link. They are left out if the wire is too slow for longer lines.
+"""Keys that improve the link but make its lines longer.
 
-The first key is left out first.
+If the wire is too slow for longer lines, the advice leaves out the first key, then also the second.
 """
 
 
 def answered(findings: Iterable[Finding]) -> bool:
-    """Return whether a board answered at the port, that is, whether its baud rate was found."""
+    """Return whether a board answered at the port. It did if the check found its baud rate."""
     return any(finding.name == "baud rate" and finding.keys for finding in findings)
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
-    """Return the configuration values to change.
+    """Return the changes of the configuration that the findings suggest.
 
-    They include `port` as `mcu.port` unless it is "" or no board answered there.
+    They include `mcu.port` with the value `port`, unless that is "" or no board answered there.
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -57,9 +57,9 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
 
 def withheld(simulated: bool, config: Config) -> str:
-    """Return why the findings do not apply to this configuration, or "" if they do.
+    """Return why the findings do not apply to the robot of this configuration, or "" if they do.
 
-    `simulated` says whether the check tested the simulator. Its findings do not apply to a robot.
+    `simulated` says whether the check tested the simulator, whose findings apply to no robot.
     """
     if not simulated or config.mcu.simulated:
         return ""
@@ -82,10 +82,11 @@ def applied(given: Changes, config: Config) -> Config | None:
 
 
 class Report(Struct, frozen=True):
-    """A check that has ended.
+    """The result of a check.
 
-    `toml` contains the changes as lines of TOML. `written` is the file to which they were written,
-    or None. `error` is a failure that does not concern the board, or None.
+    `changes` are the suggested configuration values, and `toml` contains them as lines of TOML.
+    `written` is the file to which they were written, or None. `error` is a failure that is not the
+    board's fault, or None.
     """
 
     port: str
@@ -109,8 +110,8 @@ def report(
 ) -> Report:
     """Return the report of a check.
 
-    A check has passed only if the board answered, every step was reached and judged, and none
-    failed. An empty `written`, `error` or `withheld` is None in the report.
+    A check has passed if the board answered, every step was run and judged, and no step failed. If
+    `written`, `error` or `withheld` is "", the report contains None instead.
     """
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)
@@ -121,9 +122,10 @@ def report(
 
 
 def summary(found: Report, where: str) -> str:
-    """Return a text with the numbers of verdicts and unjudged findings, and the lines for `where`.
+    """Return the last lines that the check prints.
 
-    `where` is the name of the configuration file.
+    They give the number of findings with each verdict, the number of steps that were not judged,
+    and the lines of TOML for the configuration file, whose name is `where`.
     """
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)

@@ -18,8 +18,8 @@ WHOLE = {"over-long", "garbage before it"}
 def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
     """Return the damaged lines, each with the name of its kind of damage.
 
-    The lines command `SPEED` for `motors` and zero for the others. `comma` says whether they end
-    with a comma. `sealed` adds lines with a damaged checksum.
+    The lines command `SPEED` for `motors` and zero for the other motors. With `comma`, the lines
+    end with a comma. With `sealed`, the result includes lines with a damaged checksum.
     """
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
@@ -54,7 +54,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     if not motors:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
-    board.drive(ZERO, GLANCE_S)  # a coarse encoder may show only now that the motors ran on
+    board.drive(ZERO, GLANCE_S)  # a coarse encoder may report an earlier movement only now
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))

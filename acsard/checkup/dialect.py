@@ -1,7 +1,8 @@
-"""The microcontroller's dialect: baud rate, identification, form of lines, checked link and pace.
+"""Steps of the check that find out how the board communicates.
 
-The pace is how often and how soon the board answers, and whether it reports by its own clock. These
-steps send only zeros and questions. Later steps use the results.
+They determine the baud rate, the board's identification, the form of its lines, whether it supports
+the checked link, how often and how soon it replies, and whether it reports by its own clock. They
+send only zeros and questions. Later steps use the results.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from acsard.core.link.session import IDENTITY
 
 
 def baud(board: Board) -> Finding:
-    """Find the baud rate at which the board answers. Ends the check if it answers at no rate."""
+    """Find the baud rate at which the board answers. Raises `StoppedError` if there is none."""
     configured = board.mcu.baud_rate
     if board.baud_rate != configured:
         board.open(configured)  # the board restarted while another rate was being tried
@@ -40,7 +41,7 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros as plain and as checked lines until three good replies have arrived.
+    """Send zeros, with and without a checksum, until three good replies have arrived.
 
     Returns False if they do not arrive within `seconds`.
     """
@@ -57,7 +58,7 @@ def _knock(board: Board, seconds: float) -> bool:
 
 
 def identity(board: Board) -> Finding:
-    """Ask for the board's identification. Ends the check if the answer is an echo."""
+    """Ask for the board's identification. An echo of the question raises `StoppedError`."""
     board.others.clear()
     for _ in range(3):  # the question or its answer may be lost
         board.restarts.asked(board.now_s)
@@ -77,10 +78,10 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Check whether the board answers lines that end as configured, with or without a comma.
+    """Check whether the board answers lines with the configured ending: with or without a comma.
 
-    If it answers only lines with the other ending, that ending is used from then on, and the
-    finding says so. Returns None in all other cases.
+    If the board answers only lines with the other ending, later lines have that ending, and the
+    returned finding says so. Returns None in all other cases.
     """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
@@ -95,9 +96,9 @@ def _answers(board: Board, comma: bool) -> list[Reply]:
 
 
 def comma(board: Board, dead: bool) -> Finding:
-    """Return the finding about the comma at the end of the line, which the last motor may need.
+    """Return the finding about a comma at the end of lines. Some firmware needs it for motor d.
 
-    `dead` is True if the last motor was not seen to move, or if its movement could not be measured.
+    `dead` is True if motor d was not seen to move, or if its movement could not be measured.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
@@ -108,9 +109,9 @@ def comma(board: Board, dead: bool) -> Finding:
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
-    """Return the finding that the configured form of the comma is wrong.
+    """Return the finding that `mcu.trailing_comma` is wrong. `board.comma` is the right value.
 
-    `board.comma` is the right form. `how` is the second part of the outcome's name.
+    `how` is the second part of the outcome's name.
     """
     return outcomes.find(
         f"trailing comma: {how}",
@@ -123,7 +124,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Compare the replies with the documented form. The host can read all replies found here."""
+    """Compare the form of the replies with the documented form. The daemon can read both forms."""
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
@@ -137,7 +138,8 @@ def replies(board: Board) -> Finding:
 def check(board: Board) -> Finding:
     """Find out whether the board supports the checked link and the sample fields.
 
-    Later steps use the checked link and the sample fields if the board supports them.
+    The checked link adds a checksum to each line. The sample fields of a reply are the board's
+    clock and its encoder counts. Later steps use both if the board supports them.
     """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True
@@ -154,11 +156,11 @@ def check(board: Board) -> Finding:
 
 
 def rate(board: Board) -> Finding:
-    """Measure how often the board answers at the host's rate, and whether it reports unasked."""
+    """Measure how often the board replies, and find out whether it reports by its own clock."""
     board.paced = True
     board.listen(GLANCE_S / 4)
     unasked = board.listen(CUT_S)
-    # Lines that were delayed here or at the board all arrive at once, so they span no time.
+    # Late replies to earlier lines all arrive at once, so they span no time.
     board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > GLANCE_S
     highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
@@ -192,7 +194,7 @@ def rate(board: Board) -> Finding:
 
 
 def trip(board: Board) -> Finding:
-    """Measure how soon the board answers a line."""
+    """Measure the time from sending a line to the board's reply."""
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:

@@ -1,4 +1,4 @@
-"""Compares the counts in the sample fields with the speeds, to find the counts per wheel turn."""
+"""Finds the encoder counts per wheel turn, from the counts and the speeds in the replies."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ AGREES = 0.02
 """Largest relative difference between the measured and the stated counts per turn."""
 
 ALIKE = 0.75
-"""Smallest ratio of the counts per turn of two motors that are taken to be the same.
+"""Smallest ratio of two motors' measured counts per turn that still count as equal.
 
-A coarse encoder shows the counts of one motor only roughly.
+The ratio is low, because with a coarse encoder the measurement of a single motor is rough.
 """
 
 COARSE = 0.015
-"""Mean jump of a motor's angle from line to line, rad. An encoder with this jump or more is coarse.
+"""Smallest mean jump of a motor's angle from line to line, rad, that shows a coarse encoder.
 
-The daemon must know the counts per turn of a coarse encoder.
+The daemon must know the counts per turn of such an encoder.
 """
 
 LONGEST_S = 0.05
-"""Longest time between two lines, s, for which jumps can show a coarse encoder.
+"""Longest time between two lines, s, with which jumps of the speed can show a coarse encoder.
 
-In a longer time, the motors' own accelerations look like such jumps.
+With a longer time, the motors' own accelerations look like such jumps.
 """
 
 LEAST_ANGLES = 20
-"""Smallest number of speeds of turning motors that can show a coarse encoder."""
+"""Smallest number of nonzero speed readings that can show a coarse encoder."""
 
 MOST_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""
 
 
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Return the encoder counts per wheel turn, measured against the reported speeds.
+    """Return the encoder counts per wheel turn of these motors, on average.
 
-    The result is negative if the counts run against the speeds, and None if the motors turned too
+    This is the change of the counts divided by the angle that follows from the reported speeds. The
+    result is negative if the counts run against the speeds, and None if the motors turned too
     little.
     """
     counts = angle = 0.0
@@ -58,10 +59,10 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
 
 def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Estimate the counts per turn of coarse encoders from speeds, for lines without counts.
+    """Estimate the counts per turn of coarse encoders from the jumps of the reported speeds.
 
-    Return None if the speeds do not jump from line to line by a count of a coarse encoder, or if
-    there are too few speeds.
+    This is for replies without counts. Returns None if the encoders are not coarse, if there are
+    too few speeds, or if the replies are too rare (`LONGEST_S`).
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
     # The time of a single line may be wrong if this computer is late.
@@ -82,10 +83,10 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Return the finding that compares `mcu.encoder_counts` with the board.
+    """Return the finding about `mcu.encoder_counts`, the configured counts per wheel turn.
 
-    The board may state its counts per turn in its identification. The check also measures them with
-    `motors`, which turned as commanded.
+    The configured value is compared with the one in the board's identification, if it names one,
+    and with a measurement. The measurement uses `motors`, which turned as commanded.
     """
     if not board.sampled:
         about = coarse(board.replies, motors)
@@ -110,17 +111,17 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         shown = ", ".join(f"{LETTERS[motor]} {counts:.0f}" for motor, counts in each.items())
         return outcomes.find("encoder counts: unequal", unused, shown=shown)
     if measured is None:
-        counts, how = named, "by its identification; not measured"
+        counts, how = named, "stated by the firmware; not measured"
     elif not named:
         near = abs(measured - configured) <= AGREES * configured
         if board.lost and not near:
             return outcomes.find("encoder counts: damaged", share=board.lost)
         counts = configured if near else round(measured)
-        how = f"measured against its speeds, {measured:.0f} within {AGREES:.0%}"
+        how = f"measured against the speeds, {measured:.0f} within {AGREES:.0%}"
     elif abs(measured - named) > AGREES * named:
         return outcomes.find("encoder counts: misnamed", named=named, measured=measured)
     else:
-        counts, how = named, f"by its identification; measured {measured:.0f}"
+        counts, how = named, f"stated by the firmware; measured {measured:.0f}"
     if counts > MOST_COUNTS:
         return outcomes.find("encoder counts: many", unused, counts=counts, most=MOST_COUNTS)
     right, off = configured in (0, counts), abs(configured / counts - 1)

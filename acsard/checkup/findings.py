@@ -1,4 +1,4 @@
-"""Results of the check: one `Finding` per subject, and the errors that end a check early."""
+"""Results of `acsard mcu check`: one `Finding` per subject, and the errors that end it early."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acsard.core.values import WHEELS, AcsardError
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
 REST = "the rest"
-"""Name of the row that lists the steps that were not run because the check ended early."""
+"""Name of the finding that lists the steps that were not run because the check ended early."""
 
 
 class Finding(Struct, frozen=True):
@@ -33,7 +33,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """Early end of the check. `finding` is the reason."""
+    """Ends the check early. `finding` tells the operator why."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
@@ -41,11 +41,14 @@ class StoppedError(AcsardError):
 
 
 class WireLostError(AcsardError):
-    """Loss of the serial line: it was unplugged, or its driver hangs."""
+    """The serial port was lost: the device was unplugged, or its driver hangs."""
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
-    """Return the configured wheel of a motor, and 1 or -1 for its forward direction."""
+    """Return the wheel that a motor (0 to 3) turns according to the configuration, and a sign.
+
+    The sign is -1 if a positive speed of the motor turns the wheel backward, else 1.
+    """
     for wheel in WHEELS:
         entry = getattr(mcu.wheels, wheel)
         if entry[1] == LETTERS[motor]:
@@ -59,7 +62,7 @@ def words(wheel: str) -> str:
 
 
 def motor_name(mcu: McuConfig, motor: int) -> str:
-    """Return the letter of a motor and its configured wheel: `motor d (rear right)`."""
+    """Return a text such as "motor d (rear right)" for motor 3 and its configured wheel."""
     return f"motor {LETTERS[motor]} ({words(wheel_of(mcu, motor)[0])})"
 
 

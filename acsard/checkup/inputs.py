@@ -14,25 +14,25 @@ from acsard.checkup.findings import Finding
 from acsard.core.config.settings import SafetyConfig
 
 PRESS_S = 20.0
-"""Time that the operator has to press an input and to release it, s."""
+"""Time in which the operator must press an input and release it, s."""
 
 NEWS_S = 0.5
 """Time within which a board has reported each of its inputs at least once, s."""
 
 
 class Input(Struct, frozen=True):
-    """An input of the board."""
+    """An input of the board: the emergency stop or a bumper."""
 
     number: int
-    """0 for the emergency stop; the bumpers follow from 1 in the order of the board."""
+    """0 for the emergency stop, and 1, 2, ... for the bumpers in the order of the status line."""
     name: str
 
 
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
-    """Let the operator press each input that the configuration names or the board reports.
+    """Let the operator press each input, and return a finding about the board's reports of it.
 
-    The configuration names the bumpers by their places. If it names none, the bumpers have the
-    numbers that the board gives them.
+    The inputs are those that the configuration requires or the board reports. A bumper is named by
+    its configured place, or by its number on the board if no places are configured.
     """
     board.ask(NEWS_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
@@ -77,7 +77,7 @@ def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]
             break
     others = [each.name for each in inputs if each.number in seen - {asked.number}]
     if asked.number not in seen:
-        instead = f" but of the {' and the '.join(others)}" if others else ""
+        instead = f"; instead that of the {' and the '.join(others)}" if others else ""
         return f"{asked.name}: no press was reported{instead}"
     if others:
         return f"{asked.name}: the board also reported the {' and the '.join(others)}"

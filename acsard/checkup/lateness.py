@@ -1,9 +1,9 @@
-"""Measures the lateness of this computer, and decides which findings it spoils.
+"""Measures the lateness of this computer, and decides which findings may be wrong because of it.
 
 An overloaded computer sends and receives late, and so finds faults that the board does not have. If
-the board is itself a program on this computer, the time for which it waits for a processor is
-lateness as well. A step during which this computer was too late is repeated (`procedure.py`), and
-its finding is never blamed on the board.
+the board is a program on this computer, the time for which that program waits for a processor is
+lateness as well. A step during which this computer was too late is repeated (`procedure.py`). If it
+is too late each time, the finding says so and does not blame the board.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ LEAST_S = 0.005
 """Smallest delay that is recorded, s. Every computer has smaller ones now and then."""
 
 SPOILS_S = motion.PERIOD_S
-"""Smallest delay of this computer that can cause a bad finding, s: a whole line was late."""
+"""Smallest delay of this computer that can cause a bad finding, s: the time between two lines."""
 
 PAUSE_S = motion.WATCHDOG_LEAST_S
 """Smallest delay of this computer that makes even a good finding doubtful, s.
 
-The watchdog may have cut the motors in that time.
+The board's watchdog may have stopped the motors in that time.
 """
 
 
@@ -32,7 +32,7 @@ LATE = "late: not judged"
 
 
 class Lateness:
-    """The delays with which this computer woke up, and the times at which they ended, both in s."""
+    """Record of the delays with which this computer woke up from waiting."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[float, float]] = []
@@ -48,26 +48,26 @@ class Lateness:
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
-    """Return whether a computer that was late by up to `late_s` s may have caused the finding.
+    """Return whether the finding may be wrong because this computer was late by up to `late_s` s.
 
-    The computer may have been late both at the start and at the end of a measurement, so half of
-    the finding's margin is enough.
+    Half of the finding's margin is enough, because the computer may have been late both at the
+    start and at the end of the measurement.
     """
     least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
     return late_s >= max(least_s, found.margin_s / 2)
 
 
 def finding(name: str, late_s: float) -> Finding:
-    """Return the finding that the step `name` was not judged, because this computer was late."""
+    """Return the finding that the step `name` was not judged because this computer was late."""
     return outcomes.find(LATE, name=name, late=late_s * 1000)
 
 
 def judged(found: Finding) -> bool:
-    """Return whether the finding says anything about the board."""
+    """Return False if the finding says only that this computer was too late to judge the step."""
     return found.figure != outcomes.MANUAL[LATE].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:
-    """Return the names of the subjects whose last finding says that they were not judged."""
+    """Return the names of the steps that were not judged, according to their last findings."""
     last = {found.name: found for found in findings}
     return [name for name, found in last.items() if not judged(found)]

@@ -1,9 +1,8 @@
 """Counts lost and damaged lines, and finds long silences of the board and the direction of a loss.
 
-A reply that arrives damaged was damaged on its way from the board. An unanswered line may have been
-lost in either direction, and the motors show the direction: the check sends single lines that turn
-standing motors for a moment. If the motors obeyed an unanswered line, the line arrived, so its
-answer was lost.
+A reply that arrives damaged was damaged on its way from the board. If a line has no reply, either
+the line or its reply was lost. To find out which, the check sends single lines that turn standing
+motors for a moment. If the motors obey a line without a reply, the reply was lost.
 """
 
 from __future__ import annotations
@@ -24,25 +23,26 @@ from acsard.core.link.link_diagnosis import SHOWN
 from acsard.core.link.session import IDENTITY
 
 MOST = 0.02
-"""Largest fraction of lines that may be lost. A sound link loses none."""
+"""Largest fraction of lost lines that the check accepts. A sound link loses none."""
 
 FEW = 2
-"""Smallest number of lost lines that does not count as a coincidence."""
+"""Smallest number of lost lines that counts as a fault. Fewer may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""Number of lines that show a loss of 2 %, and shortest and longest duration of the count, s.
+"""Duration of the count of lost lines. `LINES` is enough to show a loss of 2 %.
 
-The count ends early if no line is lost, and takes longer on a slow wire.
+The count takes at least `LEAST_S` s. If lines were lost, it goes on until `LINES` lines are counted
+or `MOST_S` s have passed.
 """
 
 SILENT = 2.0
-"""Multiple of the usual gap above which a gap between two answers counts as a silence."""
+"""Smallest ratio of a gap between two replies to the usual gap that counts as a silence."""
 
 
 class Count(Struct, frozen=True):
-    """Numbers of all lines and of the lost ones.
+    """Numbers of all lines, of the lost ones, and of those that arrived damaged.
 
-    `lost` includes the `damaged` lines, which arrived damaged.
+    `lost` includes the `damaged` lines.
     """
 
     lines: int
@@ -56,14 +56,15 @@ class Count(Struct, frozen=True):
 
 
 def finding(board: Board) -> Finding:
-    """Send zeros at the host's rate, count the replies, and set `board.lost`.
+    """Send zeros at the control rate, count the lost replies, and set `board.lost`.
 
-    Ends the check if plain lines arrive damaged: lines to the board may then be damaged too, and
-    could command any speed. The loss cannot be determined if the board's pace is unknown.
+    Raises `StoppedError` if many lines are lost, some arrive damaged, and lines have no checksum:
+    lines to the board may then be damaged too, and could command any speed. If the rate of the
+    replies was not measured, the finding says that the loss is not judged.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
-    board.listen(motion.GLANCE_S)  # replies after this wait answer the lines that are sent now
+    board.listen(motion.GLANCE_S)  # later replies belong to the lines that are sent after this
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
@@ -95,7 +96,7 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """Return the host's period, or a longer one if the board answers less often."""
+    """Return the time between two lines, s: at least the control period, more for a slow board."""
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > 1.5 * period_s:
@@ -117,10 +118,10 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 
 
 def _left_out(replies: Sequence[Reply]) -> int:
-    """Return the number of missing replies among evenly spaced ones.
+    """Return the number of missing replies of a board that sends them at regular intervals.
 
-    It is computed from the whole time, because a reply that is received late makes one gap longer
-    and the next one shorter.
+    It follows from the time between the first and the last reply. Single gaps would not show it,
+    because a reply that is received late makes one gap longer and the next one shorter.
     """
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
@@ -129,39 +130,42 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """Return the longest gap that the host would take for a lost link, s, or 0 if there is none."""
+    """Return the longest gap between replies, s, or 0 if no gap would look like a lost link."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0
 
 
 PULSE_S = 0.08
-"""Time for which a pulse turns the motors, s. The motors visibly move, but no watchdog acts yet."""
+"""Time from a pulse to the zeros after it, s. A pulse is a single line that turns the motors.
+
+The encoders show the movement, but the board's watchdog does not act yet.
+"""
 
 TOLD, PULSES_S = 8, 20.0
-"""Number of unanswered pulses that show the direction of the loss.
+"""Number of pulses without a reply that show the direction of the loss, and the longest search, s.
 
-`PULSES_S` is the longest time to wait for them, s.
+A pulse is a single line that turns the motors for a moment.
 """
 
 SPREAD, STRIDE = 12, 5
-"""Number of different pauses between pulses, and the stride by which they are ordered.
+"""Number of different pauses after pulses, and the step from one pause to the next.
 
-With equal pauses, losses at regular intervals could miss every pulse.
+The pauses differ because losses at regular intervals could miss every pulse otherwise.
 """
 
 OBEYED = 0.5
-"""Fraction of the usual angle of a pulse above which the motors obeyed it."""
+"""Smallest angle of a pulse that the motors obeyed, as a fraction of the usual angle."""
 
 SEEN, GRAINS = 0.02, 4
-"""Smallest usable angle of a pulse, in rad and in steps of the encoders; the larger one applies."""
+"""Smallest usual angle of a pulse that can be judged: `SEEN` rad and `GRAINS` encoder steps."""
 
 
 class Ways(Struct, frozen=True):
     """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
 
-    `sent` counts all pulses, `there` those that were lost on the way to the board, and `back` those
-    that the motors obeyed although no answer arrived.
+    `sent` counts all pulses. `there` counts those that were lost on the way to the board, and
+    `back` those whose reply was lost: the motors obeyed them.
     """
 
     sent: int
@@ -170,10 +174,10 @@ class Ways(Struct, frozen=True):
 
 
 def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
-    """Find out whether lines are lost on the way to the board or back.
+    """Find out whether lines are lost on the way to the board, or replies on the way back.
 
-    `motors` are motors that turn as commanded: their encoders show which commands arrived. Returns
-    None if no line is known to be lost.
+    `motors` turn as commanded, so their encoders show which lines arrived. Returns None if the
+    board replies to lines and few of them are lost.
     """
     if not (board.own_clock or board.lost > MOST):
         return None
@@ -191,12 +195,12 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
-    """Send pulses to standing motors and count the losses.
+    """Send pulses, single lines that turn standing motors for a moment, and count the lost ones.
 
-    Return None if the movement of `motors` does not show which pulses arrived.
+    Returns None if the movement of `motors` does not show which pulses arrived.
     """
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
-    # A board that reports by its own clock answers no line, so nothing has shown any loss yet.
+    # If the board reports by its own clock, no loss is known yet, so a shorter search is enough.
     end_s = board.now_s + (10.0 if board.own_clock else PULSES_S)
     every: list[float] = []
     unanswered: list[float] = []
@@ -228,20 +232,20 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether none of the board's own reports since `since_s` is missing."""
+    """Return True if no report is missing since `since_s`, s, of a board with its own clock."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 
 
 def _grain(board: Board, motors: Sequence[int]) -> float:
-    """Return the smallest angle above 0 that these encoders showed between two replies, rad."""
+    """Return the smallest nonzero angle that these encoders turned between two replies, rad."""
     course = motion.steps(board.replies)
     shown = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
     return min((angle for angle in shown if angle), default=0.0)
 
 
 def _stand(board: Board) -> bool:
-    """Wait until the motors stand. Return False if they are too slow for pulses."""
+    """Wait until the motors stand. Return False if they coast too long for more pulses."""
     began_s = board.now_s
     while board.turning():
         if board.now_s - began_s > motion.MOTOR_S / 2:

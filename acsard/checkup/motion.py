@@ -1,4 +1,4 @@
-"""Evaluates the motors' movement in a recording: pure functions of replies and their times.
+"""Evaluates the movement of the motors from the board's replies. The functions are pure.
 
 The module also defines the speeds, rad/s, and times, s, that several steps of the check share. A
 limit that only one step uses is defined in the module of that step.
@@ -53,17 +53,17 @@ TREND_S = 0.5
 """Shortest length of the two intervals whose mean speeds `trend` compares, s."""
 
 FALLS = 0.97
-"""Ratio of a motor's speed to its speed just before, below which the motor slows down.
+"""Largest ratio of a motor's speed to its speed just before that means that the motor slows down.
 
-Above the inverse of this ratio, the motor speeds up.
+If the ratio is larger than the inverse of this number, the motor speeds up.
 """
 
 
 class Reply(Struct, frozen=True):
-    """A good line of the MCU with the speeds of its motors, rad/s.
+    """A valid reply of the board, with the speeds of its four motors, rad/s.
 
-    `at_s` is the monotonic time at which the line was complete, s. `reading` contains the sample
-    fields, or is None if the line has none.
+    `at_s` is the monotonic time at which the line was complete, s. `line` is its text. `reading`
+    contains the board's clock and encoder counts, or is None if the line has none.
     """
 
     at_s: float
@@ -76,8 +76,9 @@ class Step(Struct, frozen=True):
     """The interval between two replies.
 
     `seconds` is its duration on this computer's clock. `speeds` are the speeds in the later reply,
-    rad/s. If both replies have the sample fields, `mcu_s` is the duration on the MCU's clock, s,
-    and `counts` is the number of counts by which each encoder moved, -32768 to 32767.
+    rad/s. If both replies contain the board's clock and encoder counts, `mcu_s` is the duration on
+    the board's clock, s, and `counts` is the number of counts by which each encoder moved, -32768
+    to 32767.
     """
 
     seconds: float
@@ -93,7 +94,7 @@ def each(value: Callable[[int], float]) -> Motors:
 
 
 def moving(speeds: Motors, least: float = MOVES) -> list[int]:
-    """Return the motors that turn at `least` rad/s or faster, in either direction."""
+    """Return the numbers of the motors that turn at `least` rad/s or faster, in any direction."""
     return [motor for motor in range(4) if abs(speeds[motor]) >= least]
 
 
@@ -122,7 +123,7 @@ def steps(replies: Sequence[Reply]) -> Iterator[Step]:
 
 
 def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
-    """Return the angle that each encoder turned since `since_s`, rad.
+    """Return the angle that each encoder turned since the monotonic time `since_s`, s, in rad.
 
     `per_turn` is the number of encoder counts per turn. If it is 0, or if a reply has no counts,
     the angle is computed from the speeds.
@@ -138,11 +139,11 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 
 
 def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
-    """Return the motors that turn at `now_s`, or may still turn between two encoder counts.
+    """Return the numbers of the motors that may still turn at the monotonic time `now_s`, s.
 
-    A coarse encoder shows nothing in most replies, even if its motor is faster than `STANDING`. The
-    last reading above `STANDING` is therefore taken as an angle. If nothing more shows for the time
-    that a motor at the speed `STANDING` needs for this angle, the motor stands.
+    A coarse encoder reports a speed of 0 in most replies, even while its motor turns. So a motor
+    counts as turning for some time after its last speed above `STANDING`. This is the time in which
+    a motor at the speed `STANDING` would turn by the angle between that reply and the one before.
     """
     found: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):
@@ -159,9 +160,10 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
 
 
 def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
-    """Return the ratio of each motor's mean speed until `now_s` to its mean speed just before.
+    """Return the ratio of each motor's mean speed now to its mean speed just before.
 
-    `gap_s` is the time between two replies, s. The ratio is 1 for a motor that stands.
+    The means are over two intervals of equal length, the second of which ends at `now_s`. `gap_s`
+    is the time between two replies, s. The ratio is 1 for a motor that stands.
     """
     span_s = max(TREND_S, 4 * gap_s)
     before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
@@ -171,11 +173,12 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
 
 
 def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
-    """Return the resolution of the speed readings as a time, s.
+    """Return the resolution of the speed readings, expressed as a time, s.
 
-    The readings jump, because the firmware counts whole encoder counts per reply. The result is the
-    time that a motor at `SPEED` needs for the angle of one jump. `steady` are replies from a time
-    at which `motors` turned at this speed. The result is 0 for fewer than five replies.
+    The readings jump, because the firmware counts whole encoder counts between two replies. The
+    result is the time in which a motor at `SPEED` turns by the angle of one jump. `steady` are the
+    replies of a time in which `motors` turned at this speed. The result is 0 for fewer than five
+    replies.
     """
     if len(steady) < 5:
         return 0.0
@@ -188,10 +191,9 @@ def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
 def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
     """Return a motor that certainly turns faster than `above` rad/s, and its speed, or None.
 
-    One reading proves nothing, because it may be damaged or a single count of a coarse encoder. The
-    largest of the last few steps is therefore ignored. The function examines a short and a longer
-    interval: the short one shows a sudden runaway sooner, and the longer one shows it with a coarse
-    encoder.
+    One reading proves nothing: it may be damaged, or show a single count of a coarse encoder. The
+    function therefore ignores the largest reading of each interval. It examines a short interval,
+    which shows a runaway sooner, and a longer one, which shows it even with a coarse encoder.
     """
     for span_s in (GLANCE_S / 2, GLANCE_S) if replies else ():
         near = since(replies, replies[-1].at_s - span_s)

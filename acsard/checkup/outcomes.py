@@ -1,6 +1,7 @@
-"""All printed texts of the check, and the findings with these texts.
+"""The texts of all findings of the check.
 
-A check step names its outcome and gives the measured figures for the text.
+A step calls `find` with the name of an outcome and with the measured values, which `find` inserts
+into the texts of that outcome.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ FAIL baud rate: other | {rate}, not {configured} baud
     -> write mcu.baud_rate = {rate}; the check goes on with it
 FAIL baud rate: nothing | nothing received
     {heard} at {configured} baud, and no good line at any other
-    -> is this the right port (`acsard ports`), has the board power, does its firmware answer, are
-    TX and RX swapped?
+    -> is this the right port (`acsard ports`), does the board have power, does its firmware answer,
+    are TX and RX swapped?
 FAIL baud rate: cut | pieces of lines
     at {configured} baud {heard}; no good line at any other
     -> the firmware cuts its replies short or omits the line end: it must send all four values and
@@ -39,12 +40,13 @@ FAIL baud rate: garbage | only garbage
     port (`acsard ports`), and is the board's ground connected to the computer's?
 FAIL baud rate: few | few good lines
     at {configured} baud {heard}; fewer good lines at any other
-    -> use a short cable away from the motors' leads, one ground, a lower baud rate at both ends
+    -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
+    ends
 FAIL baud rate: statuses | only status lines
     at {configured} baud {heard}; no good line at any other
     -> the board hears nothing: connect this computer's TX to the board's RX
 FAIL baud rate: sparse | good lines, but too seldom
-    at {configured} baud {heard}, all of them good; no good line at any other
+    at {configured} baud {heard}; no good line at any other
     -> the board must answer each line, or report by its own clock at least every 0.25 s; does
     delay() or a slow print block its loop?
 
@@ -65,7 +67,7 @@ PASS? reply rate: right | {rate:.0f} Hz, {way}
     longest gap {longest:.0f} ms
 WARN? reply rate: lossy | {rate:.0f} Hz, {way}
     only {answered:.0%} of the lines were answered
-    -> odometry has only this rate; a step below counts lost lines
+    -> odometry is computed only at this rate; a later step of this check counts lost lines
 FAIL? reply rate: slow | {rate:.0f} Hz, {way}
     one reply in {gap:.0f} ms: the daemon takes {quiet:.0f} ms of silence for a lost link
     -> write mcu.reply_period = {period:g}, or let the firmware answer every line
@@ -79,15 +81,16 @@ FAIL? reply rate: none | too few replies
 PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
 WARN? round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
     the wheel speeds arrive late
-    -> does the firmware wait? an FTDI chip waits for 16 ms unless its latency_timer is 1 (`doctor`)
+    -> does the firmware wait? an FTDI chip waits for 16 ms unless its latency_timer is 1
+    (`acsard doctor` checks it)
 SKIPPED round trip: own clock
-    the board reports by its own clock, so a reply belongs to no line
+    the board reports by its own clock, so its replies do not answer single lines
 SKIPPED? round trip: none
     no single line was answered
 
 PASS checked link: in use | {figure}
 PASS checked link: off | {figure}
-    the firmware supports it, but it is switched off: the lines below switch it on
+    the firmware supports the checked link, but mcu.link_check is off: the lines below switch it on
 SKIPPED? checked link: plain | plain
     the firmware answers without a check, so a damaged line can carry a wrong speed
 FAIL? checked link: required | none
@@ -102,20 +105,22 @@ WARN? lost lines: late | none of {lines}, but silent for {silent:.0f} ms
     -> use another USB port without a hub, and no USB power saving; does the firmware wait
     somewhere?
 FAIL? lost lines: back | {share:.0%} of {lines}
-    {damaged} arrived damaged from the board, the last `{last}`
+    {damaged} arrived damaged from the board, the last one is `{last}`
     -> check the lead from the board's TX to the computer's RX; use a short cable away from the
-    motors' leads, one ground, a lower baud rate at both ends
+    motors' leads, a common ground, or a lower baud rate at both ends
 FAIL? lost lines: both | {share:.0%} of {lines}
-    {damaged} arrived damaged from the board, the last `{last}`; others were lost on the way there
-    or back
-    -> use a short cable away from the motors' leads, one ground, a lower baud rate at both ends
+    {damaged} arrived damaged from the board, the last one is `{last}`; others were lost on the way
+    there or back
+    -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
+    ends
 FAIL? lost lines: either | {share:.0%} of {lines}
     these lines had no answer: either the line or its answer was lost; see below
-    -> use a short cable away from the motors' leads, one ground, a lower baud rate at both ends
+    -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
+    ends
 FAIL? lost lines: silent | {share:.0%} of {lines}
     this share of the board's own reports did not arrive
     -> check the lead from the board's TX to the computer's RX; use a short cable away from the
-    motors' leads, one ground, a lower baud rate at both ends
+    motors' leads, a common ground, or a lower baud rate at both ends
 
 PASS lost where: not seen | none of {sent} more
 FAIL? lost where: there | {there} of {sent} there, {back} back
@@ -150,10 +155,10 @@ FAIL? motor: dead, not seen | {figure}
     driver, fuse and leads of motor {here}
 FAIL? motor: dead, still | {figure}
     motor {here} does not turn
-    -> check driver, fuse, enable and leads of motor {here}
+    -> check the driver with its enable input, the fuse and the leads of motor {here}
 FAIL? motor: dead, turns | {figure}
     the wheel turns, but encoder {here} shows nothing: the encoder is dead
-    -> check supply, plug and A and B of encoder {here}
+    -> check the supply, the plug and the A and B leads of encoder {here}
 FAIL motor: reversed, not seen | {figure}
     encoder {here} counts against motor {here}; no configuration can fix that
     -> swap the two leads of motor {here} if the wheel turns the wrong way, otherwise A and B of
@@ -175,7 +180,7 @@ FAIL motor: other, motor | {shown}
     motor {here} moves encoder {there}: two motors or two encoders are swapped{reversed}
     -> the encoder is right: swap the leads of motors {here} and {there}
 FAIL? motor: several | {shown}
-    other encoders than {here}'s move too, or not the same ones in each direction
+    other encoders than {here} move too, or different encoders move in the two directions
     -> are wheels coupled, or are leads of two motors or encoders swapped?
 FAIL? motor: one way | {figure}
     motor {here} shows movement in one direction only
@@ -208,21 +213,22 @@ FAIL wheel map: other | {map}
     this differs from the configuration: {wheels}
     -> write the [mcu.wheels] lines below
 FAIL wheel map: twice
-    by the answers, two motors turn the {wheel} wheel
+    according to your answers, two motors turn the {wheel} wheel
     -> fix the motors above, and check again
 
 SKIPPED encoder counts: none
     the firmware sends no counts
 WARN? encoder counts: coarse | about {about:.0f} per turn
     the firmware sends no counts, and its speeds jump by one count of a coarse encoder from line to
-    line: the pose turns by degrees in one square unless the daemon knows the counts
-    -> write mcu.encoder_counts = the exact counts per wheel turn: those of the encoder times the
-    gear ratio, four for each pulse of two channels
+    line: after one square of driving the heading is wrong by degrees unless the daemon knows the
+    counts
+    -> write mcu.encoder_counts = the exact counts per wheel turn: the encoder's counts times the
+    gear ratio (two channels give four counts for each pulse)
 SKIPPED encoder counts: damaged
     {share:.1%} of the lines are lost, so the counts of the rest cannot be measured
     -> fix the lost lines above, and check again
 SKIPPED encoder counts: not turned
-    the wheels turned too little to measure them
+    the wheels turned too little to measure the counts
 FAIL encoder counts: unequal | {shown} per turn
     the counts of the motors do not agree, but the daemon takes the same counts per turn for all
     -> the firmware must compute counts and speeds of every motor with the same counts per turn
@@ -230,10 +236,10 @@ FAIL encoder counts: backward | {measured:.0f} per turn
     the counts of {names} run against the speeds, or do not change: the pose would be wrong
     -> the firmware must count up when a motor turns in its p direction
 FAIL encoder counts: misnamed | {measured:.0f}
-    the firmware names {named} per turn, but by its speeds there are {measured:.0f}
+    the firmware states {named} counts per turn, but its speeds give {measured:.0f}
     -> correct the counts per turn or the speeds in the firmware
 WARN encoder counts: many | {counts} per turn
-    these are more than the {most} that the daemon accepts
+    the daemon accepts at most {most}
     -> count fewer edges in the firmware
 PASS encoder counts: right | {counts} per turn
     {how}
@@ -252,29 +258,31 @@ FAIL watchdog: none | none within {seconds:.1f} s
     robot drives on
     -> the firmware must stop the motors 300 ms after the last valid line
 FAIL? watchdog: late | {figure}
-    after a pulled cable the robot drives on for {seconds:.1f} s: as many metres at 1 m/s
+    when the cable is pulled, the robot drives on for {seconds:.1f} s, which is as many metres at
+    1 m/s
     -> set the firmware's watchdog to 300 ms
 WARN? watchdog: early | {figure}
-    this is so short that a computer that is late once stops the robot
+    this is so short that a single delay of the computer stops the robot
     -> set the firmware's watchdog to 300 ms
 WARN? watchdog: unclear | {figure}
-    the watchdog stops the motors, but the encoders are too coarse to show whether within 500 ms
-    -> look it up in the firmware: 300 ms is right
+    the watchdog stops the motors, but the encoders are too coarse to show whether it does so
+    within 500 ms
+    -> look the time up in the firmware: 300 ms is right
 FAIL? watchdog: fed | {figure}, but fed by broken lines
     the watchdog stops the motors when no lines arrive, but not when only broken lines arrive: a
     robot with a half-broken cable drives on
     -> only a whole valid line may feed the firmware's watchdog
 PASS? watchdog: right | {figure}
-    contract 300 ms
+    300 ms is right
 
 SKIPPED damaged lines: untested
     no motor followed its commands, so none can show whether the board obeys damaged lines
     -> fix the motors above, and check again
-PASS? damaged lines: right | {lines} lines, none moved
-WARN damaged lines: lenient | {took} of {kinds} kinds moved
+PASS? damaged lines: right | {lines} lines, no motor moved
+WARN damaged lines: lenient | {took} of {kinds} kinds obeyed
     motors followed broken lines: {which}
     -> the firmware should accept a line whole or not at all
-FAIL damaged lines: taken | {took} of {kinds} kinds moved
+FAIL damaged lines: taken | {took} of {kinds} kinds obeyed
     motors followed broken lines: {which}; noise on a cable would drive the robot
     -> the firmware must accept a line whole or not at all, like deploy/firmware
 
@@ -303,30 +311,32 @@ FAIL runaway: against | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/
     control loop drives it away
     -> swap this motor's two leads, or A and B of its encoder
 FAIL stop: turns | turns {seconds:g} s after zeros
-    {motors} turns on, by its encoder, although zeros are sent
-    -> does a hand or a slope turn it? If not, cut the motors' power: the firmware must stop at
-    `p00.00`
+    according to its encoder, {motors} still turns although this computer sends zeros
+    -> does a hand or a slope turn it? If not, cut the motors' power: the firmware must stop a motor
+    at `p00.00`
 FAIL restarts: seen | {times}
     the board restarted {told}
-    -> is the supply weak (brown-out when motors start, a USB hub)? Use one for the board alone,
-    thicker leads, one ground. Does a second program open the port (DTR resets many boards)?
+    -> is the supply weak (brown-out when motors start, a USB hub)? Use a separate supply for the
+    board, thicker leads, a common ground. Does a second program open the port (DTR resets many
+    boards)?
     Otherwise its own watchdog or a crash of its firmware restarts it
 FAIL restarts: supply | {times}
-    its supply failed: the board restarted {told}
-    -> use a supply for the board alone, not that of the motors or a USB hub; thicker leads, one
-    ground, a capacitor at the driver; is a plug loose?
+    the supply of the board failed: the board restarted {told}
+    -> use a separate supply for the board, not the motors' supply or a USB hub; use thicker leads,
+    a common ground and a capacitor at the driver; is a plug loose?
 FAIL restarts: motors | {times}
     the board restarted {told}: each time while motors turned, as with a weak supply
-    -> use a supply for the board alone, thicker leads, one ground, a capacitor at the driver. If
-    the supply is good, the firmware's own watchdog or a crash restarts the board
+    -> use a separate supply for the board, thicker leads, a common ground and a capacitor at the
+    driver. If the supply is good, the firmware's own watchdog or a crash restarts the board
 FAIL restarts: watchdog | {times}
-    its own watchdog restarted it, so its firmware hung: the board restarted {told}
+    the board's own watchdog restarted it, so the firmware hung: the board restarted {told}
     -> where does the firmware wait: for room to print, for an encoder, in an interrupt? Feed the
-    watchdog only in its main loop. A supply that dips can hang it too
+    watchdog only in the main loop. A supply that dips can also hang the firmware
 FAIL restarts: pin | {times}
-    something pulled its reset pin: the board restarted {told}
+    something pulled the board's reset pin: the board restarted {told}
     -> does a second program open the port (DTR resets many boards): a serial monitor,
-    ModemManager, another computer? `fuser DEVICE` names it. Otherwise, is a long lead at the pin?
+    ModemManager, another computer? `fuser DEVICE` names it. Otherwise, is a long lead connected to
+    the reset pin?
 FAIL restarts: silence | {times}
     the board restarted {told}: each time this computer had sent nothing for {silent:.1f} s or more
     -> the firmware's watchdog restarts the whole board when no line comes: let it stop the motors
@@ -339,7 +349,7 @@ FAIL? link: silent | silent for {seconds:.1f} s
     the microcontroller fell silent when {motors} had to turn
     -> does its supply dip when a motor starts, so that it restarts? is a cable loose?
 WARN late: not judged | not judged
-    this computer was late by up to {late:.0f} ms, so the check does not judge this
+    this computer was late by up to {late:.0f} ms, so the check does not judge this step
     -> stop other programs here (`top`) and check again, or give the check real-time priority:
     `chrt -f 10 acsard mcu check ...`
 FAIL serial line: lost | lost
@@ -349,19 +359,20 @@ FAIL serial line: lost | lost
 
 
 class Unsure(Finding, frozen=True):
-    """A finding that may be caused by the lateness of this computer, whatever the board does.
+    """A finding that a late computer may cause, whatever the board does.
 
-    `margin_s` is the time by which the measurement exceeds its bound, s. A delay of less than half
-    of that time cannot have caused the finding.
+    `margin_s` is the time by which the measurement exceeds its bound, s. A delay of this computer
+    that is shorter than half of the margin cannot have caused the finding.
     """
 
     margin_s: float = 0.0
 
 
 class Outcome(Struct, frozen=True):
-    """One outcome. `figure`, `text` and `mend` are format strings for the measured values.
+    """One possible outcome of a step, with the texts of its finding.
 
-    `unsure` says whether a late computer can cause this outcome.
+    `figure`, `text` and `mend` are format strings for the measured values. `unsure` says whether a
+    late computer can cause this outcome.
     """
 
     verdict: Verdict
@@ -390,10 +401,10 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
     """Return the finding of this outcome with the measured values filled in.
 
     Args:
-        outcome: a key of `MANUAL`; the part before the colon is the finding's name.
+        outcome: a key of `MANUAL`. The part before the colon is the finding's name.
         keys: configuration values that the finding suggests.
-        seen: the measured values. `name` replaces the name; `margin_s` is the margin of an
-            `Unsure`.
+        seen: the measured values. `name` replaces the finding's name, and `margin_s` is the margin
+            of an `Unsure`.
     """
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
@@ -405,5 +416,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """Return the finding as a plain `Finding` for the report, without the margin."""
+    """Return a copy of the finding for the report, without the margin of an `Unsure`."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

@@ -1,4 +1,4 @@
-"""The check from the first zero to the last: order of steps, repetitions and early ends."""
+"""Runs the whole check: the order of its steps, their repetitions, and its early ends."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ STEPS = (
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines", "inputs",
 )  # fmt: skip
-"""Names of the steps in their order. After an early end, one row lists the steps not reached."""
+"""Names of all steps. After an early end of the check, one finding lists those that did not run."""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
@@ -51,19 +51,19 @@ SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("measuring how often the board answers", dialect.rate),
     ("measuring how fast the board answers", dialect.trip),
     ("trying the comma at the end of the line", dialect.form),
-    ("checking the form of its replies", dialect.replies),
+    ("checking the form of the replies", dialect.replies),
     ("asking the board for the link check", dialect.check),
     ("counting lost lines, 3 s and more", line_loss.finding),
 )
-"""Steps that send only zeros and questions, each with the message that the operator sees."""
+"""The steps that send only zeros and questions, in order, each with a message for the operator."""
 
 Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""Largest number of repetitions due to a late computer: of one step, and of all steps together.
+"""Largest numbers of repetitions because this computer was late: of one step, and in all.
 
-The total is limited because a check must not take four minutes.
+Without the limit of all repetitions, a check could take four minutes.
 """
 
 AGAIN, MOST = 1, 5
@@ -75,16 +75,16 @@ check.
 
 
 def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
-    """Check one microcontroller and call `tell` with each finding as it is made.
+    """Check one microcontroller, and call `tell` with each finding as soon as it is known.
 
-    Only zeros are sent before the operator has confirmed that the wheels are lifted. Whatever
-    happens, the last lines are zeros in both forms, and then the wire is closed.
+    Before the operator confirms that the wheels are lifted, only zeros are sent. The last lines are
+    always zeros, unless the serial port is lost.
     """
     told: set[str] = set()
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report the first finding of each name, and the first judged one after an unjudged one."""
+        """Report the first finding of each name. If it was not judged, also report a judged one."""
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -117,7 +117,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
 
 
 class _Steps:
-    """Runner of the steps. It repeats a step in which the board restarted."""
+    """Runs the steps. It repeats a step if the board restarted or this computer was late."""
 
     def __init__(
         self,
@@ -156,7 +156,7 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor. The operator is asked only if this computer was punctual."""
+        """Test one motor. Ask the operator which wheel turned, unless this computer was late."""
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -172,7 +172,7 @@ class _Steps:
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:
-        """Run a step whose result is worthless if this computer was late."""
+        """Run a step and report its finding. Repeat the step if this computer was late."""
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
@@ -269,7 +269,7 @@ class _Steps:
 
 
 def _ended(step: Step) -> tuple[Finding | None, bool]:
-    """Return the finding of a step, and whether the check must end with it."""
+    """Run a step, and return its finding and whether this finding ends the check."""
     try:
         return step(), False
     except StoppedError as error:

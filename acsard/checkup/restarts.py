@@ -1,8 +1,8 @@
-"""Detects from the board's lines that it restarted during the check.
+"""Detects restarts of the board during the check, from the lines that the board sends.
 
-A restart falsifies every figure of its step, so that another part seems to be at fault: the cable,
-a motor or the watchdog. The step is therefore repeated (`procedure.py`), and the probable cause of
-the restarts is reported at the end.
+A restart falsifies the measurements of the present step, so that the cable, a motor or the watchdog
+seems to be at fault. The step is therefore repeated (`procedure.py`). The check reports the
+probable cause of the restarts at its end.
 """
 
 from __future__ import annotations
@@ -22,34 +22,35 @@ from acsard.core.link.session import IDENTITY
 from acsard.core.values import AcsardError
 
 ASKED_S = 1.0
-"""Longest delay of the answer to a request for the identification, s.
+"""Longest time from a request for the identification to the board's answer, s.
 
-An identification that arrives later is one that the board sent by itself.
+An identification that arrives later was sent by the board without a request.
 """
 
 UNANSWERED = 5
-"""Number of unanswered lines in a row after which a printed text shows a restart.
+"""Smallest number of lines in a row without a reply after which a printed text shows a restart.
 
-After fewer lines, the text may be a debug print.
+With fewer such lines, the text may be a debug print of the firmware.
 """
 
 AHEAD_S = 2.0
-"""Time by which the board's clock may advance more than this host's between two replies, s.
+"""Time by which the board's clock may advance more than this computer's between two replies, s.
 
-Lines that were delayed on their way cause such differences.
+A line that is delayed on its way causes a small difference. A larger one shows a restart, because
+the clock's jump back to 0 looks like a large advance modulo `CLOCK`.
 """
 
 CLOCK = 65536
-"""Period of the board's clock, ms."""
+"""Time after which the board's clock starts again at 0, ms."""
 
 SILENT_S = 0.25
-"""Silence of this host after which the board's watchdog may restart the board, s."""
+"""Shortest time without a sent line after which a watchdog may restart the whole board, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Outcome for each cause except "unknown" that the reference firmware names after booting."""
+"""Maps the causes that the reference firmware names after a restart to outcomes of the check."""
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
-"""Pattern of a printed text. It occurs in no reply, whether whole or damaged."""
+"""Pattern that occurs in printed texts, but in no reply, not even in a damaged one."""
 
 _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 
@@ -60,15 +61,15 @@ class Restart(Struct, frozen=True):
     sign: str
     """The observation that revealed the restart, in words."""
     turned: Motors = ZERO
-    """Speeds that were commanded around the time of the last reply before the restart, rad/s."""
+    """Speeds that were commanded just before the restart, rad/s; zeros if the motors stood."""
     silent_s: float = 0.0
-    """Longest time without a line from this host since the last reply before the restart, s."""
+    """Longest time without a line to the board since the last reply before the restart, s."""
     cause: str = ""
-    """Cause of the restart as the board names it, or ""."""
+    """Cause of the restart as the board names it, or "" if it names none."""
 
 
 class RestartedError(AcsardError):
-    """Restart of the board, which makes the present measurement worthless."""
+    """The board restarted, so the present measurement is worthless."""
 
     def __init__(self, restart: Restart) -> None:
         super().__init__(restart.sign)
@@ -80,38 +81,39 @@ class Restarts:
 
     def __init__(self) -> None:
         self.watched = True
-        """Whether restarts are reported."""
+        """Whether `look` reports restarts."""
         self._asked_s = self._turned_s = float("-inf")
         self._turned: Motors = ZERO
-        """Last speeds that were not all zero, rad/s."""
+        """The last commanded speeds that were not all zero, rad/s."""
         self._sent_s: float | None = None
         self._silent_s = 0.0
-        """Longest time between two lines of this host since the last reply, s."""
+        """Longest time between two lines to the board since the last reply, s."""
         self._unanswered = 0
         self._replied_s: float | None = None
         """Time of the last reply, s, or None before the first one.
 
-        Text that the board prints because opening the port reset it is not a restart.
+        Before the first reply, a printed text does not count as a restart. Opening the port resets
+        many boards, and they print texts when they boot.
         """
         self._clock: tuple[int, float] | None = None
-        """Clock of the board, ms, in the last reply that contained it, and that reply's time, s."""
+        """The board's clock, ms, in the last reply that contained it, and that reply's time, s."""
 
     def asked(self, at_s: float) -> None:
-        """Record that this host requested the identification at `at_s`."""
+        """Record that the check requested the identification at the monotonic time `at_s`, s."""
         self._asked_s = at_s
 
     def sent(self, motors: Motors, at_s: float) -> None:
-        """Record that this host sent a line with these speeds, rad/s, at `at_s`."""
+        """Record that the check sent these speeds, rad/s, at the monotonic time `at_s`, s."""
         self._unanswered += 1
         self._silent_s, self._sent_s = self._silence_s(at_s), at_s
         if any(motors):
             self._turned, self._turned_s = motors, at_s
 
     def look(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
-        """Return the restart that a received line shows, or None.
+        """Return the restart that a received line reveals, or None.
 
-        `at_s` is the time of its arrival. `reply` is the decoded line, or None if the line is not a
-        good reply.
+        `at_s` is the monotonic time of its arrival, s. `reply` is the decoded line, or None if the
+        line is not a valid reply.
         """
         sign = ""
         if reply is not None:
@@ -132,9 +134,9 @@ class Restarts:
 
     def _line_sign(self, line: bytes, at_s: float) -> str:
         if line.startswith(IDENTITY) and at_s - self._asked_s > ASKED_S:
-            return "it sent its name without a request"
+            return "the board sent its name without a request"
         boots = self._unanswered >= UNANSWERED and _WORD.search(line)
-        return "it was silent, then printed a text" if boots else ""
+        return "the board was silent, then printed a text" if boots else ""
 
     def _clock_sign(self, reply: Reply) -> str:
         before, reading = self._clock, reply.reading
@@ -144,20 +146,20 @@ class Restarts:
         if before is None:
             return ""
         most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
-        # If more than half a minute passed without a reply, the clock may have wrapped round.
+        # After half a minute without a reply, the clock may have started again at 0 by itself.
         if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
-            return "its clock and its counts restarted"
+            return "the clock and the counts of the board restarted"
         return ""
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause that the reference firmware states in these lines after a restart, or ""."""
+    """Return the cause of a restart that the board names in these lines, or "" if it names none."""
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 
 
 def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> Finding:
-    """Return the finding for at least one restart. `back` says whether the board answers again."""
+    """Return the finding about these restarts. `back` says whether the board answers again."""
     each = Counter(_told(mcu, one) for one in restarts)
     seen: dict[str, object] = {
         "times": f"restarted{_times(len(restarts))}",
@@ -180,14 +182,14 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether each restart came after a silence of this host. One restart proves nothing."""
+    """Return whether several restarts came, each after `SILENT_S` s or more without a sent line."""
     return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
 
 
 def _told(mcu: McuConfig, restart: Restart) -> tuple[str, str]:
-    """Return when the restart happened and the observation that revealed it."""
+    """Return which motors turned at the restart, and the observation that revealed it, in words."""
     turned = [motor for motor in range(4) if restart.turned[motor]]
-    when = f"{motor_names(mcu, turned, ', ')} turned" if turned else "everything stood"
+    when = f"{motor_names(mcu, turned, ', ')} turned" if turned else "no motor turned"
     return when, restart.sign + (f" (reset={restart.cause})" if restart.cause else "")
 
 

@@ -1,13 +1,12 @@
-"""Tests whether the microcontroller stops the motors by itself when the host falls silent.
+"""Tests whether the board's watchdog stops the motors when this computer sends nothing more.
 
-It must also stop them if it receives only damaged lines: a watchdog that any byte feeds is useless
-with a half-broken cable.
+The watchdog must also act if the board receives only damaged lines, as with a half-broken cable.
 
-There is one experiment: this host brings the motors to speed, sends nothing (or damaged lines) for
-some time, and then sends zeros. The watchdog's time follows from the distance that the motors ran
-on, minus the distance of an ordinary stop. The speeds and counts in the replies show these
-distances. Firmware that answers only when asked, with momentary speeds, does not show them. After
-silences of different lengths, the check asks such firmware whether the motors were still turning.
+The check brings the motors to speed, sends nothing (or damaged lines) for some time, and then sends
+zeros. The watchdog's time follows from the distance that the motors ran on, minus the distance of
+an ordinary stop. The replies usually show these distances. Some firmware only replies to lines, and
+with momentary speeds, so its replies do not show them. For such firmware, the check tries silences
+of different lengths, and sees after each whether the motors still turned.
 """
 
 from __future__ import annotations
@@ -27,51 +26,50 @@ from acsard.core.config.wire_time import FIELD
 from acsard.core.link.codec import LETTERS, Motors
 
 FEEDING = ("a wrong letter", "neither p nor n", "cut short")
-"""Kinds of damaged lines that may feed a watchdog."""
+"""Kinds of damaged lines that are sent to test whether damaged lines feed the watchdog."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Fractions of full speed. From `TURNING` on, a motor has not slowed down.
-
-Below `STOPPED`, it stands.
-"""
+"""Fractions of the commanded speed: a motor at `TURNING` or more has not slowed down, and a motor
+below `STOPPED` stands."""
 
 UNKNOWN = math.inf
 
 Between = tuple[float, float]
-"""Lower and upper bound of the time for which the motors ran on after the last line, s."""
+"""Lower and upper bound of the time for which the motors run on after the last line, s."""
 
 
 class Run(Struct, frozen=True):
-    """Behaviour of the motors after the last line that turned them, or in an ordinary stop.
+    """Behaviour of the motors in a silence after the last line that turned them.
 
-    A distance is given as the time that the motor needs for it at full speed, s. Speeds are
-    fractions of full speed. `silent_s` is the length of the silence, s.
+    `silent_s` is the length of the silence, s, or about 0 in an ordinary stop, in which zeros
+    follow at once. A distance is expressed as the time that the motor needs for it at full speed,
+    s. Speeds are fractions of full speed.
     """
 
     silent_s: float
     ran_s: float
-    """Distance until standstill of the motor that ran on farthest, s at full speed."""
+    """Distance until standstill of the motor that ran on farthest, as a time at full speed, s."""
     slow_s: float
-    """Time until the motors had nearly stopped, s."""
+    """Time until all motors were slower than `STOPPED`, s."""
     first: float
-    """Speed in the first reply after the silence, as a fraction.
+    """Speed in the first reply after the silence, as a fraction of full speed.
 
-    It is the mean over the silence if the firmware computes speeds from line to line, and the
-    momentary speed if it measures by its own clock.
+    Firmware that computes the speed from line to line reports the mean over the silence. Firmware
+    that measures by its own clock reports the momentary speed.
     """
     second: float
-    """Speed in the second reply after the silence, as a fraction.
+    """Speed in the second reply after the silence, as a fraction of full speed.
 
-    By then a quick motor has obeyed the first zero.
+    A quick motor has obeyed the first line of zeros by then.
     """
     grain_s: float
-    """Resolution, s: the time in which a motor turns by the angle of one jump of its readings."""
+    """Resolution of the speeds: the time in which a motor turns by one jump of its readings, s."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure the watchdog's time with `motors`, which turn as commanded, and return the finding.
+    """Measure the time after which the watchdog stops the motors, and return the finding.
 
-    The motors stand again afterwards.
+    `motors` are the motors that turn as commanded. They stand again afterwards.
     """
     if not motors:
         return outcomes.find("watchdog: untested")
@@ -84,8 +82,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     broken = cycle(line for what, line in lines if what in FEEDING)
     fed = run(board, motors, max(motion.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= 0.75 * fed.silent_s:
-        # The broken lines fed the watchdog. Otherwise it would have cut the motors earlier, and
-        # their distance would be smaller.
+        # The damaged lines fed the watchdog. Otherwise it would have stopped the motors earlier,
+        # and their distance would be smaller.
         beyond_s = fed.ran_s - stop.ran_s - most_s
         return outcomes.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
@@ -111,10 +109,10 @@ def _judged(least_s: float, most_s: float) -> Finding:
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
-    """Return the bounds of the time for which these motors run on in a silence.
+    """Return the bounds of the time for which these motors run on when no lines are sent, s.
 
-    `stop` is their behaviour in an ordinary stop. If the motors never stop in the silence, the
-    upper bound is `UNKNOWN`.
+    `stop` is their behaviour in an ordinary stop. If the motors do not stop even in the longest
+    silence, the upper bound is `UNKNOWN`.
     """
     least_s = 0.0
     for length_s in (motion.CUT_S + stop.slow_s, motion.STOOD_S + stop.slow_s):
@@ -128,19 +126,21 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or found.first >= STOPPED):
         return _asked(board, motors, stop, (least_s, found.silent_s))
-    # Each distance may err by a jump of its readings, and a motor that coasts may add half a jump.
+    # Each of the two distances may err by a jump of its readings, and a motor that coasts may add
+    # half a jump.
     about_s = max(2.5 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)
     return max(0.0, ran_on_s - about_s), max(0.0, ran_on_s + about_s)
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Narrow the bounds `between` by bisection, and return the new ones.
+    """Narrow the bounds of the time for which the motors run on, by bisection.
 
-    The motors still turn at the end of a silence as long as the lower bound, s, but not at the end
-    of one as long as the upper bound. `stop` is their behaviour in an ordinary stop.
+    `between` are the bounds so far, s. After a silence of the lower bound the motors still turn,
+    and after a silence of the upper bound they stand. `stop` is their behaviour in an ordinary
+    stop.
     """
     least_s, most_s = between
-    for _ in range(8):  # each question halves the interval, unless this computer pauses
+    for _ in range(8):  # each run halves the interval, unless this computer pauses
         if most_s - least_s <= max(0.03, 0.1 * most_s):
             break
         answer = run(board, motors, (least_s + most_s) / 2)
@@ -148,18 +148,18 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
             least_s = max(least_s, answer.silent_s)
         else:
             most_s = min(most_s, answer.silent_s)
-    # The deciding reply describes a moment after the silence. The reply that shows the end of the
-    # ordinary stop also comes later than the stop.
+    # The reply that decides describes a moment after the end of the silence. In the same way, the
+    # reply that shows the end of the ordinary stop comes later than that end.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
     most_s -= stop.slow_s - board.period_s - motion.PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)
 
 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
-    """Bring the motors to speed, send nothing for `length_s` s, and stop them.
+    """Bring the motors to speed, send nothing for `length_s` s, and stop them with zeros.
 
-    A length of 0 is an ordinary stop. If there are lines in `instead`, they are sent during the
-    silence. Ends the check if none of the motors, turned together, reaches half of the speed.
+    A length of 0 is an ordinary stop. The lines in `instead` are sent during the silence. Raises
+    `StoppedError` if no motor reaches half of the commanded speed.
     """
     began_s = board.now_s
     full = run_up(board, command(motors))
@@ -197,9 +197,9 @@ def command(motors: Sequence[int]) -> Motors:
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Return the counts per turn from which distances can be computed.
+    """Return the measured encoder counts per wheel turn, or 0 if distances cannot be computed.
 
-    Returns 0 if the counts do not change, or if they can wrap round during the longest silence.
+    It is 0 if the counts do not change, or if they could overflow in the longest silence.
     """
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
     wraps = per_turn * motion.RUNAWAY / math.tau * motion.STOOD_S >= FIELD / 2

@@ -1,7 +1,8 @@
 """Turns one motor at a time forward and backward, and asks the operator which wheel turned.
 
-From the encoders and the answers, it finds out whether the motor, the encoder and the wheel of each
-channel belong together. `Channel`, `encoder_finding` and `wheel_map` compute that without any I/O.
+A channel is a motor with its encoder and its wheel. From the encoders and the answers, the check
+finds out whether the three belong together. `Channel`, `encoder_finding` and `wheel_map` compute
+this without any I/O.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from acsard.core.link.codec import LETTERS, Motors
 from acsard.core.values import WHEELS
 
 TOLERANCE = 0.25
-"""Largest relative error of an encoder's speed that is not a failure."""
+"""Relative error of an encoder's speed against the command, above which the check fails."""
 
 OFF = 0.05
-"""Largest relative error of an encoder's speed on a sound robot. A larger one is a warning."""
+"""Relative error of an encoder's speed against the command, above which the check warns."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
 FOLLOWS: tuple[Kind, ...] = ("right", "off", "size")
-"""Results for a motor that moves only its own encoder, in the commanded direction."""
+"""The values of `kind` for a motor that moves only its own encoder, in the commanded direction."""
 
 
 class Channel(Struct, frozen=True):
@@ -47,12 +48,12 @@ class Channel(Struct, frozen=True):
     forward: bool = True
     """Whether the wheel turned forward first, as the operator saw it."""
     probed: bool = False
-    """Whether the motor was turned only for a short probe, which its own encoder did not follow.
+    """Whether the motor was turned only for a short probe, because its own encoder did not follow.
 
     Then `forth` contains the speeds of the probe, and `back` is zero.
     """
     unsure: float = 0.0
-    """Relative error of the speeds that a coarse encoder may cause."""
+    """Relative error of the measured speeds that a coarse encoder may cause."""
     judged: bool = True
     """Whether this computer was punctual during the measurement.
 
@@ -68,7 +69,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def kind(self) -> Kind:
-        """Result for this motor according to the encoders, without the operator's observation."""
+        """Result for this motor according to the encoders. The operator's answer is not used."""
         if not self.judged:
             return "late"
         moved, own = self.moved, self.motor
@@ -88,7 +89,8 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative error of the motor's own encoder against the command, in the worse direction."""
+        """Relative error of the own encoder's speed against the command: the larger one of forward
+        and backward."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
@@ -120,7 +122,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the end of the outcome's name, which says what the operator's answer shows, or ""."""
+    """Return the end of the outcome's name, which depends on the operator's answer, or ""."""
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:
@@ -164,16 +166,16 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
 
 
 NEAR = 0.8
-"""Fraction of `OFF`. If the error of a speed is larger, the speed is measured again.
+"""Fraction of `OFF`. A speed with a larger error is measured again over a longer time.
 
-The first measurement is too inaccurate to decide such a case.
+The first measurement is too inaccurate to decide whether the error exceeds `OFF`.
 """
 
 LOOK_S = 0.75 * motion.MOTOR_S
 """Time over which the second measurement averages the speed, s."""
 
 LOOKS = 8
-"""Largest number of measurements that are averaged while an encoder is not steady."""
+"""Largest number of short measurements that are averaged until the speed of a motor is steady."""
 
 ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -186,10 +188,10 @@ def one(motor: int, speed: float) -> Motors:
 
 
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
-    """Bring a motor to `speed`, rad/s, and measure it.
+    """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
 
-    Returns each encoder's speed, rad/s, and the fraction by which the measured speed may err
-    because encoder counts are whole numbers.
+    Returns these speeds, rad/s, and the relative error of the motor's speed that its encoder may
+    cause because encoder counts are whole numbers.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
@@ -213,7 +215,8 @@ def _look_s(board: Board) -> float:
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
 
-    The speeds are held until the encoders show them steadily, or until the time for that is over.
+    The function holds the speeds until the encoders show them steadily. It gives up after some
+    time, or earlier if no encoder moves.
     """
     steps = max(1, int(motion.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
@@ -236,7 +239,7 @@ def run_up(board: Board, motors: Motors) -> Motors:
 
 
 def _patience_s(board: Board, told: list[int]) -> float:
-    """Return how long to command the motors `told`, s: longer while one of them still speeds up."""
+    """Return how long to wait for steady speeds, s: longer if a motor of `told` still speeds up."""
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
     return motion.PATIENCE_S if rises else motion.MOTOR_S
@@ -245,7 +248,8 @@ def _patience_s(board: Board, told: list[int]) -> float:
 def channel(board: Board, motor: int) -> Channel:
     """Turn a motor forward and backward, and return how the encoders moved.
 
-    If the last motor seems dead, it is tried again with the other form of the comma.
+    Some firmware obeys motor d only if a comma ends the line. If motor d seems dead, it is
+    therefore tried again with the other line ending.
     """
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
@@ -273,26 +277,26 @@ def _both_ways(board: Board, motor: int) -> Channel:
 
 
 def probe(board: Board, motor: int) -> Motors | None:
-    """Turn a motor slowly and briefly.
+    """Turn a motor slowly and briefly, to see whether its own encoder follows.
 
-    Returns None if the motor's own encoder follows; the motor then keeps turning. Otherwise returns
-    the speeds that the encoders showed, rad/s.
+    Returns None if the encoder follows; the motor may then still turn. Otherwise returns the speeds
+    that the encoders showed, rad/s, and the motor stands.
 
-    The firmware may drive a motor without a working encoder to full speed. The probe is so short
-    that the motor does not get far. A motor with a coarse encoder may need a second try, because
-    the encoder may need more movement to show anything, and a single count backwards proves
-    nothing.
+    The firmware may drive a motor without a working encoder to full speed, but the probe is too
+    short for that. If the encoder does not follow, the probe is repeated, unless several readings
+    show that it runs backward: a coarse encoder may need more movement, and a single count backward
+    proves nothing.
     """
     began_s = board.now_s
     shown = _probe(board, motor, motion.SPEED / 2)
     own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
     seen = [speed for speed in own if speed]
     if shown is None or (len(seen) >= 3 and max(seen) < 0):
-        return shown  # a reversed motor need not run away twice
+        return shown  # the motor is reversed; a second probe would make it run away again
     if not moving(shown, motion.PROBE_MOVES):
         return _probe(board, motor, motion.SPEED)
     again = _probe(board, motor, motion.SPEED / 2)
-    # A movement that shows only once may be that of a motor that still coasted.
+    # If only the first probe showed a movement, a motor may still have coasted in it.
     return again if again is None or any(again) else _probe(board, motor, motion.SPEED)
 
 
@@ -301,7 +305,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each encoder's angle without possible coasting, divided by `GLANCE_S`, rad/s."""
+        """Return each encoder's mean speed in the probe, rad/s, without possible coasting."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -323,8 +327,9 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Test the last motor, which does not move, again with the other form of the line's end.
+    """Test motor d, which does not move, again with the other line ending.
 
+    The two endings are with a comma and without one.
     Returns the new result if the motor moves. Otherwise returns `dead`, the result so far.
     """
     configured, board.comma = board.comma, not board.comma
@@ -341,7 +346,7 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
 def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     """Ask the operator which wheel turned, and return the channel with the answer.
 
-    The wheels already stand. The channel is returned unchanged if no person watches.
+    The wheels stand during the question. If no person watches, the channel is unchanged.
     """
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn? front right, front left, "
@@ -352,7 +357,9 @@ def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     if which is None:
         return channel
     if wheel := ANSWERS[which]:
-        question = "how did it turn first: forward (as when the robot drives ahead) or back?"
+        question = (
+            "which way did the wheel turn first: forward (as when the robot drives ahead) or back?"
+        )
         way = operator.ask(question, ("forward", "back"))
         return structs.replace(channel, wheel=wheel, forward=way != "back")
     return structs.replace(channel, wheel="")

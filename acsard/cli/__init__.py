@@ -1,8 +1,10 @@
-"""The command line: one module per subcommand, whose docstring is the text of its `--help`.
+"""The command line of acsard: one module for each subcommand.
 
-Each module has `add_options`, and `main`, which calls one package and prints. A subcommand with
-actions sets the `main` of each action instead. Only the module of the typed subcommand is imported,
-so each module imports everything it needs at its top, except libraries that may be missing.
+The docstring of such a module is the text of its `--help`. Its function `add_options` declares the
+options, and `main` calls another package and prints the results. If a subcommand has actions, such
+as `init` of `acsard tls`, each action has a main function of its own. Only the module of the typed
+subcommand is imported. It therefore imports everything it needs at its top, except libraries that
+may be missing.
 """
 
 from __future__ import annotations
@@ -54,7 +56,7 @@ VERBS = {
     "completion": "print the script for completion with Tab in a shell",
     "man": "print the text of every --help as a man page",
 }
-"""The subcommands and their help texts, in the order of `acsard --help`. Each is a module of
+"""The subcommands and their help texts, in the order of `acsard --help`. Each one is a module of
 this package."""
 
 _EPILOG = """\
@@ -83,7 +85,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of `acsard` with all subcommands, and the options of those in `called`."""
+    """Return the parser of `acsard`. It knows the options only of the subcommands in `called`."""
     whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot. It connects "
@@ -127,8 +129,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
             raise
-        # The program that reads this output (head, less) has ended, or the disk is full. A message
-        # could not be printed either.
+        # The program that reads this output (head, less) has ended, or the disk is full. So print
+        # no message, because it would be lost too.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return code if isinstance(error, BrokenPipeError) else code or int(Exit.FAILURE)
     except KeyboardInterrupt:
@@ -140,7 +142,7 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """Rewrite a negative number without its exponent: argparse would take `-1e-3` for an option."""
+    """Return `-0.001` for `-1e-3`, which argparse would take for an option; keep other words."""
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
@@ -156,7 +158,7 @@ def entry() -> NoReturn:
         code = main()
     except SystemExit as end:  # argparse ends this way after --help, --version and usage errors
         code = end.code if isinstance(end.code, int) else int(Exit.FAILURE)
-    except BaseException:  # noqa: BLE001 - print the traceback as Python would, then end in the same way
+    except BaseException:  # noqa: BLE001 - print the traceback as Python would
         traceback.print_exc()
         code = int(Exit.FAILURE)
     for stream in (sys.stdout, sys.stderr):
@@ -170,13 +172,13 @@ def entry() -> NoReturn:
 def _fill_closed_streams() -> None:
     """Open /dev/null in the place of each standard stream that is closed.
 
-    Without this, the serial port would get the number of the closed stream, and printed text would
-    go to the motors.
+    Otherwise the serial port would get the file descriptor of the closed stream, and printed text
+    would go to the motors.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            # The kernel gives the lowest free number, which is this one.
+            # The kernel gives the lowest free descriptor, which is this one.
             os.open(os.devnull, os.O_RDWR)
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))

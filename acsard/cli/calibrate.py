@@ -52,7 +52,7 @@ from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
-"""The options that only a guided drive takes."""
+"""Options that fit only a drive that this tool guides, and not a recorded one (`--log`)."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -143,7 +143,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
 
 
 def _require_fitting(args: argparse.Namespace) -> None:
-    """Raise `UsageError` for an option that does not fit the kind of drive, recorded or guided."""
+    """Raise `UsageError` for an option that does not fit a recorded (`--log`) or a guided drive."""
     if not args.log and args.distance:
         raise UsageError(
             "--distance goes with --log: a guided drive asks for the distances that it needs"
@@ -208,11 +208,11 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
 def _guided(
     args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
-    """Drive the robot and return the calibration with the configuration that the robot runs with.
+    """Drive the robot, and return the calibration and the configuration of the robot's daemon.
 
-    A key press and Ctrl-C end the drive with zero commands. `where` is the path of the file with
-    `config`. `lines` is the prompt for --json-lines, or None. Raises `GuideError`, `LogError` and
-    `RefusedError`.
+    Both a key press and Ctrl-C stop the robot with zero commands. `config` is the configuration in
+    the file `where`. `lines` is the prompt for --json-lines, or None. Raises `GuideError`,
+    `LogError` and `RefusedError`.
     """
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
@@ -273,11 +273,10 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _differing(config: Config, mine: Config, where: str) -> str:
-    """Return why a result for `config` must not be written into the file `where`, or "" if it may.
+    """Return why a calibration must not be written into the file `where`, or "" if it may.
 
-    Args:
-        config: the configuration that the daemon runs with.
-        mine: the configuration in the file `where`.
+    It must not if the daemon's configuration `config` and that of the file, `mine`, give different
+    wheel radii or track widths.
     """
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):

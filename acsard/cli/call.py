@@ -18,10 +18,7 @@ from acsard.daemon.bus.robot_discovery import named
 from acsard.host.errors import UsageError
 
 CALLED = tuple(service for service in SERVICES if service != "set")
-"""The services of this subcommand.
-
-`set` is missing because `acsard set` calls it and knows the settings.
-"""
+"""The services that `acsard call` can call. `set` is missing, because `acsard set` calls it."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -62,16 +59,16 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _fields(service: Verb) -> tuple[str, ...]:
-    """Return the names of the numbers in the payload that a service needs."""
+    """Return the names of the numbers in a service's payload; () if it has no payload."""
     if service in PLAIN_SERVICES:
         return ()
     return MESSAGES[SERVICES[service].payload].__struct_fields__
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Return a text which says that `service` cannot be called on several robots at once.
+    """Return a message which says that `service` cannot be called on several robots at once.
 
-    The text also gives the commands to type instead.
+    The message gives the command to type for each robot in `ids`, with the payload `values`.
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]
@@ -84,7 +81,6 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
 
 
 def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
-    """Stop all these robots at the same time, print their answers, and return the exit code."""
     # Send the stop to every named robot first. Finding out which robots are present would delay it.
     robot_discovery.stop(robot.session, ids, robot.caller)
     replies = of_each(robot, ids, lambda one: one.call("stop"))

@@ -1,4 +1,4 @@
-"""Options of the subcommands: the configuration, and the types of option values."""
+"""Shared code of the subcommands: common options, types of option values, and the configuration."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add the options of a subcommand that asks a person and has a result for the configuration.
+    """Add --json, --json-lines and --write to a subcommand that asks a person questions.
 
-    `result` names the result in the help text of `--write`.
+    --write stores the result of the subcommand in the configuration file. `result` is the name of
+    this result in the help text.
     """
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object")
@@ -69,7 +70,8 @@ def count(text: str) -> int:
 def seconds(text: str) -> float:
     """Parse a duration from 1 to 600 s. This function is an argparse type.
 
-    All measured values stay in memory until the end. At 100 Hz that is 60 MB in 600 s.
+    Longer measurements are refused, because all measured values stay in memory: 60 MB after 600 s
+    at 100 Hz.
     """
     value = float(text)
     if not 1.0 <= value <= 600.0:
@@ -80,7 +82,7 @@ def seconds(text: str) -> float:
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
     """Return an argparse type for a whole number from 1 to `most`.
 
-    The error message names the `units`, and ends with `hint`.
+    `units` is the noun in the error message, such as "days". `hint` is the end of that message.
     """
 
     def number(text: str) -> int:
@@ -93,10 +95,9 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
 
 
 def by_environment() -> dict[str, dict[str, object]]:
-    """Return the configuration values that the environment sets.
+    """Return the configuration values that environment variables set, by table and key.
 
-    `ACSARD_TLS` sets `bus.tls`. For example, it names the directory with the credentials of a
-    systemd service.
+    `ACSARD_TLS` sets `bus.tls`. A systemd unit uses it to name the directory of its credentials.
     """
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
@@ -104,9 +105,9 @@ def by_environment() -> dict[str, dict[str, object]]:
 def tables(
     options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
 ) -> dict[str, dict[str, object]]:
-    """Return the tables `before` with the values in `options`, which maps dotted keys to values.
+    """Return a copy of the configuration tables `before` with the values of `options`.
 
-    A value of None leaves its key as it is.
+    `options` maps dotted keys, such as "mcu.port", to values; None leaves a key as it is.
     """
     given = {table: dict(values) for table, values in before.items()}
     for key, value in options.items():
@@ -119,8 +120,9 @@ def tables(
 def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
     """Return the path of the configuration and the configuration itself.
 
-    `options` maps dotted keys, such as "mcu.port", to values; None leaves a key as it is. Prints
-    every problem in the configuration and raises `MendableError` if there are any.
+    `path` is the value of --config, or None. `options` maps dotted keys, such as "mcu.port", to
+    values that override the file; None leaves a key as it is. If the configuration has problems,
+    this prints each of them and raises `MendableError`.
     """
     where, text = find(path)
     given = tables(options or {}, by_environment())
@@ -134,10 +136,11 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 
 
 def recorded(config: Config) -> Config:
-    """Return `config` with the recording directory from the environment if `config` names none.
+    """Return `config` with an absolute path of the recording directory.
 
-    The units of the service set the environment variable `RECORD`. The path is made absolute,
-    because a client that reads it on the bus may run in another directory.
+    If `config` names no directory, the environment variable ACSARD_RECORD does, which the systemd
+    units set. The path is absolute because a client that reads it on the bus may run in another
+    directory. It stays "" if neither names a directory.
     """
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""

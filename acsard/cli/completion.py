@@ -26,7 +26,7 @@ SHELLS = {
 """Where each shell looks for its completion script."""
 
 _NUMBERS = "acsard recording 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
-"""Shell command that prints the numbers of the recordings. The shell offers local files as well."""
+"""Shell command that prints the numbers of the recordings."""
 
 _RECORDING: dict[str, str | dict[str, str]] = {
     "bash": "_acsard_recordings",
@@ -45,7 +45,7 @@ _acsard_recordings() {{
 }}""",
     },
 }
-"""Completion of a recording for each shell, in the form that shtab expects."""
+"""Completion of a recording's number or file name for each shell, in the form of shtab."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +69,8 @@ def main(args: argparse.Namespace) -> int:
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
         elif (verb, action.dest) in known:
-            # Only the shell uses these words, because this parser parses no arguments.
+            # The choices serve only the completion. This parser parses no arguments, so it refuses
+            # no other word.
             action.choices = known[verb, action.dest]
     script = shtab.complete(whole, args.shell)
     if args.shell == "zsh":
@@ -81,7 +82,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _words() -> Mapping[tuple[str, str], list[str]]:
-    """Return the words that complete each (subcommand, argument). Sources are the default ones."""
+    """Return the words that complete each argument, by the names of subcommand and argument."""
     config = Config()
     sources = [source.name for source in config.commands.sources]
     published = [topic.key for topic in PUBLISHED]
@@ -105,7 +106,7 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield every option with its subcommand: `recording` for those of `recording show`."""
+    """Yield (subcommand, option) for each option. Those of `recording show` have `recording`."""
     for action in parser._actions:
         yield verb, action
         if isinstance(action, argparse._SubParsersAction):

@@ -1,4 +1,6 @@
-"""Options, connections, key checks and explanations of silences for the subcommands on the bus."""
+"""Shared code of the subcommands that use the bus: their options, the connection, and checks of
+keys. It also explains to the operator why no message arrives.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,7 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 @contextmanager
 def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
-    """Connect to the one robot that the options name. The client sends commands as `source`."""
+    """Connect to the one robot that the options name, as the command source `source`."""
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
         yield robot
@@ -73,9 +75,10 @@ def require_one(args: argparse.Namespace) -> None:
 
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Connect as `connected` does, and yield the client and the ids of several robots.
+    """Connect to the bus, and yield the client and the ids of the robots if `--id` names several.
 
-    The ids are those in `--id`, `("*",)` for all robots and `()` for a single robot.
+    The ids are ("*",) if `--id` is "*". They are () if `--id` names one robot or is missing; then
+    the client belongs to that robot or to the configured one.
     """
     many = named(args.id or "")
     _, config = load(args.config)
@@ -87,7 +90,8 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 def require_followed(key: str) -> None:
     """Raise `UsageError`, with the command to type instead, if a key never has messages.
 
-    Warn if the key is not in the table, because waiting on a misspelt key looks like a dead robot.
+    Print a warning if the table of keys does not have the key. Without it, waiting for messages on
+    a misspelt key would look like a dead robot.
     """
     if unknown(key):
         words = f"{key} is not in the topic table ({key_hint(key)}); waiting for it all the same"
@@ -106,10 +110,10 @@ def require_followed(key: str) -> None:
 
 
 def require_asked(key: str) -> None:
-    """Raise `UsageError` if `acsard get` cannot ask this key.
+    """Raise `UsageError` if `acsard get` cannot query this key.
 
-    Some keys do not answer queries. A query to the key of a service would call the service. A
-    wildcard has several answers, but `get` prints one.
+    Some keys do not answer queries. A query to the key of a service would call the service. A key
+    with a wildcard has several answers, but `get` prints one.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
@@ -135,17 +139,16 @@ def require_asked(key: str) -> None:
 def explained(
     look: Callable[[], str], ceased: Callable[[], str] | None = None, after_s: float = FIRST_S
 ) -> Iterator[Callable[[], None]]:
-    """Explain silences, and yield a function that the caller must call for each message.
+    """Print why no messages arrive, and yield a function that the caller calls for each message.
 
-    A separate thread prints the explanations on standard error, so that the caller never waits for
-    them.
+    A separate thread finds the reason and prints it on standard error, so the caller never waits.
 
     Args:
-        look: returns a line which says why nothing has arrived in the first `after_s` s, or "" to
-            print no line.
-        ceased: returns such a line for a later silence of `after_s` s. If it is None, only the
-            first silence is explained.
-        after_s: length of a silence that is explained, s.
+        look: returns the reason if no message has arrived in the first `after_s` s, or "" to print
+            nothing.
+        ceased: returns the reason if messages have stopped for `after_s` s, or "" to print nothing.
+            If it is None, only the silence at the start is explained.
+        after_s: shortest silence that is explained, s.
     """
     come, end = Event(), Event()
 
@@ -172,10 +175,10 @@ def explained(
 
 
 def silence_explained(robot: Client, key: str = "") -> AbstractContextManager[Callable[[], None]]:
-    """Explain on standard error why nothing arrives on a key, and later why messages ceased.
+    """Print why no message arrives on a key, and later whether the connection was lost.
 
-    The context is a function that the caller calls for each message. If `key` is "", only a lost
-    connection is explained.
+    The context yields a function that the caller calls for each message. If `key` is "", only a
+    lost connection is reported. The texts go to standard error.
     """
     return explained(lambda: _none_yet(robot, key) if key else "", lambda: _ceased(robot))
 
@@ -191,7 +194,7 @@ def _none_yet(robot: Client, key: str) -> str:
 
 
 def _ceased(robot: Client) -> str:
-    """Return why messages ceased, or "" if the session is still connected."""
+    """Return why the connection was lost, or "" if the session is still connected."""
     try:
         if robot.session.info.links():
             return ""
@@ -202,9 +205,6 @@ def _ceased(robot: Client) -> str:
 
 
 def _of_link(where: Address) -> str:
-    """Return what is wrong with the TLS connection, or "".
-
-    A certificate may have expired while the tool followed the robot.
-    """
+    """Return the fault of the TLS connection, such as an expired certificate, or ""."""
     secured = where.tls and where.endpoint.startswith(TLS)
     return trouble(where.endpoint, where.tls) if secured else ""

@@ -81,10 +81,10 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
 ) -> int:
-    """Check the board with `config`, and compare the findings with the configuration file.
+    """Check the board, print the findings, and return the exit code.
 
-    `configured` is the configuration in the file, without the options of the command line, and
-    `where` is the path of the file.
+    `config` is the configuration with the options of the command line, and `configured` is the one
+    in the file `where`. The result suggests changes to that file.
     """
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
@@ -123,7 +123,7 @@ def _checked(
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
-    """Return the prompt; raise `UsageError` unless a person can answer or nothing can move."""
+    """Return the prompt. Raises `UsageError` if wheels could turn without a person's consent."""
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "
@@ -154,7 +154,7 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
 
 
 def _wire(config: Config) -> Wire:
-    """Return the serial port, or the simulator in virtual time, in which a check takes no time."""
+    """Return the serial port, or the built-in simulator in virtual time, which does not wait."""
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))
     return BlockingPort(config.mcu.port)

@@ -59,10 +59,10 @@ from acsard.report.page import drawn
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
-"""Largest number of recordings, and of gaps between them, that a search names."""
+"""Largest number of recordings, and of gaps between recordings, that a search prints."""
 
 SERVICE = Path("/var/lib/acsard/record")
-"""The directory in which the service records."""
+"""The directory in which the systemd service stores its recordings."""
 
 
 EXPORT = """\
@@ -263,7 +263,7 @@ def main_show(args: argparse.Namespace) -> int:
 
 
 def _is_being_recorded(recording: Recording) -> bool:
-    """Return whether a daemon still writes to this recording. Read the whole recording before."""
+    """Return whether a daemon still writes to a recording that has been read to its end."""
     if recording.ending != UNFINISHED:
         return False
     with suppress(OSError):  # the daemon has just renamed or removed the file
@@ -272,12 +272,12 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events of a part, and return whether the part has steps."""
+    """Print the events between the times of `part`, and return whether it contains any steps."""
     story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
         if over:
-            # Read the rest, so that the notes count every damaged place.
+            # Read the rest too, so that `recording.missing` counts every damaged place.
             continue
         seconds = (step.inputs.now.mono_ns - recording.about.mono_ns) / NS_PER_S
         over = seconds > part.end
@@ -409,7 +409,6 @@ def main_report(args: argparse.Namespace) -> int:
 
 
 def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
-    """Raise `UsageError` for --from and --to, which this subcommand does not take."""
     if args.begin is not None or args.end is not None:
         raise UsageError(f"{subcommand} takes a whole recording: leave out --from and --to")
 
@@ -439,7 +438,7 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _range(args: argparse.Namespace) -> tuple[float, float]:
-    """Return the range of time that the arguments name, s since 1970; it may be infinite."""
+    """Return the times of --from and --to, s since 1970; infinite for an option that is missing."""
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
             "a number of seconds counts from the beginning of one recording: name that recording, "
@@ -452,7 +451,7 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
 
 
 def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Search all recordings, and print on standard error which ones cover the given times."""
+    """Return each recording between --from and --to with its part in that time. Print the names."""
     first, last = _range(args)
     where, files = _files(args)
     try:
@@ -515,9 +514,10 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Yield a function that shows the progress; call it with the wall-clock time reached, in ns.
+    """Show the progress of the work on a recording on standard error, if that is a terminal.
 
-    The progress line is erased at the end. If standard error is not a terminal, nothing is shown.
+    Yield a function that the caller calls with the wall-clock time of the recording that the work
+    has reached, ns. The progress line is erased at the end.
     """
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
@@ -546,7 +546,10 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that writes the progress in percent, for the page's server."""
+    """Return a function that prints the progress in percent, which the web page's server reads.
+
+    The function takes the wall-clock time of the recording that the work has reached, ns.
+    """
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0

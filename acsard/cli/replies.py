@@ -1,4 +1,4 @@
-"""Prints messages as lines of JSON, and calls a service of several robots at the same time."""
+"""Turns messages into lines of JSON, and calls a service of several robots at the same time."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from acsard.host.errors import Exit
 
 
 def of_robot(whose: str, line: str) -> str:
-    """Return a JSON line that names the robot and contains its message."""
+    """Return the JSON line `{"robot": ..., "message": ...}`; `line` is the message as JSON."""
     told = {"robot": whose, "message": msgspec.Raw(line.encode())}
     return formatting.json_line(msgspec.json.encode(told).decode())
 
 
 def json_line(encoding: str, payload: bytes) -> str:
-    """Return a payload as a line of JSON, or `{"undecodable": ...}` if it cannot be decoded."""
+    """Return a message's payload as a line of JSON, `{"undecodable": ...}` if decoding fails."""
     try:
         form = detect(encoding, payload)
         if form == "cdr":
@@ -37,16 +37,16 @@ def json_line(encoding: str, payload: bytes) -> str:
 
 
 Replies = Mapping[str, ServiceReply | AcsardError]
-"""The reply of each robot, or the reason why there is none."""
+"""Maps a robot's id to the robot's reply, or to the error that says why it did not reply."""
 
 
 def of_each(
     robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
 ) -> dict[str, ServiceReply | AcsardError]:
-    """Call a service of the robots `ids`, and return their replies in the order of `ids`.
+    """Call a service of each robot in `ids` at the same time, and return the replies by robot id.
 
-    `call` calls the service through the client of one robot. "*" in `ids` stands for all robots
-    that are present. Raises `NoAnswerError` if there are none.
+    `call` gets a client of one robot and calls the service. If `ids` contains "*", all robots that
+    are present are called; raises `NoAnswerError` if no robot is present.
     """
     wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 
@@ -63,7 +63,7 @@ def of_each(
 def print_each(
     replies: Replies, robot: Client, ids: Sequence[str], silence: str, *, as_json: bool
 ) -> int:
-    """Print one line per robot.
+    """Print one line for the reply of each robot, and return the exit code.
 
     Args:
         replies: the replies of the robots.
@@ -72,7 +72,7 @@ def print_each(
         silence: the line of a robot without an answer; `{error}` stands for the reason.
         as_json: whether to print JSON.
 
-    Returns the exit code: `UNREACHABLE` if a robot did not answer, else `FAILURE` if one refused.
+    The exit code is `UNREACHABLE` if a robot did not answer, else `FAILURE` if one refused.
     """
     for one, reply in replies.items():
         if isinstance(reply, AcsardError):

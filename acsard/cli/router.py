@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Supervise a router until a signal, or be the supervised router (`--supervised`)."""
+    """Run a router in a child process; with `--supervised`, run it in this process."""
     router, log = Router(args.file), Log(LogConfig())
     try:
         if not args.supervised:
@@ -44,7 +44,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Keep a router process running until a signal, or until it ends with a final exit code."""
+    """Run a router process, and restart it until a signal arrives. Unusable files end it too."""
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)

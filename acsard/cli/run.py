@@ -71,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
-    """Return the configuration values of the command line; None for an option that is not given."""
+    """Return the values of the options by dotted key; None for an option that is not given."""
     return {
         "mcu.port": args.port,
         "mcu.baud_rate": args.baud_rate,
@@ -138,8 +138,8 @@ def main(args: argparse.Namespace) -> int:
 def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
     """Return the `SettingsFile` at `where`, which reads the file as a restart would.
 
-    `config` is the configuration of this start. `given` are the options of the command line by
-    dotted key, which override the file.
+    `config` is the configuration with which the daemon starts now. `given` maps dotted keys to the
+    values from the command line, which override the file.
     """
     overrides = tables(given, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
@@ -147,10 +147,11 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
 
 
 def page(config: Config, where: str) -> list[str] | None:
-    """Return the arguments of `acsard web`, or None if the page is not to be started.
+    """Return the arguments with which `acsard web` serves the robot's page, or None to serve none.
 
-    The page is started if `web.page` is set, standard output is a terminal, this is not a systemd
-    service, and the extra `web` is installed.
+    The daemon serves the page if `web.page` is set, standard output is a terminal, the daemon is
+    not a systemd service, and the libraries of the page are installed. `where` is the path of the
+    configuration file.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
     there = find_spec("aiohttp") and find_spec("segno")
@@ -168,7 +169,7 @@ def page(config: Config, where: str) -> list[str] | None:
 
 
 def _bus(config: Config) -> str:
-    """Return the daemon's bus endpoints, or those that it connects to as a client."""
+    """Return the endpoints at which the daemon listens, or to which it connects as a client."""
     bus = config.bus
     if bus.mode == "client":
         return f"client of {', '.join(bus.connect)}"
@@ -199,7 +200,7 @@ def banner(
         device: the serial device.
         trouble: why the device cannot be opened yet, or "".
         reach: the options with which other tools find this daemon.
-        served: whether the page is served.
+        served: whether the robot's web page is served.
     """
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:

@@ -123,7 +123,7 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
 
 
 def _until(settings: dict[str, Plain]) -> str:
-    """Return how long the settings last, in words."""
+    """Return a text which says how long the settings stay in force."""
     survives = "; a lowered limit survives the restart, except on the simulator"
     return f"until the next start{survives if any(map(stays, settings)) else ''}"
 
@@ -131,8 +131,6 @@ def _until(settings: dict[str, Plain]) -> str:
 def _set_all(
     robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, keep: bool, as_json: bool
 ) -> int:
-    """Change the settings of all these robots, print their answers, and return the exit code."""
-
     def change_one(one: Client) -> ServiceReply:
         reply = one.set(settings, keep=keep)
         if as_json or keep or not reply.success:

@@ -29,7 +29,7 @@ NUMBERS = {
     "bumper_pressed": "BUMPER:START:SECONDS",
     "battery": "PERCENT:MINUTES",
 }
-"""For each fault that takes numbers: the names of its arguments, for the help of `--fault`."""
+"""Maps each fault that takes numbers to the names of its arguments, for the help of `--fault`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -52,13 +52,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _with_names() -> list[str]:
-    """Return the faults with arguments, each with the names of its arguments."""
+    """Return the form of each fault that takes arguments, such as `bias=MOTOR:FACTOR`."""
     names = [form.partition("=")[::2] for form in forms()]
     return [f"{name}={NUMBERS.get(name, kinds)}" for name, kinds in names]
 
 
 def fault(text: str) -> NamedFault:
-    """Parse the name of a fault with its motors or numbers. This function is an argparse type."""
+    """Parse a fault with its arguments, such as `bias=a:0.9`. This function is an argparse type."""
     try:
         return named(text)
     except ValueError as error:

@@ -212,10 +212,10 @@ def _certified(names: list[str]) -> str:
 
 
 def _admit_service(directory: Path) -> None:
-    """Let the installed service's TLS gateway use these certificates.
+    """Let the TLS gateway of the installed service use the certificates in `directory`.
 
-    This writes a systemd drop-in with the permitted networks and the certificates. It does nothing
-    if the service is not installed.
+    This function writes a systemd drop-in, a file that extends the gateway's unit. It does nothing
+    if the service is not installed or this user is not root.
     """
     step = service.admitting(directory)
     if step is None:
@@ -226,8 +226,8 @@ def _admit_service(directory: Path) -> None:
 
 
 def _name(text: str) -> str:
-    # The setting `access` has the same rule. The name becomes a part of bus keys, and here also the
-    # name of a directory.
+    # The names in `[access]` follow the same rule. The name becomes a part of keys on the bus, and
+    # here also the name of a directory.
     if not NAME.fullmatch(text) or text in (".", ".."):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a name for a certificate: 1 to 64 letters, digits, spaces and "

@@ -136,7 +136,7 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
 
 
 def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
-    """Make a token and print its link once. `where` is the configuration's path, for messages."""
+    """Make a token, and print the link that contains it. `where` is the configuration's path."""
     import segno
 
     from acsard.web.listen import invitations, require_certificate

@@ -7,11 +7,11 @@
         print(robot.pose())
 
 `connect` is for scripts and `connect_async` for asyncio programs. Both offer the same methods and
-typed messages (`acsard.core.messages.schema`). The client signs, numbers and stamps its commands,
-and sends zeros before each drive. So a program needs no code of its own for the daemon's rules
-about stale commands and about zeros before motion. At the end of the block, also by an exception,
-the client sends a zero if its last command was not one. `drive` raises an error if the robot does
-not follow it. When `drive` returns, the robot is at rest.
+typed messages (`acsard.core.messages.schema`). The daemon refuses late commands, and requires a
+zero before a sender may move the robot. The client does what these rules require: it signs, numbers
+and stamps its commands, and sends zeros before each drive. When the block ends, also by an
+exception, the client sends a zero if its last command was not zero. `drive` raises an error if the
+robot does not follow. When `drive` returns, the robot stands, unless something else moves it.
 
 Arguments that you leave out come from the configuration file that the environment variable
 ACSARD_CONFIG names (`bus.listen`, `robot.id`, `bus.tls`), as on the command line. Without that
@@ -22,8 +22,7 @@ Errors are `AcsardError`s, and most are also the matching built-in exception. Th
 to do:
 
     UnreachableError   ConnectionError  no daemon listens at the endpoint
-    NoAnswerError      TimeoutError     there is neither such a robot nor such a key, or you may not
-                                        query it
+    NoAnswerError      TimeoutError     the robot or the key does not exist, or you may not query it
     ReplyError         RuntimeError     the daemon reports a failure; a service that refuses says so
                                         in its reply instead
     NotDrivenError     RuntimeError     the robot does not follow your drive: it is stopped or in

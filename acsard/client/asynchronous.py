@@ -52,7 +52,10 @@ class AsyncClient:
         self._client = client
 
     def send(self, linear: float, angular: float = 0.0) -> None:
-        """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving."""
+        """Send one command: `linear` m/s, `angular` rad/s (left is +).
+
+        Repeat the call to keep the robot moving.
+        """
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
@@ -84,11 +87,11 @@ class AsyncClient:
         return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
 
     async def whoami(self) -> Identity:
-        """Return this client's identity as the daemon sees it, as `Client.whoami` does."""
+        """Return this client's role and name at the robot, as `Client.whoami` does."""
         return await in_thread(self._client.whoami, 2 * REPLY_TIMEOUT_S)
 
     async def pose(self) -> Pose:
-        """Return the present pose of base_link in odom."""
+        """Return the present pose of the robot in the odom frame, m and rad."""
         return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
 
     async def messages(self, name: str) -> AsyncIterator[Any]:

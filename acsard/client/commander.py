@@ -1,10 +1,9 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
-This module is pure. Every program that commands the robot uses these time limits. `Commander` is
-for a program that forwards the commands of a person (`Wish`). It sends each of them at most once
-and repeats none, so the robot stops when the person, the panel or the network falls silent. A new
-command replaces one that has not been sent yet. A zero is never too old to be sent, and the last
-command is a zero.
+This module is pure. Every program that commands the robot uses its time limits. A program that
+forwards the commands of a person (`Wish`) uses a `Commander`. A `Commander` repeats no command, so
+the robot stops when the person, the panel or the network falls silent. A new command replaces one
+that has not been sent yet. A zero is never too old to be sent, and the last command is a zero.
 """
 
 from __future__ import annotations
@@ -16,25 +15,27 @@ from acsard.core.messages.signature import Signature
 from acsard.core.values import NS_PER_S, REST, Twist
 
 SEND_PERIOD_S = 0.05
-"""Pause between two commands, s. At 20 Hz, five commands fall into the default timeout."""
+"""Pause between two commands of a drive, s. At 20 Hz, a source sends five commands within its
+default timeout of 0.25 s."""
 
 SPACING_S = 0.003
 """Shortest pause between two commands on one connection, s.
 
-The daemon accepts 1000 commands per second.
+The daemon accepts 1000 commands per second, and drops commands that come faster.
 """
 
 AGAIN_S = 0.02
 """Pause before a zero is sent a second time, s.
 
-A busy daemon handles several commands in a row, and drops those that seem to come too fast.
+The first zero may be lost: a busy daemon receives several commands at once, and drops some of them
+because they seem to come too fast.
 """
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
 """Duration and period of the zeros at the beginning of a drive, s.
 
-The daemon checks for 0.25 s whether the commands of a new sender are late. With more zeros it
-decides sooner, despite the jitter of a busy machine.
+The daemon checks for 0.25 s whether the commands of a new sender are late. With many zeros in this
+time, the jitter of a busy machine does not prolong the check.
 """
 
 OPENED_S = 4.0
@@ -48,31 +49,30 @@ ZEROS = 3
 """Number of zeros that a sender sends at the end, in case the network loses one."""
 
 GRACE_S = 0.5
-"""Longest time for which commands may have no effect, s. After that, the operator is informed, or
-the drive ends.
+"""Longest time for which commands may have no effect, s. After that, the program informs the
+operator, or ends the drive.
 
 The time is longer than the first 0.25 s of a new sender, in which its commands never have an
 effect. It is also longer than a short delay of a known sender.
 """
 
 SILENCE_NS = 3 * NS_PER_S // 10
-"""Time without a command after which the robot has begun to brake, ns. The default timeout of a
-source is 0.25 s."""
+"""Time without a command after which the robot brakes, ns. It is a little longer than the default
+timeout of a source, 0.25 s."""
 
 GATHER_NS = NS_PER_S // 25
 """Time for which the first command after a silence waits, ns, to see whether a burst follows.
 
-A panel that sends at 20 Hz sends at most one command in this time. The first command after a burst
-of more than `CROWD` commands waits as well.
+A panel that sends at 20 Hz sends at most one command in this time. After a burst of more than
+`CROWD` commands, the next command waits again.
 """
 
 CROWD = 5
-"""Largest number of commands that a panel sends in `GATHER_NS`, at 125 Hz. If more arrive, they
-come from a queue, which may contain further commands."""
+"""Largest number of commands that a panel sends within `GATHER_NS`: five at 125 Hz. If more arrive,
+they have waited in a queue, which may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
-"""Age above which a nonzero command is not sent, ns, because it no longer shows the operator's
-intention."""
+"""Age above which a nonzero command is dropped, ns, because the operator may no longer want it."""
 
 DRIVES_NS = NS_PER_S // 2
 """Time for which a sender counts as driving after its last nonzero command, ns."""
@@ -81,7 +81,7 @@ LONGEST_S = 10.0
 """Longest timeout that a source may have, s. The robot follows no command older than this."""
 
 NEVER = ("inactive", "stopped", "fault", "shutdown")
-"""Modes in which no command moves the robot."""
+"""Modes in which no command moves the robot, and which do not end by themselves."""
 
 
 class Wish(Struct, frozen=True):
@@ -93,7 +93,7 @@ class Wish(Struct, frozen=True):
     twist: Twist
     stamp_ns: int | None = None
     steady: bool = False
-    """Whether the clock of `stamp_ns` is never adjusted."""
+    """True if the clock of `stamp_ns` is never adjusted."""
 
 
 class Commander:
@@ -109,7 +109,11 @@ class Commander:
 
     def __init__(self, *, leads: bool = False, gathers: bool = False) -> None:
         self.replaced = self.stale = 0
-        """Numbers of commands that were not sent: replaced by a newer one, or too old."""
+        """Numbers of commands that were not sent.
+
+        `replaced` counts those that a newer command replaced. `stale` counts those that were too
+        old or came in a burst.
+        """
         self._leads, self._gather_ns = leads, GATHER_NS if gathers else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)
@@ -119,8 +123,8 @@ class Commander:
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands that have arrived since the wait for a burst began; 0 after `send` has
-        taken one."""
+        """Number of commands that have arrived since the first command after a silence began to
+        wait (`GATHER_NS`). `send` resets it to 0."""
         self._crowded = False
         """Whether the last burst had more than `CROWD` commands."""
         self._moved_ns: int | None = None
@@ -158,7 +162,10 @@ class Commander:
         return None if self._wish is None else self._hold_until_ns
 
     def send(self, now_ns: int) -> Wish | None:
-        """Return the command to send at monotonic `now_ns`, or None if there is none."""
+        """Return the command that the caller must send at `now_ns`, or None.
+
+        A nonzero command that is too old, or that came in a burst, is dropped.
+        """
         if self._lead:
             self._lead = False
             return self._zero(now_ns)
@@ -213,9 +220,9 @@ class Sender:
     def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
         """Return the signature of the next command.
 
-        The daemon refuses a command whose stamp is older than that of an earlier command. The
-        commands of a sender that drives as two sources may overtake each other. So a zero gets at
-        least the newest stamp of this sender.
+        The daemon refuses a command whose stamp is older than that of an earlier command. If a
+        sender uses two sources, its commands may be signed in another order than their stamps. So
+        that a zero is never refused, it gets at least the newest stamp of this sender.
 
         Args:
             stamp_ns: the time of the command on the sender's clock, ns, or None without a clock.
@@ -259,7 +266,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def no_command(source: str) -> str:
-    """Return the objection to a client whose commands do not arrive at the daemon."""
+    """Return the text which says that the daemon receives no command of the source `source`."""
     return (
         f"the daemon receives no command of source {source}; `acsard top` shows whether it refuses "
         "commands"

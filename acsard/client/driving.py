@@ -30,26 +30,26 @@ from acsard.client.follower import QUIET_S, Followed, Watch
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2
-"""Longest time that a state takes to arrive, s. A state that arrives later than this after an
-action therefore describes the robot after the action."""
+"""Longest time that a message on `state` takes to arrive, s. If a state arrives more than this time
+after an action, the daemon sent it after the action."""
 
 STANDS = 0.01, 0.02
 """Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""A share and a time, s. If within this time the speed of the robot falls below this share of its
-lowest speed so far, the robot is still slowing down."""
+"""The robot is still slowing down if, within `SLOWS_S` s, its speed falls below the fraction
+`SLOWER` of its lowest speed so far."""
 
 
 CLOSED = "the connection was closed while the robot drove"
 
 
 class UnheardError(NotDrivenError):
-    """No command of this client arrives at the daemon."""
+    """The robot does not follow, and the daemon receives no command of this client's source."""
 
 
 class Driven(Followed, Protocol):
-    """The interface that a drive needs of a client."""
+    """The methods and attributes of a client that `drive` uses."""
 
     source: str
     sender: str
@@ -64,8 +64,8 @@ def drive(
 ) -> Generator[float, None, None]:
     """Drive for `seconds`, then send zeros until the robot stands.
 
-    The generator yields each pause, s, that the caller must make before the next step. `linear` is
-    in m/s and `angular` in rad/s (left is +).
+    The generator yields the time, s, for which the caller must wait before it resumes the
+    generator. `linear` is in m/s and `angular` in rad/s (left is +).
 
     Raises:
         NotDrivenError: The robot does not follow; the text is the daemon's reason.
@@ -118,9 +118,9 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zeros until the robot stands, or until it no longer slows down.
+    """Send zeros until the robot stands, or no longer slows down because something else moves it.
 
-    A robot that something else moves does not slow down.
+    The generator yields the pauses between the zeros, s.
     """
     begun = since = time.monotonic()
     watch, slowest = checks.watch, math.inf
@@ -193,7 +193,10 @@ class _Drive:
             )
 
     def require(self, grace: float) -> None:
-        """Raise `NotDrivenError` if the robot has not followed for longer than `grace` s."""
+        """Raise `NotDrivenError` if the robot has not followed for `grace` s, or never will.
+
+        Process the states that have arrived first.
+        """
         self.look()
         if not self.objection:
             return

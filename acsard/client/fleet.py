@@ -1,7 +1,8 @@
-"""Follows many robots: their liveliness tokens, their newest states and their versions.
+"""Follows many robots: whether each daemon is present, its newest state and its version.
 
-Zenoh's threads store the newest state of each robot undecoded. The thread that reads the rows
-decodes it. Of the methods that this thread calls repeatedly, only `ask` may wait for the bus.
+A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest state
+of each robot undecoded, and the thread that reads the rows decodes it. Of the methods that this
+thread calls repeatedly, only `ask` may wait for the bus.
 """
 
 from __future__ import annotations
@@ -30,21 +31,21 @@ names."""
 
 
 class Row(Struct, frozen=True):
-    """The facts that are known about one robot."""
+    """A robot on the bus: its id, its newest state and its version."""
 
     robot_id: str
     here: bool | None
-    """Whether the liveliness token of its daemon is present; None if the token was never seen."""
+    """True while the liveliness token of the robot's daemon is present; None if it never was."""
     state: RobotState | None
     age: float
-    """Age of `state`, s; inf if its only source is an answer that a storage may have sent."""
+    """Age of `state`, s; inf before a state has proved that the daemon runs."""
     version: str
     silent: bool = False
-    """Whether the robot counts as silent, as `Follower.silent` defines it."""
+    """True if no state of the robot has arrived for so long that it counts as silent."""
 
 
 class _Known:
-    """The facts that are known about one robot. Zenoh's threads replace each value as a whole."""
+    """The data that `Fleet` stores for one robot. Zenoh's threads replace each value as a whole."""
 
     def __init__(self) -> None:
         self.here: bool | None = None
@@ -54,29 +55,28 @@ class _Known:
         self.begin()
 
     def begin(self) -> None:
-        """Reset the times so that the robot is queried at once.
-
-        Call this when the robot has appeared, or when it is followed from now on.
-        """
+        """Begin to follow the robot, or begin again because it has reappeared; query it at once."""
         self.since = self.info_due = time.monotonic()
         self.follower = Follower(self.since, FLEET_ASK_S)
         self.follower.due = self.since
 
 
 class Fleet:
-    """Follows the robots with these ids; "*" stands for all robots."""
+    """Follows many robots, or all robots on the bus, and returns a row for each."""
 
     def __init__(
         self, robot: Client, ids: Sequence[str], most: int = MOST, forget_s: float = math.inf
     ) -> None:
-        """Subscribe to the states and tokens; this may wait for the bus. Raises `ZError`.
+        """Subscribe to the states and liveliness tokens of the robots. This may wait for the bus.
+
+        Raises `ZError` if the session cannot subscribe.
 
         Args:
             robot: A client of any robot on the same bus.
-            ids: The named robots, which are never dropped, or "*".
+            ids: The ids of the robots, or "*" for all. A robot that is named here is never dropped.
             most: Maximum number of robots.
-            forget_s: Time without a state, s, after which a robot that was not named is dropped
-                unless its token is present.
+            forget_s: Time without a state, s, after which any other robot is dropped unless its
+                liveliness token is present.
         """
         self._robot, self._ids, self._most, self._forget_s = robot, ids, most, forget_s
         self._lock = Lock()
@@ -109,7 +109,10 @@ class Fleet:
             return [self._row(name, one, now) for name, one in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the robot id and the key of each query that is due, and plan the next queries."""
+        """Return the queries that are due, as pairs of robot id and key, for a call of `ask`.
+
+        This also sets the times of the next queries.
+        """
         now, due = time.monotonic(), []
         with self._lock:
             for name, one in self._known.items():
@@ -127,7 +130,7 @@ class Fleet:
             self._robot.like(name).ask(key, self._answer if key == "state" else self._info)
 
     def here(self, robot_id: str) -> bool:
-        """Return whether the token of this robot is present."""
+        """Return whether the liveliness token of this robot's daemon is present."""
         one = self._known.get(robot_id)
         return one is not None and bool(one.here)
 
@@ -145,7 +148,6 @@ class Fleet:
         return Row(name, one.here, state, age, one.version, silent)
 
     def _take(self, one: _Known) -> None:
-        """Decode the newest published state of a robot, and pass it to its follower."""
         for sample, at in one.newest.take():
             try:
                 one.follower.published(self._states.decode(*encoded(sample)), at)
@@ -167,7 +169,7 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        """Drop the robot that has been gone for the longest time. Never drop a named robot."""
+        """Drop the robot that has been absent for the longest time, but no robot of `ids`."""
         gone = [(one.since, name) for name, one in self._known.items() if not one.here]
         for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
             del self._known[name]

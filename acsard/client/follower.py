@@ -1,11 +1,11 @@
 """Follows the `state` of one robot: its newest value, its age, and whether the daemon is silent.
 
-`Follower` is pure, and `Watch` binds it to the bus. Every program that follows `state` uses these
-time limits, so a silent robot is reported equally soon by all of them.
+`Follower` is pure, and `Watch` connects it to the bus. All programs that follow `state` use the
+time limits of this module, so they all report a silent robot equally soon.
 
-The storage of a router also answers queries. For a robot that is off, it returns the robot's last
-state. A published state never comes from a storage, so it always proves that the daemon runs. An
-answer to a query proves this only if it is newer than a state that was received before.
+A router may have a storage, which answers queries too. For a robot that is off, it answers with the
+robot's last state. A published state never comes from a storage, so it always proves that the
+daemon runs. An answer to a query proves this only if it is newer than an earlier state.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 ASK_S = 0.3
-"""Time without a published state, s, after which the client queries `state`. This is needed because
-a robot may publish its state seldom."""
+"""Time without a new state, s, after which the client queries `state`. The query is for a robot
+that is configured to publish its state seldom."""
 
 QUIET_S = 0.5
-"""Age of a state, s, above which a program must not act on it."""
+"""Age of a state, s, above which a program must not base an action on the state."""
 
 SILENT_S = 1.0
-"""Age of the last state, s, above which the robot counts as silent. Then a drive ends, and other
-programs inform the operator."""
+"""Age of the last state, s, above which the robot counts as silent. Then a drive ends, and programs
+that show the robot report the silence."""
 
 FIRST_S = 2.0
 """Time, s, within which the first message on a key arrives if the robot works normally."""
 
 FLEET_ASK_S = 2.0
-"""Value of `ASK_S` for a program that follows many robots, because it sends many queries."""
+"""Time without a new state, s, after which a program that follows many robots queries a `state`.
+The time is longer than `ASK_S`, because such a program sends many queries."""
 
 STATE = "state"
 
@@ -45,7 +46,7 @@ ANSWERS = 16
 one from each storage."""
 
 STEADY = ("lines", "lines_sent", "commands")
-"""Counters that decrease only when the daemon restarts."""
+"""Names of counters in `state` that decrease only when the daemon restarts."""
 
 
 class Follower:
@@ -53,11 +54,14 @@ class Follower:
 
     def __init__(self, now: float, ask_s: float = ASK_S) -> None:
         self.state: RobotState | None = None
-        """The newest state. Until `heard` is true, it may come from a storage."""
+        """The newest state, or None before the first one.
+
+        Until `heard` is true, the state may be an old one from the storage of a router.
+        """
         self.heard = False
-        """Whether a state has proved that the daemon runs."""
+        """Whether any state has proved that the daemon runs (see `answered`)."""
         self.last_seen = now
-        """Time of the last state that proved that the daemon runs, or of the start."""
+        """Time of the last state that proved that the daemon runs; before the first, the start."""
         self.due = now + ask_s
         """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0
@@ -71,11 +75,11 @@ class Follower:
         self.due, self.unreadable = now + self._ask_s, 0
 
     def answered(self, state: RobotState, now: float) -> bool:
-        """Process the answer to a query, and return whether it proves that the daemon runs.
+        """Process an answer to a query of `state`; return whether it proves that the daemon runs.
 
-        It does so if its stamp is newer than the stamp of the stored state or of the previous
-        answer. The comparison with the previous answer is for a robot whose clock was set back
-        after it published the stored state.
+        A storage may have sent an old answer. So an answer is a proof only if its stamp is newer
+        than that of `self.state` or of the previous answer. The previous answer is compared too,
+        because the robot's clock may have been set back since `self.state`.
         """
         held, before, self._answer = self.state, self._answer, state
         known = [one for one in (held, before) if one is not None]
@@ -89,39 +93,39 @@ class Follower:
         return False
 
     def asks(self, now: float) -> bool:
-        """Return whether the caller must query `state` now, and plan the next query."""
+        """Return whether the caller must query `state` now. If so, plan the next query."""
         if now < self.due:
             return False
         self.due = now + self._ask_s
         return True
 
     def age(self, now: float) -> float:
-        """Return the time since the last state that proves that the daemon runs, s.
+        """Return the time since the last state that proved that the daemon runs, s.
 
-        Before the first one it is the time since the start.
+        Before the first such state, return the time since the start.
         """
         return max(0.0, now - self.last_seen)
 
     @property
     def patience_s(self) -> float:
-        """The age above which the robot counts as silent, s."""
-        # A robot that publishes seldom sends only answers, at intervals of `ask_s`.
+        """Age of the last state, s, above which the robot counts as silent."""
+        # If a robot publishes seldom, only answers arrive, at intervals of `ask_s`.
         return (SILENT_S if self.heard else FIRST_S) + self._ask_s - ASK_S
 
     def silent(self, now: float) -> bool:
-        """Return whether the robot counts as silent."""
+        """Return whether the robot counts as silent at the time `now`, s."""
         return self.age(now) > self.patience_s
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
-    """Return whether the daemon has restarted between two states, because a counter decreased."""
+    """Return whether the daemon has restarted between two states, which lowers a counter."""
     return before is not None and any(
         state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY
     )
 
 
 class Followed(Protocol):
-    """The interface that a `Watch` needs of a client."""
+    """The methods of a client that a `Watch` uses."""
 
     def subscribe(self, name: str) -> Subscription:
         """Subscribe to a key."""
@@ -131,12 +135,12 @@ class Followed(Protocol):
 
 
 class Watch(Follower):
-    """Follows the state of the robot of a client. Only one thread may use it."""
+    """Follows the `state` of one robot over the bus. Only one thread may use an instance."""
 
     def __init__(
         self, robot: Followed, now: float, wake: Callable[[], object] | None = None
     ) -> None:
-        """Subscribe to the state of the robot of the client `robot`.
+        """Subscribe to `state`; `robot` is a client that is connected to the robot.
 
         `now` is the present time, s. `wake` is called on a thread of Zenoh when a state arrives.
         """
@@ -146,12 +150,13 @@ class Watch(Follower):
         if wake is not None:
             self._states.wakes(wake)
         self._answers = Mailbox[zenoh.Sample](ANSWERS)
-        """Replies to queries. A thread of Zenoh puts them here and does nothing else."""
+        """Replies to queries that a thread of Zenoh has put here, and that `look` processes."""
 
     def look(self, now: float) -> list[RobotState]:
         """Process the states that have arrived, and return the new ones.
 
-        If no state has arrived for some time, query it. Raises `ZError` if the session was closed.
+        If no state has arrived for some time, send a query, whose reply a later call processes.
+        `now` is the present time, s. Raises `ZError` if the session was closed.
         """
         news = []
         for _ in range(QUEUED):  # bounded, so that a flood cannot block the caller

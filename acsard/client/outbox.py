@@ -1,8 +1,7 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
-Each sender has a `Commander`, which keeps only its newest command. For a sender that ends, the
-program must call `release`. The last zero of this sender is then sent even if the bus has been
-blocked for a long time.
+Each sender has a `Commander`, which keeps only its newest command. When a sender ends, the program
+must call `release`. The last zero of this sender is then sent, however long the bus was blocked.
 """
 
 from __future__ import annotations
@@ -34,14 +33,16 @@ class Outbox:
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Future that gets the exception that ended the thread. After that, no command is sent."""
+        """Future of the thread. If an exception ends the thread, the future has this exception, and
+        no command is sent any more."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
         """Queue a command of the sender `commander`, to be sent by `put` on the thread.
 
-        Returns the result of `Commander.take`: the silence before the command, ns, if it was long.
+        Returns the time since the sender's previous command, ns, or None if that time was short
+        (see `Commander.take`).
         """
         with self._news:
             silence = commander.take(wish, clock.mono_ns())
@@ -69,7 +70,7 @@ class Outbox:
             )
 
     def end(self, seconds: float) -> None:
-        """Let the thread send the commands that are due and end; wait at most `seconds` for it."""
+        """End the thread after it has sent the commands that are due; wait at most `seconds`."""
         with self._news:
             self._ended = True
             self._news.notify_all()

@@ -51,7 +51,7 @@ from acsard.host.own_identity import new_secret, own_name, sender_id
 REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
-"""Text of Zenoh's error reply if the other side received the query and did not answer in time."""
+"""Text of Zenoh's error reply if the other side has received a query but did not answer in time."""
 
 
 @contextmanager
@@ -62,12 +62,15 @@ def connect(
     source: str = "app",
     tls: str | None = None,
 ) -> Iterator[Client]:
-    """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`).
+    """Connect to the daemon at `endpoint`, and yield a client until the end of the `with` block.
 
-    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449". An
-    argument that is None comes from the file that the environment variable ACSARD_CONFIG names. The
-    variable ACSARD_TLS replaces the certificate directory of that file. Without these variables,
-    `endpoint` is "tcp/127.0.0.1:7448", `robot_id` is "acsar", and there is no certificate.
+    The client sends its commands as the command source `source`, a name in `[[commands.sources]]`.
+    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449".
+
+    An argument that is None comes from the file that the environment variable ACSARD_CONFIG names.
+    The variable ACSARD_TLS replaces the certificate directory of that file. Without these
+    variables, `endpoint` is "tcp/127.0.0.1:7448", `robot_id` is "acsar", and there is no
+    certificate.
     """
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
@@ -79,11 +82,10 @@ def connect(
 
 
 def close(session: zenoh.Session) -> None:
-    """Close a session, even if the other side is stuck."""
+    """Close a session, and ignore the error of Zenoh if the other side is stuck."""
     try:
         session.close()
     except zenoh.ZError:
-        # The other side is stuck. Ignore that, because this client ends the session anyway.
         pass
 
 
@@ -91,19 +93,18 @@ class _Puts:
     """Keeps a minimum pause between the commands on one connection.
 
     The daemon accepts 1000 commands a second per connection and key, and drops others. So it would
-    drop a zero that is sent directly after another command. That command may be from another
-    `Client` on the same connection.
+    drop a zero that is sent directly after another command. All clients of one connection share one
+    instance, because the other command may come from any of them.
     """
 
     def __init__(self) -> None:
         # The lock is reentrant: a signal handler may also send while the same thread holds it.
         self._lock, self._next_s = threading.RLock(), 0.0
         self.moving: dict[Client, float] = {}
-        """The clients of the connection whose last command was not zero, each with the time of that
-        command, s."""
+        """The clients whose last command was not zero, each with the time of that command, s on the
+        monotonic clock."""
 
     def wait(self) -> None:
-        """Wait until the next command may be sent."""
         with self._lock:
             at_s = max(self._next_s, time.monotonic())
             self._next_s = at_s + SPACING_S
@@ -130,7 +131,7 @@ class Client:
         self._opened = False
         self._puts = _Puts()
         self.certificate = shown_at(endpoint, tls)
-        """Common name of the certificate that this client presents, "" without one."""
+        """Common name of the certificate that this client shows to the daemon, "" without one."""
         # The secret identifies this program as a caller of services. Clients made by `like` share
         # it, although they may send commands under another name.
         self._secret = new_secret()
@@ -143,13 +144,13 @@ class Client:
         whole = sender_id(name)
         self._sender = Sender(whole)
         self.sender = public_name(whole, self.certificate)
-        """Value of `state.sender` while the robot follows this client."""
+        """Public name of this client. It is the value of `state.sender` while the client drives."""
 
     @property
     def caller(self) -> str:
         """The sender id that this client attaches to service calls and queries: `name/SECRET`.
 
-        The daemon's log shows the public name that is derived from it.
+        The daemon's log shows a public name instead, which does not reveal the secret.
         """
         return sender_id(self.name, self._secret)
 
@@ -192,9 +193,8 @@ class Client:
     def end(self) -> None:
         """Close the connection, as `connect` does at the end of its block.
 
-        First send a zero to each robot that may still follow the last command of a client of this
-        connection. The program may have failed while it drove, and a source may have a timeout of
-        several seconds.
+        First send a zero to each robot that may still follow a client of this connection. Without
+        the zero, a robot would drive on until the timeout of the source, which may be 10 s.
         """
         begun_s = time.monotonic()
         # After the longest timeout a zero would only stop the next sender that drives.
@@ -235,10 +235,10 @@ class Client:
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, such as "stop", with the fields of its payload.
 
-        `clear` releases the stop or fault that `state` shows at the time of the call. `activate`
-        switches on a robot that `state` shows as switched off at that time. If a person has decided
-        on the basis of an earlier state, pass `latch=state.latch` of that state. The daemon then
-        refuses the call if there was a stop or a `deactivate` in between.
+        `clear` releases the stop or fault that `state` shows at the time of the call, and
+        `activate` switches on a robot that is switched off at that time. If a person has seen an
+        earlier state and decided to call one of them, pass `latch=state.latch` of that state. The
+        daemon then refuses the call if the robot has been stopped or switched off again since then.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
@@ -247,10 +247,10 @@ class Client:
     def set(self, settings: Mapping[str, Plain], *, keep: bool = False) -> schema.ServiceReply:
         """Change settings until the next start of the daemon, for example `{"rates.state": 5.0}`.
 
-        The daemon changes all of the settings or none. A lowered speed, acceleration or jerk of
-        `limits` survives the next start. With `keep`, the daemon also writes the settings into its
-        configuration file. The reply then names the file, or says why the settings are refused or
-        not written.
+        The daemon changes all of the settings or none. If a speed, acceleration or jerk in `limits`
+        is lowered, it stays lowered after the next start. With `keep`, the daemon also writes the
+        settings into its configuration file. The reply then names the file, or says why the
+        settings are refused or not written.
         """
         fields: dict[str, object] = {"settings": settings}
         return self.request("set", fields | {"keep": True} if keep else fields)
@@ -261,7 +261,7 @@ class Client:
         return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
 
     def get(self, name: str) -> Any:
-        """Return the last value of a key as its typed message: `odom`, `state`, `info`, …"""
+        """Return the last message on a key such as `odom` or `state`, decoded to its type."""
         return decoder(name).decode(*self.reply(name))
 
     def reply(self, name: str) -> tuple[str, bytes]:
@@ -269,7 +269,7 @@ class Client:
         return self._ask(name)
 
     def whoami(self) -> Identity:
-        """Return this client's identity as the daemon sees it. The role is "" if it is unknown."""
+        """Return this client's role and name at the robot. The role is "" if it is unknown."""
         where = self.where
         try:
             return identity(self.ask, where.tls, self.sender, where.robot_id, where.endpoint)
@@ -277,7 +277,7 @@ class Client:
             raise self._refused("whoami") from None
 
     def pose(self) -> Pose:
-        """Return the present pose of base_link in odom."""
+        """Return the present pose of the robot in the odom frame, m and rad."""
         state = self.get("state")
         return Pose(state.x, state.y, state.yaw)
 
@@ -298,9 +298,9 @@ class Client:
         yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
-        """Call `callback` with each sample of a key, on a thread of Zenoh.
+        """Subscribe to a key; `callback` is called with each sample on a thread of Zenoh.
 
-        To end this, call `undeclare` on the returned subscriber.
+        To end the subscription, call `undeclare` on the returned subscriber.
         """
         try:
             return self.session.declare_subscriber(self.key(name), callback)
@@ -308,7 +308,7 @@ class Client:
             raise self._refused(name) from None
 
     def subscribe(self, name: str) -> Subscription:
-        """Subscribe to a key; return its raw samples as a queue for a loop that must not block."""
+        """Subscribe to a key; return a queue of raw samples that can be read without waiting."""
         return Subscription(self._queue(name), self.key(name))
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
@@ -334,9 +334,10 @@ class Client:
     def put(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
     ) -> None:
-        """Send a command with this signature, for a program that forwards other senders' commands.
+        """Send a command of another sender, which `signature` identifies.
 
-        `source` is the command source; "" means the source of this client.
+        This is for a program that forwards commands. `source` is the command source; "" means the
+        source of this client.
         """
         self._puts.wait()
         self._publish(twist, signature, source or self.source)
@@ -405,7 +406,6 @@ class Client:
         return next(iter(replies), None)
 
     def _refused(self, name: str) -> MendableError:
-        """Return the error for a key `name` that Zenoh's session has refused."""
         if self.session.is_closed():
             return NoAnswerError(
                 "the connection of this client is closed: use a client within the `with` block of "
@@ -414,7 +414,7 @@ class Client:
         return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
-        """Return the error for a query of the key `name` without a reply, with the likely cause."""
+        """Return the error for a query of the key `name` that got no reply; the text says why."""
         key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
@@ -436,10 +436,10 @@ class Client:
         )
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """Return the error to raise for a drive or a state that failed with `error`.
+        """Return the error to raise instead of `error`, with which a drive or a query has failed.
 
-        The result is one of the errors that `acsard.client` documents. If no command arrives at the
-        daemon, the text of the error also names the role of this client's certificate.
+        The result is one of the errors that `acsard.client` documents. If this client's role may be
+        the reason, the text of the error also names the role.
         """
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))

@@ -13,10 +13,11 @@ in the same way as the MCU, and passes a line only if all of these conditions ho
 Otherwise the guard replaces the line with the stop line. It returns the reason, and the robot
 latches a fault.
 
-The guard also checks that the robot comes to rest. Only zero speeds pass if the last fresh command
-is older than the longest ramp to rest that the limits allow. After a stop, a fault or a shutdown,
-only zero speeds pass once the longest ramp at the stop decelerations is over. The guard remembers
-these times, so a recording stores the guard's `Memory` beside the state of the robot.
+The guard also checks that the robot comes to rest in time. A ramp from full speed to rest takes a
+known time with the configured decelerations. When this time and `MARGIN_NS` have passed since the
+last fresh command, only zero speeds pass. After a stop, a fault or a shutdown the time is that of a
+ramp at the stop decelerations. The guard remembers the moments from which it counts, so a recording
+stores the guard's `Memory` beside the state of the robot.
 """
 
 from __future__ import annotations
@@ -40,27 +41,27 @@ HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
 MARGIN_NS = 300_000_000
-"""Time allowed beyond the longest ramp, ns. The board stops the motors by itself if it receives no
-line for this time, so the ramp of a moving robot cannot be delayed by more than that."""
+"""Time by which a ramp to rest may end later than computed, ns. It is the board's watchdog time: if
+no line arrives for longer, the board has stopped the motors by itself."""
 
 
 class Memory(Struct, frozen=True):
     """Everything that a guard remembers from one line to the next."""
 
     last: bytes = b""
-    """The last line written to the port, which an MCU with power follows. Empty at the start."""
+    """The last line that was written to the serial port; empty before the first one."""
     commanded_ns: int | None = None
-    """Monotonic time at which mode `driving` last had a fresh command, ns; None before that."""
+    """Monotonic time of the last step with a fresh command in mode `driving`, ns; None before."""
     halted_ns: int | None = None
     """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
-    """Longest ramp to rest, ns, under any limits in force since the robot was last at rest."""
+    """Longest time from full speed to rest, ns, with any limits in force since the last rest."""
     stop_ramp_ns: int = 0
-    """Longest ramp to rest at the stop decelerations, ns, under any of the same limits."""
+    """Longest time from full speed to rest at the stop decelerations, ns. See `ramp_ns`."""
 
 
 class Guard:
-    """Checks each line before it is sent, and replaces a forbidden line with the stop line."""
+    """Checks each line to the board, and sends the stop line (all zeros) for a forbidden one."""
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
         """Start with the memory of an earlier guard, or with an empty one if `memory` is None.
@@ -77,7 +78,7 @@ class Guard:
     def use(self, config: Config) -> None:
         """Use `config` for all later checks.
 
-        Until the robot is at rest, the longer of the old and the new ramps applies.
+        Until the robot is at rest, the longer one of the old and the new ramp times applies.
         """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
@@ -115,7 +116,7 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _note_limits(self) -> None:
-        """Update the longest ramps. A moving robot may still brake at earlier, lower limits."""
+        """Update the longest ramp times. A moving robot may still brake as earlier limits ask."""
         if _wheels(self._last) == _ZERO:
             self._longest = self._ramps
         else:
@@ -125,22 +126,22 @@ class Guard:
     def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
         wheels = _wheels(line)
         if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
-            return "it is not a whole line of four wheels"
+            return "it is not a complete line with four wheel speeds"
         if wheels == _ZERO:
             return ""
         if max(wheels) > self._most or min(wheels) < -self._most:
-            return "a wheel is over limits.wheel_speed"
+            return "it moves a wheel faster than limits.wheel_speed"
         if not outputs.linked:
-            return "it moves a wheel without a link"
+            return "it moves a wheel while the serial link is not up"
         if self._require_check and b"#" not in line:
-            return "it moves a wheel without the check that mcu.link_check requires"
+            return "it moves a wheel without the checksum that mcu.link_check requires"
         grows = wheels != before and any(
             abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
         if grows and not self._commanded(outputs):
-            return "a wheel speeds up without a fresh command in mode driving"
+            return "it speeds up a wheel without a fresh command, or not in mode driving"
         if self._late(outputs.now.mono_ns):
-            return "it still moves a wheel although the longest ramp to rest is over"
+            return "it still moves a wheel although the longest ramp to zero has ended"
         return ""
 
     def _late(self, now_ns: int) -> bool:

@@ -61,9 +61,9 @@ MAX_DT = 0.05
 stall of the process. If 1.5 control periods are longer, that time applies instead."""
 
 UNHEARD_S = WATCHDOG_S - 0.05
-"""If no line was written to the port for this time, s, the robot starts again from rest. The MCU
-stops the motors by itself after `WATCHDOG_S`, measured by its own clock. The difference of 0.05 s
-allows for a clock that runs a little fast."""
+"""If no line was written to the port for this time, s, the next speeds start from rest, because the
+MCU has stopped the motors by itself. The MCU does so after `WATCHDOG_S` by its own clock, and that
+clock may run a little fast: hence the 0.05 s."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -76,7 +76,7 @@ message from any client."""
 
 
 class Robot:
-    """One robot base with its link, pose, mode and commanders."""
+    """The state of one robot: its link to the board, its pose, its mode and its command sources."""
 
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
         """Start in the mode that `latches` require, with the lowered limits that they contain."""
@@ -150,9 +150,9 @@ class Robot:
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return the values for `state` and `diagnostics`. This is too slow for every step.
+        """Return the values for the messages `state` and `diagnostics`.
 
-        `now_ns` is the present time on the monotonic clock.
+        Do not call this in every step: it is slow. `now_ns` is the present monotonic time.
         """
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
@@ -228,7 +228,7 @@ class Robot:
         level = battery.level if battery else ""
         another = status != self._status or level != self._battery_level
         self._status, self._battery_level = status, level
-        # In all other steps neither the mode nor the commander can have changed.
+        # In all other steps neither the mode nor the sender that drives can have changed.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
         # Pass the arguments by position: seventeen keyword arguments take three times as long.
@@ -393,11 +393,12 @@ class Robot:
             events.append(Event("lines_rejected", why, "warning", kind="implausible", news=False))
             self._odometry.skip(line)
             if self._sanity.doubtful:
-                self._fault(f"impossible feedback: {why}", now, events)
+                self._fault(f"the board reports impossible speeds: {why}", now, events)
             return None
         checks = self._odometry.checks
         wheels = checks.wheels
-        # Motors without power obey no command, so they cannot contradict one.
+        # A pressed emergency stop cuts the motors' power, so wheels that ignore the speeds are no
+        # sign of a fault.
         sent = None if self._estop.why else self._speeds
         fault = wheels.watch(sent, line.speeds, line.since)
         if fault:
@@ -415,7 +416,7 @@ class Robot:
 
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
-            trip = f"the guard replaced a line: {inputs.guard_trip}"
+            trip = f"the guard replaced a line to the board by zeros: {inputs.guard_trip}"
             self._fault(trip, inputs.now, events)
             self._life.caused_again(inputs.now.mono_ns)
         if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
@@ -469,7 +470,6 @@ class Robot:
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
-        """Change settings while the robot runs."""
         # The robot is at rest only if two lines are zero: the last one that was written to the
         # port, which the wheels follow, and the last one that was computed.
         said, made = self._said[0].twist, self._limiter.twist

@@ -1,7 +1,8 @@
 """Containers that thin out curves, bands and paths while data arrives; pure.
 
-Times are in s and never decrease. Each container holds a bounded number of entries. When it is
-full, it merges neighbouring entries and halves its resolution. A curve keeps every peak.
+A curve is a value over time, a band is a state over time, and a path is a series of poses. Times
+are in s and never decrease. Each container holds a bounded number of entries. When it is full, it
+merges neighbouring entries and halves its resolution. A curve keeps every peak.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from itertools import islice
 from typing import NamedTuple
 
 MOST_BINS = 1500
-"""Maximum number of bins of a curve: two for each pixel of a picture's width."""
+"""Maximum number of bins (time intervals) of a curve: two for each pixel of a picture's width."""
 
 FIRST_WIDTH = 0.001
 """Bin width of a curve at the start, s. It is shorter than the interval between the robot's steps,
@@ -41,12 +42,15 @@ class _Bin(NamedTuple):
 
 
 class Curve:
-    """A value over time: the lowest and the highest value of each bin, with their times."""
+    """A value over time, divided into bins, which are intervals of time of equal width.
+
+    Each bin keeps its lowest and its highest value with their times.
+    """
 
     def __init__(self, most: int = MOST_BINS) -> None:
         self._most, self._bins = most, list[_Bin]()
         self.width = FIRST_WIDTH
-        """Width of a bin, s."""
+        """Width of a bin, s. It doubles when the curve has too many bins."""
 
     def add(self, t: float, value: float | None) -> None:
         """Add the value at time `t`, s. None, NaN and infinity interrupt the curve."""
@@ -106,13 +110,16 @@ class Span(NamedTuple):
 
 
 class Band:
-    """A state over time.
+    """A state over time, as a list of time spans.
 
     If there are too many spans, short ones are merged with their neighbours.
     """
 
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
-        """Create an empty band. `ranks` lists the kinds; earlier ones win when spans are merged."""
+        """Create an empty band.
+
+        When two spans are merged, the kind that is earlier in `ranks` wins.
+        """
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []
@@ -134,7 +141,7 @@ class Band:
         self.add(t, "")
 
     def spans(self) -> list[Span]:
-        """Return the spans with a kind, in order."""
+        """Return the time spans in which there is a state, in order."""
         return [span for span in self._spans if span.kind]
 
     def _wider(self, spans: list[Span]) -> list[Span]:
@@ -151,7 +158,7 @@ class Band:
 
 
 class Place(NamedTuple):
-    """A pose in the odom frame, m and rad.
+    """A pose in the odom frame, m and rad, at the time `t`, s.
 
     `new` is True if the robot did not drive here from the previous place.
     """
@@ -185,7 +192,6 @@ class Track:
         self._last: Place | None = None
 
     def add(self, place: Place) -> None:
-        """Append a place."""
         kept, last = self._kept, self._last
         self._last = place
         if last is not None and _apart(last, place) > self._jump:
@@ -200,7 +206,7 @@ class Track:
             self._kept = kept = self._wider(kept)
 
     def places(self) -> list[Place]:
-        """Return the places to draw, in order, always with the first and the last one."""
+        """Return the kept places in order, then the newest place if it is not kept."""
         last = self._last
         return [*self._kept, *([last] if last and last != self._kept[-1] else [])]
 

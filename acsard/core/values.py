@@ -111,7 +111,8 @@ class Command(Struct, frozen=True):
       Zenoh or from the header of the message.
 
     `arrived_ns` is the monotonic time of arrival, ns, and the age is computed from it alone.
-    `stamp_ns` is the time of sending by `clock`, which is not synchronized with the daemon's clock.
+    `stamp_ns` is the time of sending by `clock`, ns. That clock is not synchronized with the
+    daemon's clock.
     """
 
     source: str
@@ -121,9 +122,10 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """Whether speeds that are not zero were requested, but result in a zero twist.
+    """Whether the sender requested speeds, but they result in a zero twist.
 
-    Such a command does not count as the zero that a sender must send first.
+    An example is a speed along the y axis, in which the robot cannot move. Such a command does not
+    count as the zero that a sender must send first.
     """
     sequence: int | None = None
     """Number of this command, counted by its sender; None if it has none.
@@ -227,7 +229,7 @@ class Event(Struct, frozen=True):
     kind: str = ""
     """A detail such as a reason or a change. Repeated events are counted separately by kind."""
     count: int = 1
-    """Number of occurrences since the last log line with this name."""
+    """Number of occurrences that this event stands for."""
     news: bool = True
     """False for an event that only repeats an earlier one. Its log line may be delayed."""
 
@@ -253,19 +255,21 @@ class Estimate(Struct, frozen=True, gc=False):
 
 
 class Wait(Struct, frozen=True):
-    """The condition that a source waits for before it drives the robot.
+    """The condition that a command source waits for before it drives the robot.
 
-    `core/motion/arbiter_text.py` puts it into words. The other fields hold details for this text.
+    `what` names the condition, and the other fields give its details.
+    `core/motion/arbiter_text.py` makes a sentence of them.
     """
 
     what: Literal[
         "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"
     ]
     source: str = ""
-    """The source that `what` is about.
+    """The command source that the condition `what` is about.
 
-    This source must send a zero (`neutral`), must show that its delays are steady (`proof`), sends
-    late commands (`late`), sends only zeros (`zeros`), or holds the robot (`higher`, `equal`).
+    Depending on `what`, this source must send a zero (`neutral`), must show that its delays are
+    steady (`proof`), sends late commands (`late`), or sends only zeros (`zeros`). For `higher` and
+    `equal` it drives the robot, and has a higher or an equal priority.
     """
     seconds: float = 0.0
     """A duration, s, whose meaning depends on `what`.
@@ -276,9 +280,9 @@ class Wait(Struct, frozen=True):
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """Least time for which the wait has lasted, s.
+    """Time for which the wait has lasted, s, rounded down to one of a few values.
 
-    The time is rounded down to one of a few values, so that it does not change with each step.
+    Without the rounding it would change with each step.
     """
     kept: str = ""
     """The source that sends speeds but must wait for `source`, which sends only zeros."""
@@ -310,14 +314,17 @@ class WheelsStatus(Struct, frozen=True):
     slipping: tuple[str, ...] = ()
     """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned fraction by which the front wheel turns more than the rear wheel: left, right."""
+    """Learned fraction by which the front wheel turns more than the rear wheel.
+
+    The first value is for the left side, and the second one for the right side.
+    """
     slow: tuple[str, ...] = ()
     """The wheels that turn too slowly in the commanded direction, each with its share of the
     expected speed."""
 
 
 class RoutersStatus(Struct, frozen=True):
-    """The connections of `bus.connect`. All fields are empty if `bus.connect` is empty."""
+    """The endpoints in `bus.connect`, by the state of the daemon's connection to each of them."""
 
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
@@ -352,9 +359,10 @@ means that the wheels slip.
 """
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
-"""The use of the track that was learned from a gyro.
+"""Whether the odometry uses the effective track that it learned from a gyro, or why it does not.
 
-With any value except `used`, the odometry uses the configured track.
+The effective track is the distance between left and right wheels that makes computed turns right.
+With any value except `used`, the odometry uses the configured one.
 """
 
 
@@ -363,7 +371,7 @@ class GyroStatus(Struct, frozen=True):
 
     does: GyroDoes = "off"
     bias: float | None = None
-    """Bias, rad/s."""
+    """Turn rate that the gyro reports at rest, rad/s."""
     delay: float = 0.0
     """Delay of the gyro relative to the wheels, s."""
     track: float | None = None
@@ -395,33 +403,30 @@ class BatteryStatus(Struct, frozen=True, gc=False):
     amps: float | None = None
     """Current, A. It is negative while the battery discharges."""
     mean: float | None = None
-    """Mean voltage (V) or charge (%) with which the thresholds are compared."""
+    """Voltage (V) or charge (%), averaged over about 10 s, that is compared with the thresholds."""
 
 
 class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
     number: int
-    """Number that identifies the latch: the time in milliseconds since 1970.
+    """Number that identifies the latch: normally the time at which it was set, ms since 1970.
 
-    If the previous latch already has that number, a larger one is used. The number stays unique
-    across restarts, and JavaScript represents it exactly.
+    If an earlier latch has that number or a larger one, a still larger one is used. The number is
+    unique across restarts, and JavaScript represents it exactly.
     """
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
-    """Client that requested the latch, as in `Event.by`; empty for a fault."""
+    """Name of the client that requested the latch; "" if no client did, as for a fault."""
     why: str
-    """Reason in words: "stopped by NAME", the fault's reason or "switched off by NAME"."""
+    """Reason in words, such as "stopped by NAME", "switched off by NAME" or that of a fault."""
     kept: bool = False
     """True if the latch was set before the daemon's last start."""
 
 
 class Latches(Struct, frozen=True):
-    """The latches and the lowered limits, which must survive every end of the daemon's process.
-
-    They do not depend on the link.
-    """
+    """The latches and the lowered limits, which must survive every end of the daemon's process."""
 
     stop: Latch | None = None
     fault: Latch | None = None
@@ -449,12 +454,12 @@ class Latches(Struct, frozen=True):
 
 
 class Inputs(Struct, frozen=True):
-    """The complete input of one step.
+    """The complete input of one control step.
 
-    If `tick` is true, the step computes the line of its control period. If `at_once` is true, the
-    step may compute an extra line for a new command or mode. If both are false, it computes no
-    line. `opened` counts how often the port was opened: a new number means a new session with the
-    board.
+    If `tick` is true, the step computes the line that the board gets in each control period. If
+    `at_once` is true, the step may compute an extra line for a new command or mode. If both are
+    false, it computes no line. `opened` counts how often the serial port was opened: a new number
+    means a new session with the board.
     """
 
     now: Instant
@@ -462,7 +467,7 @@ class Inputs(Struct, frozen=True):
     port_open: bool
     opened: int = 0
     port_trouble: str = ""
-    """Why the port is closed, in words."""
+    """Why the serial port is closed, in words; "" while it is open."""
     received: tuple[Received, ...] = ()
     commands: tuple[Command, ...] = ()
     requests: tuple[Request, ...] = ()
@@ -481,16 +486,18 @@ class Inputs(Struct, frozen=True):
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """Time between the previous step and the writing of its line, ns; 0 if the process did not
-    stall in between."""
+    """Time from the start of the previous step to the writing of its line, ns; 0 if it was normal.
+
+    It is longer than normal if the process stalled in between.
+    """
 
 
 class Outputs(Struct, frozen=True):
-    """Everything that one step decided."""
+    """Everything that one control step decided."""
 
     now: Instant
     due: bool
-    """Whether the step had to compute a line, for its control period or at once."""
+    """Whether the step had to compute a line for the board, for its control period or at once."""
     line: bytes | None
     """The line for the board; None if no line was due."""
     speeds: WheelSpeeds
@@ -511,14 +518,14 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Whether something has changed since the last computed line: the command, the mode, or a press
-    of the emergency stop or of a bumper."""
+    """Whether the command or the mode has changed since the last computed line, or the emergency
+    stop or a bumper was pressed."""
     latches: Latches = Latches()
     """The latches in force after the step; the same object until one of them changes."""
 
 
 class Spread(Struct, frozen=True):
-    """Median, 99th percentile and maximum of `count` measurements, in one unit."""
+    """Median, 99th percentile and maximum of `count` measurements, in the measurements' unit."""
 
     count: int = 0
     p50: float = 0.0
@@ -534,7 +541,7 @@ class Measured(Struct, frozen=True):
 
 
 class Recording(Struct, frozen=True):
-    """The state of the recorder."""
+    """The state of the recorder, which stores every control step in files."""
 
     where: str = ""
     """The directory of the recordings, "" if recording is switched off."""
@@ -545,7 +552,7 @@ class Recording(Struct, frozen=True):
 
 
 class Snapshot(Struct, frozen=True):
-    """Values for `state` and `diagnostics` beyond one step's outputs."""
+    """The values in the messages `state` and `diagnostics` that `Outputs` does not contain."""
 
     pose: Pose
     measured: Twist | None  # None while the feedback is silent
@@ -559,7 +566,8 @@ class Snapshot(Struct, frozen=True):
 
     A command that is refused only because its sender is new does not count.
     """
-    feedback_age_s: float | None = None  # since the last good line, None before it
+    feedback_age_s: float | None = None
+    """Seconds since the last valid line of the board, None before the first one."""
     missed_last_minute: int = 0
     """Number of periods without a step in the last minute."""
     figures: dict[str, Measured] = {}

@@ -1,7 +1,7 @@
-"""Collects the inputs of `Robot.step`, calls it, and delivers its outputs. It decides nothing.
+"""Collects the inputs of `Robot.step`, calls this method, and delivers its outputs.
 
-The control loop is synchronous, so that the daemon can call `step` from one task and the tests can
-call it in virtual time.
+The control loop decides nothing about the motion. It is synchronous, so that the daemon can call
+`step` from one task and the tests can call it in virtual time.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ LATE_NS = 1_000_000
 write of its line. Most delays are shorter and are passed as 0, because the sample times are not
 that accurate."""
 
-NOT_STORED = "the disk has not stored this yet, and a restart may lose a stop until it has"
+NOT_STORED = "the disk has not stored this yet; until then, a restart may lose a stop"
 """Text that is added to an answer if the disk is slow and the answer no longer waits for the latch
 file."""
 
@@ -332,7 +332,8 @@ class ControlLoop:
     def _from_bus(
         self, now: Instant
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
-        # Take no queries before the first step, because there are no outputs yet to answer them.
+        # Before the first step there are no outputs yet to answer queries. The bus then returns at
+        # most a slow query, which needs none.
         got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if got is NOTHING:
             return (), (), ()
@@ -428,7 +429,7 @@ class ControlLoop:
         Refuse `request` if there is no configuration file.
         """
         if self._settings_file is None:
-            text = "nothing is set: this daemon has no configuration file"
+            text = "nothing is set: this daemon has no configuration file; leave out `keep`"
             self._answers.append((now.mono_ns, Answer(request.id, False, text)))
         else:
             self._settings_file.keep(request, now.mono_ns)

@@ -145,7 +145,7 @@ async def run(
         if refused:
             log.info("real_time", text=refused)
         totals: dict[str, object] = {}
-        stack.callback(lambda: log.info("ended", **totals))  # entered first, so it runs last
+        stack.callback(lambda: log.info("ended", **totals))  # entered early, so it runs late
         urdf = robot_description(config.ros.urdf)
         events, start = list[Event](), clock.now()
         recorder = _recorder(config, events.append, start.wall_ns, stack)
@@ -235,7 +235,6 @@ def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
 
 
 def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
-    """Return the serial port, which is not open yet."""
     stop, period_ns = _stop_line(config), int(NS_PER_S / config.rate_hz)
     return SerialPort(path, config.mcu.baud_rate, stop, period_ns, wake, tell)
 

@@ -1,11 +1,14 @@
 """The file that keeps the latches for the next start of the daemon.
 
-The latches are stop, fault and `inactive`, and the lowered limits. A thread writes the file, and
-another thread syncs it. The control loop only hands the newest latches to the first thread, and
-never waits for the disk. Once that thread has renamed the new file, a kill of the process loses
-nothing. Once the other thread has synced it, a power cut loses nothing. A sync takes up to seconds
-on an SD card, and a stop must not wait for the sync of earlier latches. The file is read once,
-before the robot exists. `latch_rules.py` decides with which latches the robot starts.
+A latch is a stop, a fault or "inactive", which lasts until a person releases it. The file also
+keeps the limits that `set` has lowered. `latch_rules.py` decides with which latches the robot
+starts.
+
+One thread writes the file, and a second thread syncs it to the disk. The control loop only hands
+the newest latches to the first thread, and never waits for the disk. Once the first thread has
+renamed the new file, a kill of the process loses nothing. Once the second thread has synced the
+file, a power cut loses nothing. There are two threads, because a sync takes up to seconds on an SD
+card, and a stop must not wait for the sync of earlier latches.
 """
 
 from __future__ import annotations
@@ -142,7 +145,7 @@ class LatchFile:
         self._threads: tuple[threading.Thread, ...] = ()
         """The threads that write and sync the file, in this order. Empty until both run."""
 
-    # the start
+    # The start of the daemon calls the methods below.
 
     async def start(self, now: Instant) -> Latches:
         """Read the file, try to write it, and return the latches with which the robot starts.
@@ -244,7 +247,7 @@ class LatchFile:
     # The control loop calls the methods below.
 
     def keep(self, latches: Latches) -> None:
-        """Hand the latches that are now in force to the writer's thread, without waiting for it.
+        """Hand the latches that are now in force to the writing thread, without waiting for it.
 
         If several sets of latches wait, the thread writes only the newest.
         """
@@ -276,7 +279,7 @@ class LatchFile:
     def trouble(self) -> str:
         """Why the latches in force are not kept, in words; "" if they are kept."""
         if not all(thread.is_alive() for thread in self._threads):
-            return "the thread that keeps a stop over a restart has ended; restart the daemon"
+            return "the thread that stores stops for the next start has ended; restart the daemon"
         failed = self._failed or (HANGS if self._hangs else "")
         return unwritable(self.where, failed) if failed else ""
 
@@ -291,7 +294,7 @@ class LatchFile:
 
     @property
     def _again(self) -> Event:
-        return Event("latch_file", f"a stop is kept again in {self.where}")
+        return Event("latch_file", f"a stop survives a restart again; it is stored in {self.where}")
 
     def close(self) -> None:
         """Wait until the newest latches are written and synced, but at most `CLOSE_S`."""

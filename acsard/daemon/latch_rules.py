@@ -32,7 +32,7 @@ With a slow disk, a longer wait would make a client believe that the robot did n
 """
 
 BY = "acsard"
-"""Name of the caller if the daemon itself stops the robot."""
+"""Name in place of a client's name in a stop that the daemon itself sets."""
 
 
 class LatchFileError(AcsardError):
@@ -72,7 +72,7 @@ def decode(robot: str, data: bytes) -> Latches:
         number = raw.get("format") if isinstance(raw, dict) else None
         if type(number) is int and number != FORMAT:
             raise LatchFileError(
-                f"it is of another version (format {number}, but this daemon reads {FORMAT})"
+                f"another version wrote it (format {number}, but this daemon reads {FORMAT})"
             )
         content = msgspec.convert(raw, _Content)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -96,7 +96,7 @@ def unreadable(where: str, reason: str) -> str:
 
 def unwritable(where: str, reason: str) -> str:
     """Return the message for a latch file that cannot be written."""
-    return f"a stop cannot be kept over a restart: {where}: {reason}"
+    return f"a stop would not survive a restart: {where}: {reason}"
 
 
 def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
@@ -163,8 +163,8 @@ class LatchKeeper(Protocol):
 class Handover:
     """Hands the latches of the control loop to their keeper, and reports when they are stored.
 
-    The robot stops at once, but the answer to a stop waits until the stop is stored. So a stop that
-    was answered survives a kill of the process.
+    The robot stops at once, but the answer to a stop waits until the stop is stored, so that it
+    survives a kill of the process. After `ANSWER_NS` the answer says that it is not stored yet.
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:

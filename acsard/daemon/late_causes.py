@@ -156,7 +156,7 @@ def cgroup_quota(late: Lateness) -> str:
     without_ns = late.after.quota_ns - late.before.quota_ns
     if not late.explains(without_ns):
         return ""
-    return f"the daemon's processor time was used up for {_seconds(without_ns)}"
+    return f"the daemon's processor quota was used up for {_seconds(without_ns)}"
 
 
 def stolen(late: Lateness) -> str:
@@ -167,7 +167,7 @@ def stolen(late: Lateness) -> str:
     stolen_ns = most_stolen(late.before, late.after)
     if stolen_ns < LEAST_STOLEN_NS or not late.explains(stolen_ns):
         return ""
-    return f"its host gave this virtual machine no processor for {_seconds(stolen_ns)}"
+    return f"the host gave this virtual machine no processor for {_seconds(stolen_ns)}"
 
 
 def most_stolen(before: Reading, after: Reading) -> int:
@@ -225,12 +225,12 @@ def other_program(late: Lateness) -> str:
 CAUSES = (
     Cause("suspended", suspended, "disable suspend: systemctl mask sleep.target"),
     Cause("undervoltage", undervoltage, "use a stronger power supply and a shorter cable"),
-    Cause("heat", heat, "cool it"),
+    Cause("heat", heat, "cool the processor"),
     Cause("governor", governor, "choose the governor schedutil or performance"),
     Cause("quota", cgroup_quota, "raise CPUQuota= of the service, or --cpus of the container"),
     Cause("steal", stolen, "give the virtual machine a processor of its own"),
-    Cause("memory", memory, "free memory; the service locks that of the daemon"),
-    Cause("disk", disk, "find the program that uses it (`iotop`), or use a faster disk"),
+    Cause("memory", memory, "free memory; the service locks the memory of the daemon"),
+    Cause("disk", disk, "find the program that uses the disk (`iotop`), or use a faster disk"),
     Cause(
         "processor",
         other_program,
@@ -290,7 +290,7 @@ def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, 
     now = after.conditions
     stolen_ns = most_stolen(before, after)
     hotter = now.throttled > before.conditions.throttled
-    host = f"its host gave this virtual machine no processor for {_seconds(stolen_ns)}"
+    host = f"the host gave this virtual machine no processor for {_seconds(stolen_ns)}"
     clauses = {
         "undervoltage": low_voltage(now),
         "heat": hot(now, hotter),

@@ -35,7 +35,6 @@ class Histogram:
         self._max = 0.0
 
     def add(self, value: float) -> None:
-        """Count a measurement."""
         # Compute the index, because a search in a table would fetch a dozen cold cache lines.
         index = math.ceil(PER_DECADE * math.log10(value)) if value > 1.0 else 0
         self._buckets[index if index < LAST else LAST] += 1
@@ -69,7 +68,7 @@ Name = Literal[
     "feedback_to_bus",
     "mcu_round_trip",
 ]
-"""The figures, in the order in which a command passes them.
+"""The latencies that the daemon measures.
 
 - period_lateness: from the time at which a period was due to the start of its step. If periods
   were missed, from the time at which the first missed period was due.
@@ -87,7 +86,7 @@ Name = Literal[
 NAMES: tuple[Name, ...] = get_args(Name)
 
 SLOT_NS = 10 * NS_PER_S
-"""Length of one slot of the last minute, ns. The newest slot replaces the oldest."""
+"""Length of a slot, ns. The last minute has `SLOTS` slots, and a new one replaces the oldest."""
 
 SLOTS = 6
 

@@ -1,9 +1,9 @@
-"""Decides when a line may be written: in every period, and early for a new command or mode or after
-a press of the emergency stop or of a bumper.
+"""Decides when a line may be written to the board: in every control period, and early if needed.
 
-A line that is written early, between two periods, replaces the line of the next period. So a flood
-of commands does not cause more lines. An early line must come at least the wire time of a line plus
-`BREATH_NS` after the previous line. Each period allows one attempt to write an early line.
+An early line is written between two periods, for a new command or mode or after a press of the
+emergency stop or of a bumper. It replaces the line of the next period, so a flood of commands does
+not cause more lines. An early line must come at least the wire time of a line plus `BREATH_NS`
+after the previous line. Each period allows one attempt to write an early line.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from msgspec import Struct
 
 
 class Period(Struct, frozen=True):
-    """The number of periods that have ended since the last step, and when the first was due.
+    """The control periods that have ended since the last step.
 
-    `due_ns` is a monotonic time, ns.
+    `expired` is their number, and `due_ns` the monotonic time at which the first one was due, ns.
     """
 
     expired: int
@@ -32,26 +32,26 @@ ns."""
 IDLE_WAKES = 3
 """Largest number of steps per period that input from the bus may cause without a new command or
 mode. If the number is exceeded, input waits for the next period. This bounds the cost of a flood
-from a stranger."""
+of messages from any client."""
 
 
 class Pace:
-    """The decision when a line may be written, and the record of this period that it needs.
+    """Decides when a line may be written, and records for this decision what the period has sent.
 
-    The port knows when it wrote the last line, so the methods get that time as `sent_ns`.
+    The serial port knows when it wrote the last line, so the methods get that time as `sent_ns`.
     """
 
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
         self._possible = self._gap_ns < period_ns
-        """Whether the gap is shorter than a period, so that a line can be written between two
-        periods."""
+        """Whether a period is longer than the least time between two lines, so that a line can be
+        written between two periods."""
         self._ahead = False
         """Whether an early line was written in place of the next period's line."""
         self._tried = False
         """Whether this period's attempt to write an early line was made, successful or not."""
         self._waiting = False
-        """Whether a new command came too soon after a line and waits for the end of the gap."""
+        """Whether a new command came too soon after a line, and must wait before it is sent."""
         self._idle = 0
 
     def period_ended(self, missed: int) -> bool:

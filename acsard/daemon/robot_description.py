@@ -72,7 +72,7 @@ def robot_description(path: str) -> str:
     except (ET.ParseError, ValueError) as error:
         raise _error(path, f"it is not XML ({error}); name the robot's URDF") from None
     if root.tag != "robot":
-        raise _error(path, f"its outermost element is <{root.tag}>, and that of a URDF is <robot>")
+        raise _error(path, f"its outermost element is <{root.tag}>, but a URDF begins with <robot>")
     if any(XACRO in element.tag for element in root.iter()):
         raise _error(
             path, f"it is a xacro file; make the URDF with `xacro {path} > robot.urdf`, and name it"
@@ -85,8 +85,8 @@ def robot_description(path: str) -> str:
 def _too_large(path: str) -> ExitError:
     return _error(
         path,
-        f"it has more than {MAX_BYTES} bytes, or more than {MAX_JSON} as JSON, and the links of "
-        "the bus take no longer message; shorten it, or let robot_state_publisher publish it",
+        f"it has more than {MAX_BYTES} bytes, or more than {MAX_JSON} as JSON, which is too long "
+        "for a message on the bus; shorten it, or let robot_state_publisher publish it",
     )
 
 

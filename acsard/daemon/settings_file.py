@@ -124,7 +124,7 @@ class SettingsFile:
         try:
             thread.start()
         except RuntimeError as error:
-            self.differ = f"this process cannot compare them with the file ({error})"
+            self.differ = f"this process cannot compare settings and file ({error})"
 
     def use(self, config: Config) -> None:
         """Compare the file with this configuration from now on.
@@ -156,11 +156,11 @@ class SettingsFile:
             self._box.put("look")
 
     def obeyed(self, answer: Answer) -> bool:
-        """Process the robot's answer to any request.
+        """Process the robot's answer to any request. Return whether `results` will return it.
 
-        If `results` has returned this request and the robot has used its settings, the thread now
-        writes them. Then this method returns True, and `results` will return the answer. Otherwise
-        it returns False: the caller must send the answer.
+        It will if the request is a `set` with `keep` whose settings the robot has used. The thread
+        writes them to the file first. If this method returns False, the caller must send the
+        answer.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -278,7 +278,7 @@ class SettingsFile:
         try:
             keep(edit)
         except MendableError as error:
-            return Answer(answer.id, False, f"{told}; until the next start: {error}")
+            return Answer(answer.id, False, f"{told}, but only until the next start: {error}")
         limits = {
             key.removeprefix(TABLE): float(value)  # type: ignore[arg-type]
             for key, value in edit.keys.items()
@@ -289,12 +289,11 @@ class SettingsFile:
         return Answer(answer.id, True, f"{told}; written to {edit.file}")
 
     def _difference(self) -> str:
-        """Return the text of `differ`."""
         try:
             self._read()
         except OSError as error:
             self._signature = None
-            return f"the file cannot be read: {error.strerror or error}"
+            return f"the configuration file cannot be read: {error.strerror or error}"
         except ConfigError as error:
             self._signature = None
             return f"the daemon could not start with the file as it is now: {error.problems[0]}"
@@ -325,5 +324,5 @@ def _overdue(pending: _Pending) -> Answer:
     answer = pending.answer
     text = f"nothing is set: {why}"
     if answer is not None:
-        text = f"{answer.message}; {why}: look whether the file has it"
+        text = f"{answer.message}; {why}: look whether the file has the new value"
     return Answer(pending.request.id, False, text)

@@ -58,7 +58,7 @@ class Alarm(_Timer):
     def set(self, at_ns: int | None) -> None:
         """Call `wake` at monotonic `at_ns`.
 
-        With None, nothing new is set. An earlier setting stays in force.
+        If `at_ns` is None, the time that was set before stays in force.
         """
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
@@ -107,10 +107,10 @@ class Ticker(_Timer):
 
 
 class Next(Struct, frozen=True):
-    """The events to wait for after a step, besides period, bytes, stop and signal."""
+    """Says which events start the next step, besides a period, bytes, a stop and a signal."""
 
     listens: bool
-    """Whether a command gets a step of its own."""
+    """Whether a command that arrives gets a step of its own, before the next period."""
     retry_ns: int | None
     """Monotonic time of the next step for a waiting command, ns; None if no command waits."""
     period_ended: bool = True
@@ -118,7 +118,7 @@ class Next(Struct, frozen=True):
 
 
 class Wakeup:
-    """The wake-up of the control loop.
+    """Runs the control loop's step when the event loop, a timer or the bus asks for it.
 
     Calling this object runs a step at once. A call during a step runs another step after it.
     """
@@ -151,7 +151,8 @@ class Wakeup:
     def stop(self) -> None:
         """Report a stop, from any thread.
 
-        Further stops do not wake the loop until a step has ended a period or listens for commands.
+        After this stop, further stops do not wake the loop until a step has ended a period or has
+        asked for commands (`Next.listens`).
         """
         if not self._stop_told:
             self._stop_told = True

@@ -1,1 +1,1 @@
-"""`acsard foxglove` shows the robot live in Foxglove and Lichtblick; it is a process of its own."""
+"""`acsard foxglove`: a process that shows the robot live in the viewers Foxglove and Lichtblick."""

@@ -1,8 +1,8 @@
-"""Connects a robot to Foxglove viewers: creates the parts and runs the main loop on one thread.
+"""Connects a robot to Foxglove viewers, by a main loop that runs on one thread.
 
-Each round of the loop checks whether the daemon is present, updates the subscriptions to the topics
-that viewers look at, forwards new messages, and explains to a viewer why its commands have no
-effect.
+Each round of the loop checks whether the daemon is present, subscribes to the topics that viewers
+look at, and forwards new messages. If a viewer drives and the robot does not follow, the round also
+tells the viewers the reason.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from acsard.foxglove.server import (
 from acsard.host import clock
 
 GONE = "daemon"
-"""Id of the status message which says that the daemon is gone."""
+"""Id of the status message that tells the viewers that the daemon is gone."""
 
 
 class Bridge:
@@ -68,7 +68,9 @@ class Bridge:
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
         self._deaf = facts.deaf
-        """Reason why this program cannot show commands; "" if it can, or once it has reported this.
+        """Reason why this program cannot show the commands of other programs, in words.
+
+        It is "" if the program can show them, and after the viewers have been told the reason.
         """
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
@@ -76,37 +78,39 @@ class Bridge:
         self._server = start(f"acsard {self._id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
         self._watch: Watch | None = None
-        """Follows the robot while a viewer drives."""
+        """Follows the robot's `state` while a viewer drives; otherwise None."""
         self._here = self._was_here = True
         key = robot.key("alive")
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
-        """Run the main loop until `end` is called; raise the error if the sending thread dies."""
+        """Run the main loop until `end` is called.
+
+        If the thread that sends the viewers' commands has died, raise the exception that ended it.
+        """
         dead = self._drives.outbox.dead
         while not self._ended.is_set():
             if dead.done():
                 dead.result()
             self._wake.wait(0.5)
-            # Wait, so that messages gather before a round. The wait is shorter than one frame of a
-            # screen that shows 60 frames a second, and makes the rounds a third cheaper. Commands
-            # do not wait for this loop.
+            # Let messages gather before a round, which makes the rounds a third cheaper. The pause
+            # is shorter than one frame at 60 Hz. Commands do not wait for this loop.
             time.sleep(0.015)
             self._wake.clear()
             self._round()
 
     def end(self) -> None:
-        """Make `run` return; a signal handler may call it."""
+        """Make `run` return. A signal handler may call this method."""
         self._ended.set()
         self._wake.set()
 
     def close(self) -> None:
-        """Stop driving for all viewers first, then stop the server."""
+        """Send a zero for each viewer that drives, then stop the server."""
         self._drives.end()
         self._server.stop()
 
     def _viewer(self, client: int) -> Client:
-        """Return a client that sends the commands of viewer `client` under its own sender name."""
+        """Return a bus client for the viewer with the id `client`, as a sender of its own."""
         name = self._robot.sender.rpartition("/")[0]
         return self._robot.like(self._id, f"{name}/{client}")
 
@@ -137,7 +141,7 @@ class Bridge:
         return True
 
     def _came_back(self) -> bool:
-        """Learn the facts of a restarted daemon, which may have other sources and settings.
+        """Query the restarted daemon, which may have other sources and settings.
 
         Returns False if the daemon does not answer yet.
         """
@@ -173,10 +177,10 @@ class Bridge:
                 self._watch.look(now)
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Report once for each viewer why the robot does not follow its commands.
+        """Tell the viewers, once for each viewer that drives, why the robot does not follow it.
 
-        `driving` contains the viewers that request a speed. A report is withdrawn when its reason
-        ends.
+        `driving` has the bus client of each viewer that requests a speed, by the viewer's id. The
+        message is removed from the viewers when its reason ends.
         """
         now_ns = clock.mono_ns()
         for client in driving.keys() - self._objections.keys():

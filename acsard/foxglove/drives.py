@@ -1,9 +1,9 @@
-"""Drives the robot from a viewer's panel. Each viewer is a sender of its own, under the daemon's
-rules.
+"""Drives the robot from the panels of Foxglove viewers. To the daemon, each viewer is one sender.
 
-A panel repeats its command while a button is held, and is silent after the release. Few of its
-messages have a stamp. Therefore a zero command is sent first after a silence, and a burst of
-commands that follows the silence is dropped.
+A panel repeats its command while a button is held, and sends nothing after the release. Few panels
+send a stamp, from which the daemon could see that a command is late. So this module sends a zero
+before the first command after a silence. A burst of commands after a silence has been delayed on
+its way, so the module drops it.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""Thresholds for a panel that publishes too seldom: `SLOW_TIMES` messages in a row that each follow
-a silence of at most `SLOW_NS`."""
+"""A panel publishes too seldom if `SLOW_TIMES` messages in a row each follow a silence of 0.3 to
+2.5 s: longer than `commander.SILENCE_NS`, and at most `SLOW_NS`, ns."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
-"""Decoder for twists only. Twists depend on neither joints nor wheels, so the default configuration
-is sufficient."""
+"""Decoder of velocity commands (twists). They depend on neither the joints nor the wheels of the
+robot, so the default configuration is sufficient."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
-    """Return the Zenoh encoding for a channel that a viewer advertised.
+    """Return the Zenoh encoding for the messages of a channel that a viewer has announced.
 
-    Raises `DecodeError` if the channel cannot carry twists.
+    `encoding` is "json" or "cdr", and `schema_name` is a ROS type such as "geometry_msgs/Twist".
+    Raises `DecodeError` if messages of this kind cannot drive the robot.
     """
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
@@ -53,29 +54,31 @@ def encoding_of(encoding: str, schema_name: str) -> str:
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
-    """Return the twist and the stamp of a message in this Zenoh encoding.
+    """Decode a viewer's velocity command; `encoding` is the Zenoh encoding of `payload`.
 
-    Raises `DecodeError` if any part of the message is refused.
+    Raises `DecodeError` if any part of the message is not valid.
     """
     found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)
 
 
 class Viewer:
-    """One viewer with its sender name."""
+    """A viewer that may drive: its bus client, its newest command and its channels."""
 
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
-        """Encoding and problem of each channel. If the problem is not empty, the channel cannot
-        drive."""
+        """The Zenoh encoding of each channel and an error text, by the id of the channel.
+
+        One of the two is "". The error text says why the channel cannot drive.
+        """
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
-        """Record the silence before a message, and return whether messages arrive too seldom.
+        """Record the silence before a message, ns; return whether the panel publishes too seldom.
 
-        If they do, the robot stops between them. `silence_ns` is None if the silence was shorter
-        than `commander.SILENCE_NS`.
+        The robot stops between the messages of such a panel. `silence_ns` is None for the first
+        message, and after a silence of at most `commander.SILENCE_NS`.
         """
         slow = silence_ns is not None and silence_ns <= SLOW_NS
         self._slow = self._slow + 1 if slow else 0
@@ -83,7 +86,7 @@ class Viewer:
 
 
 class Drives:
-    """The viewers that publish commands, and the thread that sends these to the robot."""
+    """The viewers that publish commands, and the thread that sends the commands to the robot."""
 
     def __init__(
         self, robot_of: Callable[[int], Client], topic: str, notices: Notices, forbidden: str
@@ -96,12 +99,15 @@ class Drives:
         self.timeout_s = LONGEST_S
         """Timeout of the command source under which viewers drive, s."""
 
-    # Called by the server's threads.
+    # The server's threads call the methods below.
 
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a viewer's channel. If it cannot drive, `came` reports the reason."""
+        """Register a channel on which a viewer will publish.
+
+        If the channel cannot drive the robot, `came` reports the reason at each message.
+        """
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"
@@ -118,7 +124,10 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """Queue the command that a viewer published, or report why it cannot drive."""
+        """Queue the command in a message of a viewer, or tell the viewers why it is refused.
+
+        `client` is the id of the viewer, and `channel` is the id of the viewer's channel.
+        """
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
         if viewer is None or not encoding:
@@ -149,9 +158,9 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove a channel that its viewer has closed, explicitly or by disconnecting.
+        """Remove a channel that the viewer `client` has closed, explicitly or by disconnecting.
 
-        If the robot may still follow this viewer, send a zero command.
+        If the robot may still follow this viewer, send a zero.
         """
         with self._lock:
             viewer = self._viewers.get(client)
@@ -163,24 +172,24 @@ class Drives:
             if not viewer.channels:
                 del self._viewers[client]
 
-    # Called by the main thread.
+    # The main thread calls the methods below.
 
     def driving(self) -> dict[int, Client]:
-        """Return the clients of the viewers that currently request a speed, by viewer id."""
+        """Return the bus client of each viewer that requests a speed now, by the viewer's id."""
         now_ns = clock.mono_ns()
         with self._lock:
             viewers = self._viewers.items()
             return {one: it.robot for one, it in viewers if it.commander.drives(now_ns)}
 
     def end(self) -> None:
-        """Send a zero command for each viewer that drives, then stop the sending thread."""
+        """Send a zero for each viewer that drives, then stop the sending thread."""
         with self._lock:
             for viewer in self._viewers.values():
                 self.outbox.release(viewer.commander, self.timeout_s)
             self._viewers.clear()
         self.outbox.end(0.5)  # the final zeros normally take a few ms
 
-    # Run by the sending thread.
+    # The sending thread runs the method below.
 
     def _send(self, robot: Client, wished: Wish) -> None:
         twist = wished.twist

@@ -1,6 +1,7 @@
-"""Sends messages to the viewers as status messages and on the topic `log`, and to the terminal.
+"""Shows messages about the robot in the Foxglove viewers and at the terminal.
 
-`Objections` decides when a viewer learns why its commands do not drive.
+A viewer gets each message as a status message and on the topic `log`. `Objections` decides when to
+report that the robot does not follow a viewer.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ AGAIN = Rate(0.5)
 """Limit on the rate of notices with the same text: one in two seconds."""
 
 WAITING = 100
-"""Maximum number of waiting notices. If there are more, the oldest are dropped."""
+"""Maximum number of notices that wait to be sent. If there are more, the oldest are dropped."""
 
 
 class Notice(Struct, frozen=True):
     """A message to the viewers.
 
-    `stays` is the id of a lasting status, or "" for a single message. An empty `text` removes the
-    lasting status.
+    If `stays` is not "", it is the id of a message that the viewers show until it is removed. A
+    notice with this id and an empty `text` removes it.
     """
 
     level: Level
@@ -59,8 +60,9 @@ class Notices:
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
         """Queue a message to all viewers.
 
-        `name` is the subject, for the topic `log`. `stays` is the id of a lasting status, or "". A
-        text that repeats too soon (`AGAIN`) is dropped unless it is a lasting status.
+        `name` is the subject, for the topic `log`. If `stays` is not "", it is an id, and the
+        viewers show the message until `over` is called with this id. Without an id, a text that
+        repeats too soon (`AGAIN`) is dropped.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -69,13 +71,14 @@ class Notices:
             self._waiting.put(Notice(level, name, text, stays))
 
     def over(self, stays: str) -> None:
-        """End the lasting status with this id."""
+        """Remove the message with the id `stays` from the viewers."""
         self._waiting.put(Notice("info", "", "", stays))
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
-        """Send the waiting notices; `log` publishes each of them on the topic `log`.
+        """Send and print the waiting notices; `log` publishes each of them on the topic `log`.
 
-        If `newcomers` is true, there are new viewers, so first send all lasting statuses again.
+        If `newcomers` is true, a viewer may be new. So first send again each message that the
+        viewers show until it is removed.
         """
         if newcomers:
             for one in self._staying.values():
@@ -99,10 +102,14 @@ class Objections:
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self.told = ""
-        """The objection that was reported and still holds, or ""."""
+        """The reported reason why the robot does not follow, in words; "" if there is none."""
 
     def look(self, objection: str, now_ns: int) -> bool:
-        """Process the current objection ("" for none); return whether `told` has changed."""
+        """Process the present reason, "" if the robot follows; return whether `told` has changed.
+
+        A reason is stored in `told` once the robot has not followed for `GRACE_S`. `now_ns` is the
+        monotonic time, ns.
+        """
         if not objection:
             self._since_ns = None
             changed, self.told = bool(self.told), ""

@@ -1,8 +1,7 @@
-"""Forwards messages from the bus to the viewers, with a subscription only for topics that are
-shown.
+"""Forwards messages from the bus to the Foxglove viewers.
 
-A topic that no viewer looks at costs nothing, neither here nor in the daemon. If messages arrive
-faster than they can be forwarded, the oldest are dropped.
+It subscribes only to topics that a viewer looks at, so any other topic costs no time here or in the
+daemon. If messages arrive faster than they can be forwarded, the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ EVENTS = "events"
 
 
 class News:
-    """Converts the daemon's events to log lines, each event once."""
+    """Converts the lists of events that the daemon publishes to log messages, each event once."""
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
         self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return the new events as log lines.
+        """Return the events that are new in the list `events`, as log messages.
 
-        After a restart of the daemon, return all events that it still knows.
+        After a restart of the daemon, all events of the list are new.
         """
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
@@ -59,7 +58,7 @@ class News:
 
 
 class _Out:
-    """A topic as the viewers see it."""
+    """A topic that is offered to the viewers, and the last message on it."""
 
     def __init__(self, row: Channel, key: str, channel: foxglove.Channel) -> None:
         self.row, self.key, self.channel = row, key, channel
@@ -71,21 +70,21 @@ class _Out:
 
 
 class Way(Struct, frozen=True):
-    """How the daemon interprets samples on one key of the bus."""
+    """How the daemon interprets the commands that arrive on one key of the bus."""
 
     native: str
-    """The native key, below the robot's id, that has the same meaning. "*" in it stands for the
-    name of a certificate."""
+    """The daemon's own key for commands of this kind, without the robot's id. "*" in it stands for
+    the name of a certificate."""
     encoding: str = ""
-    """Encoding of all samples on the key; "" if each sample names its own."""
+    """Encoding of all commands on the key; "" if each command names its encoding."""
     via: Via = "native"
 
 
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
-    """Return a `Way` for each key on which the command source `source` accepts commands.
+    """Return how the daemon interprets the commands of `source`, by the key on which they arrive.
 
-    They are the keys of twists and wheel speeds, and the keys of ROS. `key_of` returns the full key
-    for a key below the robot's id.
+    The keys are the daemon's own ones for twists and wheel speeds, and those of ROS. `key_of`
+    returns the full key for a key below the robot's id.
     """
     native = source_keys([source])
     found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
@@ -96,7 +95,10 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
 
 
 class Reader:
-    """Converts commands to messages of `cmd_vel_in/<source>` with the robot's configuration."""
+    """Converts commands of any kind to messages of the topic `cmd_vel_in/<source>`.
+
+    Wheel speeds are converted with the configuration of the robot.
+    """
 
     def __init__(self, config: Config) -> None:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
@@ -105,18 +107,17 @@ class Reader:
     def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
         """Return the twist of a command that arrived at `wall_ns`, ns on the wall clock.
 
-        Raises `DecodeError`.
+        Raises `DecodeError` if the command is not valid.
         """
         twist = self._receiver.command(arrival).twist
         return asked(twist, Time.from_ns(wall_ns), self._frame)
 
 
 class Commanders:
-    """The commands of all sources, by topic.
+    """Receives the commands that programs send to the robot, for one topic per command source.
 
-    Commands are decoded exactly as the daemon decodes them and as `acsard recording export` writes
-    them. A command that the daemon refuses is not shown; it appears in the daemon's counters. One
-    thread uses this class; Zenoh's threads call `wake`.
+    A command is decoded as the daemon decodes it. A command that the daemon refuses is not shown,
+    because the daemon counts it. Only one thread may use this class; Zenoh's threads call `wake`.
     """
 
     def __init__(self, robot: Client, wake: Callable[[], object]) -> None:
@@ -136,11 +137,14 @@ class Commanders:
 
     @property
     def topics(self) -> Collection[str]:
-        """The command topics, one for each source."""
+        """The names of the topics that show commands, one for each command source."""
         return self._ways.keys()
 
     def follow(self, topics: Collection[str]) -> None:
-        """Receive the commands of these topics only, or none if this program may receive none."""
+        """Subscribe to the commands of `topics` only, and end the other subscriptions.
+
+        A client over TLS may not receive commands, so over TLS nothing is subscribed.
+        """
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
             self._heard.pop(topic).undeclare()
@@ -148,7 +152,7 @@ class Commanders:
             self._heard[topic] = _Heard(self._robot.session, self._ways[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
-        """Yield each received command with its topic.
+        """Yield each command that has arrived since the last call, with its topic.
 
         A command that cannot be decoded is skipped.
         """
@@ -161,16 +165,13 @@ class Commanders:
 
 
 class _Heard:
-    """The subscriptions of one source.
-
-    Zenoh's threads append each command with its arrival time.
-    """
+    """The subscriptions to the commands of one source, and the commands that have arrived."""
 
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
     ) -> None:
         self._ways = by_key
-        # About one second of commands at the highest accepted rate. The oldest are dropped.
+        # This is one second of commands at 100 Hz. If more wait, the oldest are dropped.
         self._box = Mailbox[tuple[Arrival, int]](100, wake)
         handler = zenoh.handlers.Callback(self._take)
         self._declared = [session.declare_subscriber(key, handler) for key in by_key]
@@ -211,7 +212,10 @@ class _Heard:
 
 
 class Relay:
-    """All topics of a robot. One thread uses this class; Zenoh's threads call `wake`."""
+    """Forwards all topics of a robot to the viewers. Only one thread may use this class.
+
+    Zenoh's threads call `wake` when a message arrives.
+    """
 
     def __init__(self, robot: Client, context: foxglove.Context, wake: Callable[[], None]) -> None:
         self._robot, self._context, self._wake = robot, context, wake
@@ -224,7 +228,7 @@ class Relay:
         """Number of samples that could not be decoded."""
 
     def offer(self, facts: Facts) -> None:
-        """Offer the robot's topics, in addition to those offered before."""
+        """Offer the robot's topics to the viewers. Topics that were offered before stay."""
         self._commanders.use(facts)
         for row, source in facts.rows():
             topic = row.topic(facts.config.ros.namespace, source)
@@ -241,13 +245,14 @@ class Relay:
 
     @property
     def commanders(self) -> Collection[str]:
-        """The topics that show the commands of each source."""
+        """The names of the topics that show commands, one for each command source."""
         return self._commanders.topics
 
     def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
-        """Subscribe to the keys of these topics only.
+        """Subscribe only to the keys of `topics`, the topics that viewers look at.
 
-        `fresh` are topics that a viewer has just begun to look at.
+        `fresh` are the topics that have a new viewer. If such a topic is published seldom, send its
+        last message again.
         """
         if self.log_topic in fresh:
             self._news = News()  # a viewer that opens the log sees the last events

@@ -1,4 +1,7 @@
-"""Facts of a robot, read at the start and again after each restart of its daemon."""
+"""The facts about a robot that the Foxglove bridge needs: its configuration, and what is allowed.
+
+The bridge reads them at its start, and again after each restart of the robot's daemon.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,9 @@ from acsard.host.errors import ReplyError
 
 
 class Facts(Struct, frozen=True):
-    """The configuration and the sources of a robot, and the permissions of this client.
+    """The configuration and the command sources of a robot, and the permissions of this client.
 
-    `config` holds defaults if this program may not read the robot's.
+    `config` has the default values if this program may not read the robot's configuration.
     """
 
     config: Config
@@ -28,14 +31,14 @@ class Facts(Struct, frozen=True):
     forbidden: str
     """Reason why this program may not drive, in words; "" if it may."""
     deaf: str = ""
-    """Reason why the sources' commands are invisible to this program, in words; "" if they are
-    visible."""
+    """Reason why this program cannot receive the commands of other programs, in words; "" if it
+    can."""
 
     def rows(self) -> list[tuple[Channel, str]]:
-        """Return each published channel with its command source.
+        """Return the topics to offer to the viewers, each with the name of a command source.
 
-        The channel `CMD_VEL_IN` appears once for each source. Every other channel has the source
-        "".
+        The topic `CMD_VEL_IN` shows the commands of one source, so it appears once for each source.
+        Every other topic has the source "".
         """
         found = []
         for row in published_channels(left_out(self.config)):
@@ -45,7 +48,10 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """Return the key below the robot's id on which a channel's messages are published."""
+    """Return the key, below the robot's id, of the messages that the topic `row` shows.
+
+    `source` replaces the placeholder `<source>` in the key.
+    """
     return row.native.replace(SOURCE, source)
 
 

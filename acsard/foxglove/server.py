@@ -1,8 +1,8 @@
-"""The websocket server of foxglove-sdk: its callbacks, settings, services and its start.
+"""Starts the WebSocket server of foxglove-sdk, with its callbacks, settings and services.
 
-The library implements the protocol. The protocol has no authentication, so the subcommand
+The library implements the protocol, which has no authentication. So the subcommand
 (`cli/foxglove.py`) accepts only an address of this machine. Viewers call the services in JSON, and
-get the daemon's own replies.
+get the replies of the daemon.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 
 POLL_NS = 5 * NS_PER_S
-"""Interval, ns, at which the settings are read while a viewer follows them, because other clients
-change them too."""
+"""Interval, ns, at which the settings are read again while a viewer subscribes to them, because
+other clients may change them."""
 
 
 class Shown:
-    """The viewers of each topic."""
+    """Records which viewers are subscribed to which topics."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
@@ -63,17 +63,16 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return the viewed topics, and those that have gained a viewer since the last call."""
+        """Return the topics with a viewer, and those that have gained one since the last call."""
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
 
 
 class Settings:
-    """The settings that can be changed at run time.
+    """The settings of the robot that viewers can read and change while the daemon runs.
 
-    The server's threads send them to viewers, and change them when a viewer asks for it. The main
-    thread updates them from the daemon.
+    The server's threads answer the viewers. The main thread reads the settings from the daemon.
     """
 
     def __init__(self, robot: Robot, notices: Notices, tables: object) -> None:
@@ -99,7 +98,7 @@ class Settings:
         return news
 
     def get(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the settings with these names, or all if `names` is empty, as last read."""
+        """Return the settings with these names, or all if `names` is empty, without a query."""
         with self._lock:
             self._asked = True
             return asked(self._known, names)
@@ -117,7 +116,7 @@ class Settings:
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
         """Change all of these settings or none of them, and return their values afterwards.
 
-        A refusal is reported to the viewers.
+        All viewers are told whether the daemon changed them.
         """
         try:
             if any(value is None for value in wishes.values()):
@@ -133,7 +132,7 @@ class Settings:
             return asked(self._known, wishes.keys()) if wishes else {}
 
     def refresh(self) -> dict[str, Any]:
-        """Read the settings again if a viewer needs them; return the settings that changed."""
+        """Query the settings again if a viewer needs them; return the settings that changed."""
         with self._lock:
             age_ns = clock.mono_ns() - self._read_ns
             due = (self._asked and age_ns > NS_PER_S) or (self._followed and age_ns > POLL_NS)
@@ -163,7 +162,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]
 
 
 class Listener:
-    """Callbacks of the server, which runs them on threads of its own."""
+    """The callbacks that the server runs on its own threads when a viewer sends something."""
 
     def __init__(self, shown: Shown, drives: Drives, settings: Settings) -> None:
         self._shown, self._drives, self._settings = shown, drives, settings
@@ -269,12 +268,12 @@ class Refusals(logging.Handler):
 
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
-"""Services that are offered with `--drive`. `set` is left out, because viewers set parameters
-instead."""
+"""Services that viewers may call with the option `--drive`. `set` is left out, because viewers
+change settings as parameters of the protocol."""
 
 STOPS: tuple[Verb, ...] = ("stop",)
-"""Services that are offered without `--drive`. Any web page in a local browser can connect, and the
-browser does not identify the page, so only a stop is safe."""
+"""Services that viewers may call without the option `--drive`. Any web page in a local browser can
+connect, and this server cannot tell which page it is, so only a stop is safe."""
 
 NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
 
@@ -299,7 +298,7 @@ def _service(robot: Robot, verb: Verb, name: str) -> foxglove.Service:
 
 
 def called(robot: Robot, verb: Verb, payload: bytes) -> ServiceReply:
-    """Call a service with a JSON payload. An error becomes a negative reply."""
+    """Call a service with a JSON payload. If the call fails, return a reply with the reason."""
     try:
         fields: dict[str, float] = {}
         if verb not in PLAIN_SERVICES:

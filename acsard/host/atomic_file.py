@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 NEW_MODE = 0o644
-"""Default mode of a new file. The service's own user must be able to read it."""
+"""Default mode of a new file. The user of the systemd service must be able to read the file."""
 
 
 def replace(

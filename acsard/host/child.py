@@ -1,11 +1,11 @@
-"""Processes that this program starts: their start, limits, signs of life and end.
+"""Starts child processes, limits them, watches their signs of life, and ends them.
 
 Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent. The
 parent then ends its children in its own way. A child does not outlive its parent.
 
-A `Child` and a `Parent` are the two ends of one socket, the child's standard input. The child
-writes a sign of life to the socket again and again, and ends when its parent closes the other end.
-The parent kills a child that falls silent.
+`Child` is used in the parent process, and `Parent` in the child process. A socket, the child's
+standard input, connects them. The child writes a sign of life to the socket again and again, and
+ends when its parent closes the other end. The parent kills a child that falls silent.
 """
 
 from __future__ import annotations
@@ -38,31 +38,31 @@ BEAT_S = 0.5
 """Longest time between two signs of life of a child, and between two checks by its parent, s."""
 
 SILENT_NS = 3 * NS_PER_S
-"""Silence after which a child is killed, ns.
+"""Time without a sign of life after which a child is killed, ns.
 
-The gateway ends itself after a second without progress (`daemon/gateway/listener_process.py`). This
-limit is for a process that cannot even do that.
+The TLS gateway ends itself after a second without progress (`daemon/gateway/listener_process.py`).
+This limit is for a process that cannot even do that.
 """
 
 START_NS = 15 * NS_PER_S
-"""Longest wait for the first sign of life, ns. Python starts slowly on a busy machine."""
+"""Longest wait for a child's first sign of life, ns. Python starts slowly on a busy machine."""
 
 
 class Silence:
-    """Detector of a peer that has been silent for longer than `most_ns`, ns.
+    """Detects that another process has given no sign of life for longer than `most_ns`, ns.
 
-    The machine or a CPU quota may stop both processes. Therefore at most 0.5 s of the time between
-    two calls of `too_long` is counted as silence.
+    The computer or a CPU quota may stop both processes for a while. Therefore at most 0.5 s of the
+    time between two calls of `too_long` counts as silence.
     """
 
     def __init__(self, most_ns: int) -> None:
         self._most_ns, self._ns = most_ns, 0
 
     def too_long(self, heard: bool, passed_ns: int) -> bool:
-        """Return whether the silence exceeds `most_ns`.
+        """Return whether the other process has been silent for longer than the limit.
 
-        `heard` says whether the peer has given a sign of life since the last call, which was
-        `passed_ns` ago.
+        `heard` says whether it has given a sign of life since the last call. `passed_ns` is the
+        time since that call, ns.
         """
         self._ns = 0 if heard else self._ns + min(passed_ns, NS_PER_S // 2)
         return self._ns > self._most_ns
@@ -72,7 +72,7 @@ class Silence:
 
 
 def acsard(*words: str) -> list[str]:
-    """Return the command that runs this program with these arguments."""
+    """Return the command that runs acsard with these arguments."""
     # With -P Python ignores the working directory, so it runs the installed package.
     return [sys.executable, "-P", "-m", "acsard", *words]
 
@@ -83,7 +83,7 @@ def environment(hidden: Collection[str] = ()) -> dict[str, str]:
 
 
 class Limits(Struct, frozen=True):
-    """Nice value and data memory of a child whose work is less important than the daemon's."""
+    """Limits of a child whose work is less important than the daemon's."""
 
     nice: int
     memory_bytes: int
@@ -93,7 +93,6 @@ def limit(pid: int, limits: Limits) -> None:
     """Set the limits of a child, and let the kernel end it first when memory runs out."""
     try:
         with suppress(OSError):
-            # When memory runs out, the kernel ends this child before any other process.
             Path(f"/proc/{pid}/oom_score_adj").write_bytes(b"1000")
         os.setpriority(os.PRIO_PROCESS, pid, limits.nice)
         memory = limits.memory_bytes
@@ -103,7 +102,7 @@ def limit(pid: int, limits: Limits) -> None:
 
 
 def how_it_ended(code: int) -> str:
-    """Return the end of a process in words."""
+    """Return how a process ended, in words. `code` is its exit code, or minus its signal."""
     return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
 
 
@@ -126,10 +125,10 @@ async def running(
     stdout: int | None = None,
     stderr: int | None = None,
 ) -> AsyncIterator[Process]:
-    """Start a child in the event loop; kill it if it still runs at the end of the block.
+    """Start a child process, yield it, and kill it if it still runs at the end of the block.
 
-    `stdin`, `stdout` and `stderr` are as in `subprocess`. Raises `OSError` if the child cannot be
-    started.
+    `stdin`, `stdout` and `stderr` have the same meaning as in `subprocess`. Raises `OSError` if the
+    child cannot be started.
     """
     child = await asyncio.create_subprocess_exec(
         *command,
@@ -156,7 +155,7 @@ async def running(
 
 
 class Child:
-    """One run of a child, which ends when its input closes, and which is killed if it is silent."""
+    """The parent's side of a child process, which is killed if it stops sending signs of life."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -188,7 +187,7 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Return True once the child is silent, or False once it has ended or was released.
+        """Wait until the child falls silent, ends or is released. Return True if it fell silent.
 
         `ours` is the parent's end of the socket, on which the signs of life arrive.
         """
@@ -219,7 +218,7 @@ class Child:
 
 
 class Parent:
-    """The process at the other end of this process's standard input, `fd`."""
+    """The child's side: the parent process at the other end of standard input, `fd`."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -236,7 +235,7 @@ class Parent:
                 os.write(self.fd, b".")  # fails if the buffer is full or the parent has gone
 
     def gone(self) -> bool:
-        """Read from the descriptor, which must be readable; return whether the parent closed it."""
+        """Return whether the parent has closed its end. Call this only when `fd` is readable."""
         try:
             return not os.read(self.fd, 64)
         except BlockingIOError:
@@ -246,8 +245,9 @@ class Parent:
 
 
 def end_with_parent(number: signal.Signals) -> None:
-    """Let the kernel send this process a signal when the thread that started this process ends.
+    """Let the kernel send the signal `number` to this process when its parent ends.
 
-    A child calls this function, so that it ends with its parent even if the parent crashes.
+    A child calls this function, so that it also ends if its parent crashes. To the kernel, the
+    parent is the thread that started this process.
     """
     ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG in linux/prctl.h

@@ -1,11 +1,11 @@
-"""The only module that reads a clock. It also detects that this computer was suspended.
+"""Reads the clocks of this computer, and detects that it was suspended.
 
-The monotonic clock is CLOCK_MONOTONIC_RAW, because NTP slews CLOCK_MONOTONIC by up to 8 %. With the
-latter, each distance that is computed as speed times time, and each measured delay of a command,
-would be wrong by as much.
+In the daemon, no other module reads a clock. The monotonic clock is CLOCK_MONOTONIC_RAW, because
+NTP makes CLOCK_MONOTONIC faster or slower by up to 8 %. With that clock, each distance that is
+computed as speed times time, and each measured delay of a command, would be wrong by as much.
 
-An `Instant` is in whole us. Smaller digits only show how long the reading took, and storing them
-would make a recording twice as large.
+The times in an `Instant` are whole microseconds. Reading the clocks takes that long, so smaller
+digits mean nothing, and storing them would make a recording twice as large.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ A Python function would be slower, and the loop calls this one about a dozen tim
 def asleep_ns() -> int:
     """Return how long this computer was suspended since its start, ns.
 
-    `mono_ns` does not advance in a suspend.
+    The clock `mono_ns` does not advance during a suspend.
     """
     awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
 
 def steady_ns() -> int:
-    """Return a time, ns, that is never adjusted and that also advances in a suspend."""
+    """Return a time, ns, that is never adjusted and that also advances during a suspend."""
     return mono_ns() + asleep_ns()
 
 
@@ -51,15 +51,15 @@ def now() -> Instant:
 
 
 MOMENT_NS = 100_000_000
-"""Shortest time that counts as a suspend, ns. Every real suspend takes longer. If NTP sets the
-wall clock, the measured time does not change.
+"""Shortest time that counts as a suspend, ns. Every real suspend takes longer. Setting the wall
+clock does not count as a suspend, because the measured time does not depend on it.
 """
 
 
 class Asleep:
     """Detector that reports each suspend of this computer once.
 
-    The daemon's monotonic clock stands still during a suspend. Without this check, commands and
+    The daemon's monotonic clock stands still during a suspend. Without this detector, commands and
     wheel speeds from before the suspend would seem fresh.
     """
 
@@ -71,8 +71,8 @@ class Asleep:
         """Return whether the computer has been suspended since the last call."""
         if self._read() - self._known_ns < MOMENT_NS:
             return False
-        # `read` reads two clocks, and another process may have run between them. A second reading
-        # confirms the suspend.
+        # `read` reads two clocks, and the difference is wrong if another process ran in between. So
+        # a second reading must confirm the suspend.
         now_ns = self._read()
         slept, self._known_ns = now_ns - self._known_ns >= MOMENT_NS, now_ns
         return slept

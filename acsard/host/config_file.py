@@ -25,7 +25,8 @@ def find(path: str | None) -> tuple[str, bytes]:
     """Return the path and the content of the configuration file.
 
     If `path` is None or "", the file is the one in $ACSARD_CONFIG, or else the first existing one
-    of `PLACES`. If there is no file, return ("built-in defaults", b"").
+    of `PLACES`. If there is no such file, return ("built-in defaults", b""). Raises `ExitError` if
+    the file cannot be read.
     """
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
@@ -51,10 +52,11 @@ def find(path: str | None) -> tuple[str, bytes]:
 
 
 def writable(path: str | None) -> Path:
-    """Return the file that --write changes.
+    """Return the path of the configuration file that the option --write changes.
 
-    Raises `MendableError` if the file or the library tomlkit is missing, if the file is the
-    reference file of a clone of acsard, or if this user may not change it.
+    `path` is the value of --config, or None. Raises `MendableError` if the file or the library
+    tomlkit is missing, if the file is the `acsard.toml` of a clone of acsard, or if this user may
+    not change it.
     """
     require_tomlkit()
     where, text = find(path)
@@ -75,26 +77,26 @@ def writable(path: str | None) -> Path:
 
 
 Keys = Mapping[str, object]
-"""Values by dotted keys, such as "mcu.port"."""
+"""Maps dotted keys, such as "mcu.port", to configuration values."""
 
 
 class Edit(Struct, frozen=True):
-    """A change of a configuration file that a daemon may make by itself."""
+    """A change of a running daemon's configuration file that the daemon has prepared."""
 
     file: Path
     keys: Keys
     before: bytes
-    """The content of the file for which `after` was computed."""
+    """The content of the file from which `after` was computed."""
     after: str
-    """The new text."""
+    """The new text of the file."""
 
 
 def keepable(file: Path | None, keys: Keys) -> Edit:
-    """Return the change that writes these settings into the file of a running daemon.
+    """Prepare the change that writes these settings into the file of the running daemon.
 
-    Raises `MendableError` with the reason if the file is None, tracked by git or read-only, if the
-    library tomlkit is missing, or if the text before or after the change is not a valid
-    configuration.
+    `file` is None if the daemon runs without a file. Raises `MendableError` with the reason if the
+    file is None, tracked by git or read-only, if the library tomlkit is missing, or if the text
+    before or after the change is not a valid configuration.
     """
     if file is None:
         raise MendableError(
@@ -118,9 +120,10 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
 
 
 def keep(edit: Edit) -> None:
-    """Write the change. Compute it again first if another program has changed the file since.
+    """Write a prepared change into the file.
 
-    Raises `MendableError` and leaves the file unchanged if the change cannot be written.
+    If another program has changed the file since, the change is prepared again first. Raises
+    `MendableError` and leaves the file unchanged if the change cannot be written.
     """
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
@@ -141,7 +144,7 @@ def keep(edit: Edit) -> None:
 
 
 def _require_writable(place: Path) -> None:
-    """Raise `ValueError` if a daemon may not replace the file at this resolved path."""
+    """Raise `ValueError` if the daemon may not replace the file. `place` has no symbolic links."""
     if not place.is_file():
         raise ValueError("it is not a regular file")
     # Check the mode bits too, because root may write every file. Without these checks the daemon
@@ -153,9 +156,9 @@ def _require_writable(place: Path) -> None:
 
 
 def is_tracked(place: Path) -> bool:
-    """Return whether git tracks the file at this resolved path.
+    """Return whether git tracks the file. `place` has no symbolic links.
 
-    If git cannot tell, only the reference file of a clone counts as tracked.
+    If git cannot tell, only the `acsard.toml` of a clone of acsard counts as tracked.
     """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False
@@ -179,7 +182,7 @@ def _is_reference(file: Path) -> bool:
 
 
 def require_tomlkit() -> None:
-    """Raise an error now if tomlkit is missing, before a person has spent minutes on a check."""
+    """Raise `MendableError` if tomlkit is missing, before a person spends minutes on a check."""
     try:
         import tomlkit  # noqa: F401
     except ImportError:
@@ -190,10 +193,11 @@ def require_tomlkit() -> None:
 
 
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
-    """Set keys in an `acsard.toml`, and return them.
+    """Set keys in an `acsard.toml`, and return the keys with their values.
 
-    `keys` may be a function that computes them from the configuration. If `new` is true, the file
-    need not exist. Raises `MendableError` and leaves the file unchanged if it cannot be changed.
+    `keys` may be a function that computes them from the file's configuration. If `new` is true, a
+    missing file is created. Raises `MendableError` and leaves the file unchanged if it cannot be
+    changed.
     """
     try:
         place, text, given = _changed(file, keys, new)
@@ -206,7 +210,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
 def require_changeable(
     file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
 ) -> None:
-    """Raise the error that `change` would raise, before other work depends on the change."""
+    """Raise the `MendableError` that `change` would raise, before work whose result it writes."""
     try:
         place, _, _ = _changed(file, keys, new)
         if not os.access(place.parent, os.W_OK):
@@ -218,7 +222,7 @@ def require_changeable(
 def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
-    """Return the resolved path, the text with the new keys, and the keys."""
+    """Return the path without symbolic links, the text with the new values, and the keys."""
     place = file.resolve(strict=not new)
     # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else place.read_bytes().decode()

@@ -1,9 +1,9 @@
-"""Computes the changed text of an `acsard.toml` in a process of its own, for the daemon.
+"""Computes the changed text of an `acsard.toml` for the daemon, in a separate process.
 
 The library tomlkit needs a tenth of a second for a file as long as the reference configuration. In
-a thread of the daemon it would hold the interpreter lock again and again, for half a millisecond
-each time. In a measurement with such a thread, the control loop was up to 12 ms late and missed 3
-of 559 periods.
+a thread of the daemon it would delay the control loop, because it holds the interpreter lock again
+and again, for half a millisecond each time. In a measurement with such a thread, the loop was up to
+12 ms late and missed 3 of 559 periods.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ EDIT_S = 2.0
 
 
 class Task(Struct, frozen=True):
-    """The text of a file, and its new values by dotted key."""
+    """Input of the process: the text of a file, and the new values by dotted key."""
 
     text: str
     keys: dict[str, object]
 
 
 class Result(Struct, frozen=True):
-    """The new text, or the reason why there is none."""
+    """Output of the process: the new text, or an `error` that says why it cannot be made."""
 
     text: str = ""
     error: str = ""
 
 
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text of a file with new values. Another process computes it with `edited`.
+    """Return a configuration text with new values, which a separate process sets.
 
-    `text` is the present text, and `keys` maps dotted keys to new values. Raises `ValueError` with
-    the reason if the text cannot be changed, and `OSError` if no process can be started.
+    `text` is the present text, and `keys` maps dotted keys to the new values. Raises `ValueError`
+    with the reason if the text cannot be changed, and `OSError` if no process can be started.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.
@@ -68,9 +68,9 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
 
 def main() -> None:
     """Read a `Task` from standard input, and write a `Result` to standard output."""
-    # The unit of the service does not permit this call.
+    # Lower the priority of this process below that of the robot's other processes. The systemd unit
+    # does not permit this call.
     with suppress(OSError):
-        # The robot's other processes have priority over this one.
         os.nice(10)
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=Task)
     try:

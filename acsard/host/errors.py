@@ -1,10 +1,10 @@
 """Errors with an external cause that a person can fix, and the exit codes of acsard.
 
 Each of these errors is an `AcsardError`. Most are also the built-in exception that Python uses for
-such a case, so either can be caught. The text says what is wrong and how to fix it. The attribute
-`code` is the exit code of a subcommand that ends with the error. `MendableError` itself is raised
-for problems that no other class describes. Bugs are not among these errors, and neither are states
-of the robot, such as a lost port or a stale command.
+such a case, so a caller may catch either class. The text says what is wrong and how to fix it. The
+attribute `code` is the exit code of a subcommand that ends with the error. `MendableError` itself
+is raised for problems that no other class describes. This module has no errors for bugs, or for
+states of the robot such as a lost port or a stale command.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from acsard.core.values import AcsardError
 
 
 class Exit(IntEnum):
-    """Exit codes, after sysexits.h."""
+    """Exit codes of acsard. Those from 64 on follow sysexits.h."""
 
     OK = 0
     FAILURE = 1
@@ -39,11 +39,11 @@ WORDS: dict[int, str] = {
     Exit.NO_PERMISSION: "no permission",
     Exit.BAD_CONFIG: "bad configuration",
 }
-"""Meaning of each exit code, for people."""
+"""Meaning of each exit code, in words for messages."""
 
 
 class MendableError(AcsardError):
-    """Base class of the errors that a person can mend. The text says how."""
+    """Base class of the errors whose cause a person can fix. The text of the error says how."""
 
     code: Exit = Exit.FAILURE
     """Exit code of a subcommand that ends with this error."""
@@ -110,7 +110,7 @@ class RecordingError(MendableError, ValueError):
 
 
 class ExitError(MendableError):
-    """Ends the program with exit code `code`; the text says what is wrong and how to fix it."""
+    """Ends the subcommand with any exit code. The text says what is wrong and how to fix it."""
 
     def __init__(self, code: Exit, text: str) -> None:
         super().__init__(text)

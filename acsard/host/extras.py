@@ -1,7 +1,7 @@
-"""Finds the command that installs an extra, which is a group of optional libraries.
+"""Finds the command that installs an extra, a group of optional libraries in `pyproject.toml`.
 
-`pyproject.toml` defines the extras. No package index has acsard, so the command names the directory
-from which acsard was installed, or only the libraries.
+acsard is in no package index. So the command names the directory from which acsard was installed,
+or only the libraries.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def install(extra: Extra) -> str:
     """Return the shell command that installs an extra, for an error about a missing library."""
     try:
         wanted = wanted_by(distribution("acsard"), extra)
-    # acsard runs from its source directory and was never installed.
+    # acsard runs from its source directory and has not been installed.
     except PackageNotFoundError:
         wanted = [f".[{extra}]"]
     return shlex.join([*_installer(), *wanted])
@@ -54,7 +54,7 @@ def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
 
 
 def _installer() -> list[str]:
-    """Return the installer of the running venv, not the one that comes first in PATH."""
+    """Return the command that installs packages into the venv of this process."""
     sudo = [] if os.access(sys.prefix, os.W_OK) else ["sudo"]
     if find_spec("pip"):
         return [*sudo, sys.executable, "-m", "pip", "install"]

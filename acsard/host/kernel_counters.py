@@ -1,8 +1,8 @@
 """Reads the kernel's counters that can explain why a program was late.
 
-`Kernel` reads the kernel's files, and the functions above it turn their text into values. A file
-that this computer does not have, or that this user may not read, counts as zeros. Reading the files
-can take a few milliseconds, so the control loop never does it.
+`Kernel` reads the files of the kernel, and the functions in this module decode their text. The
+values of a file are 0 if this computer does not have it or this user may not read it. Reading the
+files can take a few milliseconds, so the control loop never does it.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 SLOWED_BITS = 0b1110
-"""Bits of `get_throttled`: the clock is limited, the processor is throttled, the soft temperature
-limit is active. Each bit describes the present state, not the past."""
+"""Bits 1 to 3 of the Raspberry Pi's `get_throttled`. They say that at present the clock is limited,
+the processor is throttled, or the soft temperature limit is active."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
-"""Drivers whose governor `powersave` adapts the processor's clock frequency to the load.
+"""The cpufreq drivers whose governor `powersave` adapts the processor's frequency to the load.
 
 With every other driver, this governor keeps the lowest frequency.
 """
 
 COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
-"""Prefixes of the types of cooling devices that slow a processor down."""
+"""Beginnings of the type names of cooling devices that slow a processor down."""
 
 
 class SlowClock(Struct, frozen=True):
@@ -59,7 +59,7 @@ class Reading(Struct, frozen=True, omit_defaults=True):
     steal_ns: tuple[int, ...] = ()
     """Time in which the host of a virtual machine ran something else, for each processor."""
     disk_ns: int = 0
-    """Time in which a program waited for a disk."""
+    """Time in which at least one program waited for a disk."""
     own_disk_ns: int = 0
     """Time in which the first thread of this process waited for a disk. Most kernels measure it
     only if the setting kernel.task_delayacct is on."""
@@ -68,12 +68,12 @@ class Reading(Struct, frozen=True, omit_defaults=True):
     major_faults: int = 0
     """Number of memory pages that this process had to read from a disk before it could continue."""
     quota_ns: int = 0
-    """Time in which the cgroup of this process had used up its processor time."""
+    """Time in which this process did not run because its cgroup had used up its CPU quota."""
     conditions: Conditions = Conditions()
 
 
 class Scheduled(Struct, frozen=True, omit_defaults=True):
-    """The time that a thread ran, and the time that it was ready but waited for a processor, ns."""
+    """Time for which a thread ran, and for which it was ready but waited for a processor, ns."""
 
     ran_ns: int = 0
     waited_ns: int = 0
@@ -86,12 +86,12 @@ class Program(Struct, frozen=True):
     name: str
     ran_ns: int
     priority: int = 20
-    """Priority of its first thread: 20 plus the nice value, or negative for a real-time one. The
-    lowest number is the highest priority."""
+    """Kernel priority of its first thread: 20 plus the nice value, or negative for a real-time
+    thread. The lowest number is the highest priority."""
 
     @property
     def real_time(self) -> bool:
-        """Whether its first thread is real-time, so that it displaces all ordinary programs."""
+        """Whether its first thread is a real-time thread, which runs before all ordinary ones."""
         return self.priority < 0
 
 
@@ -102,14 +102,15 @@ def scheduled(text: bytes) -> Scheduled:
 
 
 def steal(text: str, tick_ns: int) -> tuple[int, ...]:
-    """Decode the steal time of each processor from `/proc/stat`, ns. `tick_ns` is a clock tick."""
+    """Return the steal time of each processor, ns, from `/proc/stat`; `tick_ns` is a clock tick."""
     return tuple([int(row[8]) * tick_ns for row in _processors(text) if len(row) > 8])
 
 
 def iowait(text: str, tick_ns: int) -> int:
-    """Decode from `/proc/stat` the time in which a processor was idle and a program waited for I/O.
+    """Return how long a processor was idle while a program waited for I/O, ns.
 
-    Return the longest such time of a single processor, ns. `tick_ns` is a clock tick.
+    `text` is that of `/proc/stat`. The result is that of the processor with the longest such time.
+    `tick_ns` is the length of the kernel's clock tick.
     """
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 
@@ -121,9 +122,10 @@ def _processors(text: str) -> list[list[str]]:
 
 
 def stalled(text: str) -> int:
-    """Return the time in which at least one task stalled, ns.
+    """Return the time in which at least one task waited for the resource, ns.
 
-    `text` is a file of the kernel's pressure stall information.
+    `text` is that of a file of the kernel's pressure stall information, such as
+    `/proc/pressure/io`.
     """
     for line in text.splitlines():
         if line.startswith("some "):
@@ -132,9 +134,9 @@ def stalled(text: str) -> int:
 
 
 def quota(text: str) -> int:
-    """Return the time for which a cgroup had used up its quota, ns.
+    """Return the time in which a cgroup did not run because it had used up its CPU quota, ns.
 
-    `text` is the file `cpu.stat` of the cgroup, in version 1 or 2.
+    `text` is that of the cgroup's file `cpu.stat`, in version 1 or 2 of cgroups.
     """
     for line in text.splitlines():
         name, _, value = line.partition(" ")
@@ -146,7 +148,7 @@ def quota(text: str) -> int:
 
 
 def disk_bytes(text: str) -> int:
-    """Decode from `/proc/PID/task/TID/io` the bytes read from disks and written to them."""
+    """Return how many bytes a thread read from and wrote to disks, from `/proc/.../TID/io`."""
     rows = (line.partition(": ") for line in text.splitlines())
     return sum(int(value) for name, _, value in rows if name in ("read_bytes", "write_bytes"))
 
@@ -154,7 +156,7 @@ def disk_bytes(text: str) -> int:
 def fields(text: str) -> list[str]:
     """Return the fields of `/proc/PID/stat` that follow the name of the program.
 
-    Index 0 is field 3 of proc(5). The name may contain spaces and brackets.
+    Index 0 of the result is field 3 in the manual page proc(5).
     """
     return text.rpartition(")")[2].split()
 
@@ -173,9 +175,9 @@ def busiest(
 ) -> Program | None:
     """Return the process that ran most between two readings, with the time that it ran in between.
 
-    `before` and `after` are the two readings, `within_ns` ns apart. A process that cannot delay a
-    thread of the priority `priority` is left out. Return None if no other process used a quarter of
-    a processor.
+    The readings `before` and `after` are `within_ns` ns apart. Processes that cannot delay a thread
+    of the kernel priority `priority` are ignored. Returns None if no other process used a quarter
+    of a processor.
     """
     # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
     # difference of 10, the kernel gives the process only a tenth of the thread's weight.
@@ -191,11 +193,11 @@ def busiest(
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
-    """Return the limit of a processor's clock frequency, from the files of its directory `cpufreq`.
+    """Return the limit of a processor's clock frequency if the limit is low, else None.
 
-    `policy` maps the name of each file to its text. Return None if the limit is at least 0.6 of the
-    full frequency. The present frequency does not matter, because a processor at rest runs slowly
-    and speeds up when there is work.
+    `policy` maps the names of the files in the processor's `cpufreq` directory to their texts. A
+    limit is low if it is less than 0.6 of the full frequency. The present frequency does not
+    matter, because an idle processor runs slowly and speeds up when there is work.
     """
     governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
     if governor == "powersave" and policy.get("scaling_driver") not in OWN_SCALING:
@@ -209,7 +211,7 @@ def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
 
 
 class Kernel:
-    """The files of the kernel. Its methods are called from one thread."""
+    """Reader of the kernel's files. Call its methods from one thread only."""
 
     def __init__(self, root: Path = Path("/")) -> None:
         """Find the files below `root`. Only tests use another directory than "/"."""
@@ -231,12 +233,12 @@ class Kernel:
             if _text(device / "type").startswith(COOLERS)
         ]
         self._policies = sorted(cpu.glob("cpufreq/policy*"))
-        # A kernel without pressure stall information refuses to read these files, or lacks them.
+        # Without pressure stall information, these files are missing or cannot be read.
         self._pressure = next((path for path in self._pressures() if _text(path)), None)
         self._quota = next((path for path in self._cgroups() if path.is_file()), None)
 
     def read(self, conditions: Conditions | None = None) -> Reading:
-        """Read all counters. Read the conditions too, unless the caller passes them."""
+        """Read all counters. Read the processor's conditions too, unless the caller passes them."""
         stat = _text(self._proc / "stat")
         own = fields(_text(self._proc / "self/stat"))
         pressure = "" if self._pressure is None else _text(self._pressure)
@@ -270,11 +272,10 @@ class Kernel:
         )
 
     def busiest(self, seconds: float) -> Program | None:
-        """Read the times of all processes twice, `seconds` apart, and return the busiest process.
+        """Return the other process that uses the most processor time during the next `seconds` s.
 
-        Return None if no process both uses a quarter of a processor and has enough priority to
-        delay this process. The result is also None if the kernel hides the processes of other
-        users.
+        Returns None if no process uses a quarter of a processor and has enough priority to delay
+        this process. Processes of other users are not considered if the kernel hides them.
         """
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)
@@ -300,7 +301,7 @@ class Kernel:
         yield self._root / "sys/fs/cgroup/io.pressure"
 
     def _cgroups(self) -> Iterator[Path]:
-        """Yield the places where the `cpu.stat` of this process's cgroup may be."""
+        """Yield the possible paths of the file `cpu.stat` of this process's cgroup."""
         mounted = self._root / "sys/fs/cgroup"
         for line in _text(self._proc / "self/cgroup").splitlines():
             controllers, path = line.split(":", 2)[1:]

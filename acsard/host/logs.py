@@ -1,10 +1,10 @@
-"""Logs events as lines on standard error or in the systemd journal, without ever blocking.
+"""Logs events as lines on standard error or in the systemd journal, and never blocks the caller.
 
 A thread writes the lines from a bounded queue, because a full disk, a closed pipe or a stopped
 terminal must not delay the control loop. Lines that do not fit in the queue are dropped.
 
-In the journal each line is a datagram with fields of its own. With these fields,
-`journalctl ACSARD_EVENT=link_down` finds exactly the lines of an event.
+A line for the journal is a datagram that also contains the values as separate fields. With these
+fields, `journalctl ACSARD_EVENT=link_down` finds exactly the lines of an event.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
 
 
 def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
-    """Render a structlog line in the journal's own protocol."""
+    """Return a structlog line in the journal's own protocol: a line NAME=VALUE for each field."""
     fields = {
         "MESSAGE": _message(line),
         "PRIORITY": str(_PRIORITIES.get(str(line.get("level")), 6)),
@@ -65,9 +65,9 @@ def _message(line: Mapping[str, Any]) -> str:
 
 
 class JournalStream(io.StringIO):
-    """Stream that sends each written text to the journal as a datagram.
+    """Stream that sends each written text to the systemd journal as a datagram.
 
-    Creating it raises `OSError` if there is no journal.
+    The constructor raises `OSError` if there is no journal.
     """
 
     def __init__(self, path: str = "/run/systemd/journal/socket") -> None:
@@ -87,11 +87,11 @@ class JournalStream(io.StringIO):
 Form = Literal["console", "json", "logfmt", "journal"]
 
 MAX_VALUE = 500
-"""Largest number of characters of a logged value, which may be a text from another program."""
+"""Number of characters after which a logged value is cut. It may be a text of another program."""
 
 
 class Writer:
-    """Stream whose `write` never blocks and never raises: a thread writes the queued lines."""
+    """Stream whose `write` never blocks and never raises. A thread writes the queued lines."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -113,7 +113,7 @@ class Writer:
         """Do nothing: the thread flushes each line."""
 
     def close(self, timeout: float) -> None:
-        """Write the queued lines, for at most `timeout` s."""
+        """Wait until the queued lines are written, for at most `timeout` s."""
         try:
             self._lines.put_nowait(None)
         except queue.Full:
@@ -130,14 +130,14 @@ class Writer:
 
 
 def write_through(stream: TextIO, text: str) -> None:
-    """Write to the stream's file descriptor, past its buffer.
+    """Write directly to the stream's file descriptor, without the stream's buffer.
 
-    With a buffer, a thread that is stuck in a write would hold the buffer's lock. No other thread
-    could then flush the buffer at the end of the process.
+    A thread that is stuck in a write would hold the lock of the buffer. No other thread could then
+    flush the buffer at the end of the process.
     """
     try:
         fd = stream.fileno()
-    # A stream in memory lacks a descriptor.
+    # A stream in memory has no descriptor.
     except (OSError, ValueError):
         stream.write(text)
         return
@@ -162,7 +162,7 @@ class Log:
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
-        """Use the level of these settings. Keep the destination and the format of the start."""
+        """Apply the log level of these settings. The destination and the format do not change."""
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[
@@ -179,7 +179,7 @@ class Log:
         )
 
     def event(self, event: Event) -> None:
-        """Log an event, with its sender and its count if it has them."""
+        """Log an event of the robot, with its sender and its count if it has them."""
         fields: dict[str, object] = {"text": event.text}
         if event.by:
             fields["by"] = event.by
@@ -192,7 +192,7 @@ class Log:
         self._logger.info(name, **fields)
 
     def close(self) -> None:
-        """Write the queued lines, within 0.2 s."""
+        """Wait until the queued lines are written, for at most 0.2 s."""
         self._writer.close(0.2)
 
 
@@ -208,7 +208,7 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
 def _printable(
     logger: object, method: str, line: MutableMapping[str, Any]
 ) -> MutableMapping[str, Any]:
-    """Replace characters that would move a terminal's cursor or begin a new line."""
+    """Cut long values, and replace characters that would move a cursor or begin a new line."""
     for key, value in line.items():
         if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE):
             line[key] = printable(value[:MAX_VALUE])

@@ -1,12 +1,11 @@
-"""Hands items from any threads to one reader: bounded, newest wins, with a wake-up.
+"""Passes items from any threads to one reader through a bounded queue, and wakes the reader.
 
-A writer never waits, neither for the reader nor for a lock. If the reader falls behind, each new
-item takes the place of the oldest one. A writer stores its item before it wakes the reader, and the
-reader looks at the items after it wakes, so no wake-up is lost. The reader may be woken although no
-item waits.
+A writer never waits, neither for the reader nor for a lock. If the queue is full, each new item
+displaces the oldest one. A writer stores its item before it wakes the reader, and the reader looks
+for items after it wakes, so no wake-up is lost. The reader may also wake without an item.
 
-Two kinds of queues are not mailboxes: one whose oldest items are worth more than its newest ones
-(the log, the recording), and one in which no item may be lost (replies to queries).
+Do not use a mailbox if old items are worth more than new ones (the log, the recording), or if no
+item may be lost (replies to queries).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ T = TypeVar("T")
 class Bell:
     """Signal that wakes one waiting thread.
 
-    If `ring` was called before `wait`, once or several times, that wait ends at once.
+    If `ring` was called before `wait`, even several times, the next `wait` ends at once.
     """
 
     def __init__(self) -> None:
@@ -42,12 +41,12 @@ class Bell:
                 pass  # another thread called this method at the same moment
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait until `ring` is called. Return False after `seconds`; None waits for ever."""
+        """Wait until `ring` is called; return False after `seconds` s. None waits for ever."""
         return self._lock.acquire(timeout=-1 if seconds is None else max(0.0, seconds))
 
 
 class Mailbox(Generic[T]):
-    """The items that wait for their reader, in the order of their arrival."""
+    """Bounded queue of the items that wait for one reader, in the order of their arrival."""
 
     def __init__(self, most: int, wake: Callable[[], object] | None = None) -> None:
         """Create an empty mailbox.
@@ -64,19 +63,20 @@ class Mailbox(Generic[T]):
         method call for each of them would take too long.
         """
         self.lost = 0
-        """Number of items that newer ones have displaced. It is exact if there is one writer."""
+        """Number of items that newer ones have displaced. With several writers it is approximate.
+        """
         self._bell = Bell()
         self.wake = wake or self._bell.ring
-        """Wakes the reader. A writer that uses `store` calls it afterwards."""
+        """Function that wakes the reader. A writer that calls `store` must call it afterwards."""
         self.closed = False
         """Whether no more items will arrive. Earlier items may still wait."""
 
     # The writers' side
 
     def store(self, item: T) -> bool:
-        """Store an item without waking the reader; return False if the oldest item was dropped.
+        """Store an item without waking the reader. Return False if the oldest item was dropped.
 
-        The result is exact if there is one writer.
+        With several writers, the result may be wrong.
         """
         items = self.waiting
         room = len(items) < items.maxlen  # type: ignore[operator]
@@ -87,22 +87,23 @@ class Mailbox(Generic[T]):
         return room
 
     def put(self, item: T) -> bool:
-        """Store an item and wake the reader; return False if the oldest item was dropped for it."""
+        """Store an item and wake the reader. Return False if the oldest item was dropped."""
         room = self.store(item)
         self.wake()
         return room
 
     def close(self) -> None:
-        """Mark the end of the items, and wake the reader, which still gets the items that wait."""
+        """Declare that no more items will come, and wake the reader. Waiting items stay."""
         self.closed = True
         self.wake()
 
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Let writers call `wake` from now on, instead of ending `wait`.
+        """Make writers call the function `wake` to wake the reader, from now on.
 
-        It is called at once if an item waits or the mailbox is closed.
+        The method `wait` is then no longer woken. `wake` is called at once if an item waits or the
+        mailbox is closed.
         """
         self.wake = wake
         if self.waiting or self.closed:
@@ -119,7 +120,7 @@ class Mailbox(Generic[T]):
         return [items.popleft() for _ in range(len(items))]
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait for an item or for `close`. Return False after `seconds`; None waits for ever."""
+        """Wait for an item or for `close`; return False after `seconds` s. None waits for ever."""
         began_ns, left = clock.mono_ns(), seconds
         while not (self.waiting or self.closed):
             if left is not None and left <= 0:

@@ -1,4 +1,4 @@
-"""The names and addresses of this process and its machine, as others see them."""
+"""Finds the names and addresses by which other programs know this process and its machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from acsard.host.processes import called
 
 
 def own_name() -> str:
-    """Return a name like `alice@laptop patrol`: user, machine, and the program if it has a name."""
+    """Return the user, the machine and the program, if it has a name, as "alice@laptop patrol"."""
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
@@ -28,7 +28,7 @@ def own_name() -> str:
 
 
 def sender_id(name: str, secret: str = "") -> str:
-    """Return a sender id `NAME/SECRET`. If `secret` is "", the id gets a new secret."""
+    """Return the id `NAME/SECRET` of a sender of commands. If `secret` is "", a new one is made."""
     return f"{name[:MAX_NAME]}/{secret or new_secret()}"
 
 
@@ -38,10 +38,9 @@ def new_secret() -> str:
 
 
 def own_addresses() -> list[str]:
-    """Return the addresses at which others can reach this machine.
+    """Return the IP addresses at which other machines can reach this one.
 
-    Loopback and link-local addresses are left out. The list is empty if the command `ip` is
-    missing.
+    Loopback and link-local addresses are left out. The list is empty if the command `ip` fails.
     """
     try:
         found = json.loads(called(("ip", "-json", "address"), 5.0).stdout or "[]")

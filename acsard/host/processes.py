@@ -1,7 +1,7 @@
-"""Finds the processes that have a device open, and runs a command.
+"""Finds the processes that have a device open, and runs commands.
 
-Procfs shows the open files of a process, so the module opens no device. It examines only files
-below a /dev directory, because a file on a network disk that hangs would block this process.
+The open files of each process are read from /proc, so no device is opened. Only files below /dev
+are examined, because a file on a network disk that hangs would block this process.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from msgspec import Struct
 PROC = Path("/proc")
 
 PTY_MAJORS = range(136, 144)
-"""Major device numbers of ptys, with 256 minor numbers each. Serial ports have other major numbers.
-"""
+"""Major device numbers of ptys, with 256 ptys for each. Serial ports have other major numbers."""
 
 
 class Holder(Struct, frozen=True):
@@ -37,12 +36,11 @@ class _Open(Struct, frozen=True):
         return os.stat(self.process / "fd" / self.fd).st_rdev
 
     def about(self) -> list[str]:
-        """Return the kernel's information about the descriptor, as lines."""
         return (self.process / "fdinfo" / self.fd).read_text().splitlines()
 
 
 def holders(path: str) -> Iterator[Holder]:
-    """Yield the processes that have this device open."""
+    """Yield the processes that have the device `path` open."""
     for process in dict.fromkeys(one.process for one in _having_open(path)):
         try:
             yield _holder(process)
@@ -52,9 +50,9 @@ def holders(path: str) -> Iterator[Holder]:
 
 
 def holder_of(path: str) -> Holder | None:
-    """Return the process that prevents this process from using a device, or None.
+    """Return another process that uses the device `path`, or None.
 
-    It is a process with a lock on the device, or else one that has the device open.
+    A process with a lock on the device comes before one that only has the device open.
     """
     found = None
     for one in _having_open(path):
@@ -70,7 +68,7 @@ def holder_of(path: str) -> Holder | None:
 
 
 def master_of(path: str) -> Holder | None:
-    """Return the process at the other end of a pty; None for a real device."""
+    """Return the process at the other end of a pty, such as a simulator; None for a real device."""
     wanted = _number(path)
     if os.major(wanted) not in PTY_MAJORS:
         return None
@@ -86,7 +84,7 @@ def master_of(path: str) -> Holder | None:
 
 
 def name_of(pid: int) -> str:
-    """Return the name of a process's program; "" if the process does not exist or is hidden."""
+    """Return the program name of a process; "" if the process does not exist or is hidden."""
     try:
         return _name(PROC / str(pid))
     except OSError:
@@ -94,9 +92,9 @@ def name_of(pid: int) -> str:
 
 
 def waited_ns(pid: int) -> int:
-    """Return how long the first thread of a process has waited for a processor since its start, ns.
+    """Return how long the first thread of a process has waited for a processor in total, ns.
 
-    Returns 0 if the kernel does not report it.
+    Returns 0 if the kernel does not report this time.
     """
     try:
         return int((PROC / str(pid) / "schedstat").read_text().split()[1])
@@ -105,7 +103,7 @@ def waited_ns(pid: int) -> int:
 
 
 def running(name: str) -> bool:
-    """Return whether a process of this name runs."""
+    """Return whether any process with this program name runs on this computer."""
     for process in _processes():
         try:
             if _comm(process) == name[:15]:
@@ -161,9 +159,9 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """Return the program's name. It is "acsard" even if Python runs acsard as a module or script.
+    """Return the program name of a process; `process` is its directory in /proc.
 
-    `process` is the directory of the process in /proc.
+    The name is "acsard" even if Python runs acsard as a module or script.
     """
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
@@ -176,7 +174,7 @@ def _comm(process: Path) -> str:
 
 
 def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
-    """Run a command and wait for its end.
+    """Run the command `words`, wait for its end, and return its output and exit code.
 
     Raises `OSError` if it cannot be started, and `subprocess.TimeoutExpired` after `within_s` s.
     """

@@ -1,8 +1,9 @@
-"""Limits how often something may happen, and how many of a kind there may be. This module is pure.
+"""Limits how often something may happen, and how many things may exist at once.
 
-`Buckets` limits rates by token buckets: one per name (an address, a token, a text), and one for all
-names together. A bucket with room for one unit enforces a shortest interval. `Places` limits how
-many things exist at the same time, per name and in all.
+`Buckets` limits rates with token buckets: one for each name (an address, a token, a text), and one
+for all names together. A bucket with room for one unit enforces a shortest interval. `Places`
+limits how many things, such as connections, exist at the same time, for each name and in all. This
+module is pure.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from acsard.core.values import NS_PER_S
 
 
 class Rate(NamedTuple):
-    """A sustained rate, `hz` units per second, with a burst allowance."""
+    """A permitted rate: `hz` units per second on average, and `most` units at once."""
 
     hz: float
     most: float = 1.0
-    """Number of units that may be taken at once after a rest."""
+    """Number of units that may be taken at once after a pause."""
 
 
 class Bucket:
@@ -30,10 +31,11 @@ class Bucket:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
         self._paid_ns = 0
-        """Time at which the bucket is full again, ns. Each consumed unit adds `_unit_ns`."""
+        """Monotonic time at which the bucket is full again, ns. Each consumed unit adds `_unit_ns`.
+        """
 
     def room(self, now_ns: int) -> bool:
-        """Return whether a unit is left."""
+        """Return whether the bucket contains a unit now."""
         return self._paid_ns <= now_ns + self._burst_ns
 
     def full(self, now_ns: int) -> bool:
@@ -52,17 +54,17 @@ class Buckets:
     """A token bucket for each name, and one for all names together."""
 
     def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
-        """Set the rate of each name. `in_all` limits all names together, unless it is None."""
+        """Limit each name to the rate `of_one`, and all together to `in_all` unless it is None."""
         self._of_one = of_one
         self._shared = None if in_all is None else Bucket(in_all)
         self._buckets: dict[str, Bucket] = {}
 
     def room(self, name: str, now_ns: int) -> bool:
-        """Return whether this name has a unit left."""
+        """Return whether the bucket of this name contains a unit now."""
         return name not in self._buckets or self._buckets[name].room(now_ns)
 
     def take(self, name: str, now_ns: int) -> bool:
-        """Consume one unit of this name. Return False if its bucket or the shared one is empty."""
+        """Consume a unit of this name's bucket and of the common one; False if either is empty."""
         if name not in self._buckets:
             # Drop the full buckets, which equal new ones, so that many names do not fill the
             # memory.
@@ -83,7 +85,6 @@ class Places:
 
     @property
     def taken(self) -> int:
-        """Number of taken places."""
         return self._taken.total()
 
     def room(self, name: str) -> bool:
@@ -105,7 +106,7 @@ class Places:
 
     @contextmanager
     def held(self, name: str = "") -> Iterator[bool]:
-        """Hold a place during the block if one is free; yield whether a place was free."""
+        """Take a place for the time of the block if one is free, and yield whether one was free."""
         free = self.enter(name)
         try:
             yield free

@@ -12,16 +12,16 @@ import resource
 from pathlib import Path
 
 PRIORITY = 10
-"""Real-time priority: above ordinary processes, below the kernel's interrupt threads (50)."""
+"""Real-time priority of the control loop: below that of the kernel's interrupt threads (50)."""
 
 SPIN_S = 1
-"""Time that the loop may run without a pause before the kernel ends the process, s. A limit is
-needed because the loop has priority over everything else on its core. A step takes a thousandth of
+"""Time that the control loop may run without a pause before the kernel ends the process, s. A limit
+is needed because the loop has priority over all ordinary programs. A step takes a thousandth of
 this time.
 """
 
 DOZE = "/dev/cpu_dma_latency"
-"""The kernel's device that limits how long a processor may take to wake."""
+"""The kernel's device through which a process limits how long a processor may take to wake."""
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -50,7 +50,8 @@ def ask() -> str:
 def has(pid: int) -> bool | None:
     """Return whether the first thread of a process has real-time scheduling.
 
-    In a daemon, this thread runs the control loop. Returns None if the scheduling cannot be read.
+    In the daemon, this thread runs the control loop. The process id 0 means this process. Returns
+    None if the scheduling cannot be read.
     """
     try:
         policy = os.sched_getscheduler(pid)

@@ -1,8 +1,8 @@
-"""Notifies the service manager: ready, alive, status and stopping.
+"""Informs systemd that this process is ready, alive or stopping, and about its status.
 
-Without a service manager (`$NOTIFY_SOCKET` unset) nothing is sent. The protocol is that of
-sd_notify: a datagram with `NAME=value` lines. The control step itself sends `WATCHDOG=1`. If the
-control loop hangs, the messages stop, and systemd ends the process.
+The protocol is that of sd_notify: a datagram with lines `NAME=value`. Nothing is sent if systemd
+did not start this process (`$NOTIFY_SOCKET` is not set). The control loop itself sends
+`WATCHDOG=1`. If the loop hangs, these messages stop, and systemd ends the process.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
-"""Number of times that the control loop feeds systemd's watchdog within its timeout. No separate
-timer feeds the watchdog, because that would hide a loop that is late.
+"""Number of times that the control loop feeds systemd's watchdog within the watchdog's timeout. No
+separate timer feeds it, because systemd could then not see that the loop hangs.
 """
 
 PATIENCE_S = 30
@@ -22,7 +22,7 @@ PATIENCE_S = 30
 
 
 class Systemd:
-    """Connection to the service manager of this process, if there is one."""
+    """Connection to systemd. Its methods do nothing if systemd did not start this process."""
 
     def __init__(self, environ: Mapping[str, str], pid: int) -> None:
         self._socket: socket.socket | None = None
@@ -55,19 +55,19 @@ class Systemd:
         self._send("STOPPING=1\nSTATUS=ramping to zero")
 
     def waiting(self, why: str) -> None:
-        """Report that the start waits, and the reason `why`. Call again within `PATIENCE_S`."""
+        """Report why the start is delayed. Call again within `PATIENCE_S`, or systemd gives up."""
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 
     def status(self, text: str) -> None:
-        """Report the status for `systemctl status`."""
+        """Report a status line, which `systemctl status` shows."""
         self._send(f"STATUS={text}")
 
     def alive(self) -> None:
-        """Feed the watchdog."""
+        """Tell systemd's watchdog that this process is alive."""
         self._send("WATCHDOG=1")
 
     def step(self, outputs: Outputs) -> None:
-        """Feed the watchdog after a control step, and report the status if it has changed."""
+        """Feed systemd's watchdog after a control step, and report the status if it has changed."""
         if self._socket is None:
             return
         now_ns = outputs.now.mono_ns

@@ -1,4 +1,4 @@
-"""The terminal: whether output may contain colours, and how a program reads single key presses."""
+"""Decides whether output may contain colours, and makes the terminal deliver single key presses."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def coloured(stream: TextIO) -> bool:
 
 @contextmanager
 def one_by_one() -> Iterator[None]:
-    """Deliver the keys of standard input one by one, and restore the terminal at the end.
+    """Let standard input deliver each key press at once, and restore the terminal at the end.
 
-    During the block Ctrl-S is an ordinary key. Otherwise it would block the program's output, and
-    with it the program that drives the robot.
+    Ctrl-S becomes an ordinary key during the block. Otherwise it would stop the program's output,
+    and so block the program while it drives the robot.
     """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

@@ -16,17 +16,17 @@ T = TypeVar("T")
 
 
 class NoThreadError(TimeoutError):
-    """No thread could be started, so the call has not begun."""
+    """No thread could be started, so the function was not called."""
 
 
 async def in_thread(
     call: Callable[[], T], timeout: float | None, late: Callable[[T], None] | None = None
 ) -> T:
-    """Return the result of `call`, or raise `TimeoutError` after `timeout` s (None: wait for ever).
+    """Call `call` in a thread of its own, and return its result.
 
-    Raises `NoThreadError` at once if no thread can be started. If the caller no longer waits when
-    the result comes, or stops waiting in the same round of the event loop, a thread passes the
-    result to `late`, which must release the result.
+    Raises `TimeoutError` after `timeout` s (None waits for ever), and `NoThreadError` at once if no
+    thread can be started. If the caller has stopped waiting when the result comes, a thread calls
+    `late` with the result, so that `late` can release it.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()

@@ -1,7 +1,7 @@
-"""A kernel timer for the event loop, more precise than asyncio's timers.
+"""A timer of the kernel that wakes the event loop more precisely than asyncio's own timers.
 
-On epoll asyncio rounds every wait up to milliseconds. A timerfd wakes the loop on time and counts
-missed expirations. Python itself offers timerfd only from 3.13 on, so this module calls the C
+asyncio rounds every wait up to whole milliseconds. The kernel's timerfd wakes the loop on time, and
+counts its expirations. Python itself offers timerfd only from 3.13 on, so this module calls the C
 library.
 """
 
@@ -28,10 +28,10 @@ class _Itimerspec(ctypes.Structure):
 
 
 class TimerFd:
-    """One timer. Its file descriptor becomes readable when the timer expires.
+    """A timer whose file descriptor becomes readable when the timer expires.
 
-    The kernel does not offer a timerfd on CLOCK_MONOTONIC_RAW, the daemon's clock. So `set` passes
-    the remaining time.
+    The kernel has no timerfd for CLOCK_MONOTONIC_RAW, the daemon's clock. So `set` gives the kernel
+    the remaining time and not the time of the expiration.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class TimerFd:
         return int(self._fd)
 
     def set(self, at_ns: int) -> None:
-        """Expire once at the monotonic time `at_ns`."""
+        """Let the timer expire once, at the time `at_ns` of the daemon's monotonic clock."""
         wait_ns = max(1, at_ns - clock.mono_ns())
         value = self._spec.it_value
         value.tv_sec, value.tv_nsec = divmod(wait_ns, NS_PER_S)
@@ -55,7 +55,7 @@ class TimerFd:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
 
     def expirations(self) -> int:
-        """Return the number of expirations since the last call."""
+        """Return how often the timer has expired since the last call."""
         try:
             return int.from_bytes(os.read(self._fd, 8), sys.byteorder)
         except OSError as error:

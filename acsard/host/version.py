@@ -1,7 +1,7 @@
-"""The version of this program with the commit of its source.
+"""Finds the version of this program and the commit of its source.
 
-`deploy/build_hook.py` imports this module when it builds a wheel, so it uses only the standard
-library.
+`deploy/build_hook.py` imports this module when it builds a wheel. The module therefore uses only
+the standard library.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ COMMIT_FILE = "commit"
 the file."""
 
 DIGITS = 9
-"""Number of digits of a commit that are shown."""
+"""Number of digits of the commit in the version."""
 
 
 @lru_cache(1)

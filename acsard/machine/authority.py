@@ -1,8 +1,9 @@
-"""Certificates and their authority as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
+"""Creates the certificate authority of a robot, and certificates that it signs, as files.
 
-The keys are P-256 keys, in files that only their owner can read. People make their phones trust the
-authority, so its certificate limits the hosts that it may sign for. A thief of the authority's key
-can pose as the robots and as hosts of a private network, but not as any other web site.
+The files are `ca.pem`, `certificate.pem`, `key.pem` and `ca-key.pem`. The keys are P-256 keys, in
+files that only their owner can read. People make their phones trust the authority. Its certificate
+therefore limits the hosts for which it may sign. A thief of the authority's key can pose as a robot
+or as a host of a private network, but not as any other web site.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from acsard.host.atomic_file import replace
 from acsard.machine.certificates import CA_KEY
 
 LOCAL = ("local", "localhost")
-"""Host names that every authority may sign, with all names below them."""
+"""Host names for which every authority may sign certificates, with all names below them."""
 
 PRIVATE = (
     "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
     "192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10",
 )  # fmt: skip
-"""Networks whose addresses every authority may sign. No Internet host has such an address."""
+"""Networks for whose addresses every authority may sign. No Internet host has such an address."""
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 class Authority:
-    """Certificate authority that signs certificates."""
+    """A certificate authority: a certificate and the key that signs other certificates."""
 
     def __init__(self, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
         self._certificate, self._key = certificate, key
@@ -44,15 +45,15 @@ class Authority:
     def make(
         cls, directory: Path, name: str, days: int, addresses: Sequence[str] = ()
     ) -> Authority:
-        """Create an authority in `directory` with the common name `name`.
+        """Create an authority with the common name `name`, and write its files into `directory`.
 
-        Its own certificate is valid for five times `days`, which is the validity of the
-        certificates that it signs.
+        `days` is the validity of the certificates that it will sign. Its own certificate is valid
+        for five times as long.
 
-        The host names that it may sign are those of `addresses` and of `LOCAL`, with all names
-        below them. The IP addresses that it may sign are those of `addresses` and of `PRIVATE`. For
-        an IPv6 address, the whole /64 network is permitted. Names of other kinds are not limited:
-        a certificate may have any common name, which names a client on the bus.
+        It may sign for the host names in `addresses` and `LOCAL`, with all names below them, and
+        for the IP addresses in `addresses` and `PRIVATE`. For an IPv6 address in `addresses`, it
+        may sign for the whole /64 network. Common names, which identify clients on the bus, are not
+        limited.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -70,9 +71,9 @@ class Authority:
 
     @classmethod
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
-        """Load the authority from `directory`.
+        """Load the authority from the files in `directory`.
 
-        If the key is encrypted, `password` is called and returns the password. Raises `OSError` or
+        If the key is encrypted, `password` is called for the password. Raises `OSError` or
         `ValueError` if the authority cannot be loaded.
         """
         data = (directory / CA_KEY).read_bytes()
@@ -88,8 +89,8 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
-        An authority that acsard made is limited to some names. An authority that another program
-        made may have no limits.
+        The certificate of an authority that acsard made lists the permitted names. If another
+        program made the authority, it may have no such list, and then everything is permitted.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -111,7 +112,7 @@ class Authority:
         )
 
     def names_in(self, directory: Path) -> list[str]:
-        """Return the names and addresses in the certificate of `directory`, if there is one."""
+        """Return the names and addresses in the certificate in `directory`; [] if it is missing."""
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
             names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -121,11 +122,11 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """Write a certificate for server and client use, its key and the authority's certificate.
+        """Sign a certificate for servers and clients, and write its files into `directory`.
 
-        The files are written to `directory`. `name` is the common name of the certificate.
-        `addresses` are the host names and IP addresses at which the holder of the certificate is
-        reached. `days` is the validity of the certificate.
+        The files are the certificate, its key and the authority's certificate. `name` is the common
+        name. `addresses` are the host names and IP addresses at which the owner of the certificate
+        can be reached. `days` is the validity in days.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -183,7 +184,7 @@ def _usage(signs: bool) -> x509.KeyUsage:
 
 
 def _constraints(addresses: Sequence[str]) -> x509.NameConstraints:
-    """Return the constraints of an authority that signs for these host names and IP addresses."""
+    """Return the list of permitted names for an authority that signs for these addresses."""
     hosts, networks = list(LOCAL), [ipaddress.ip_network(one) for one in PRIVATE]
     for address in addresses:
         named = _general_name(address)
@@ -222,5 +223,5 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file by one that this user owns and that never has more permissions than `mode`."""
+    """Write a file that this user owns. It never has more permissions than `mode`."""
     replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))

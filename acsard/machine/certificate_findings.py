@@ -1,6 +1,6 @@
 """Examines the certificates of this machine and of the routers that it connects to.
 
-Each finding about a problem contains the remedy, with the commands that a person can type.
+A finding about a problem contains the commands that fix it.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ from acsard.machine.finding import LEVELS, Finding
 
 
 def certificates(tls: str) -> Iterator[Finding]:
-    """Yield findings about the certificates in the directory `tls`; none if `tls` is "".
+    """Yield findings about the certificates in the directory `tls`, or nothing if `tls` is "".
 
-    The findings say whether the files exist, are private and have not expired.
+    The findings say whether the files exist, whether other users can read the key, and whether the
+    certificates have expired or will expire soon.
     """
     if not tls:
         return
@@ -63,13 +64,13 @@ def renewal(tls: str, whose: str) -> str:
     """Return the commands that replace a certificate that expires soon.
 
     `tls` is the directory of this machine's certificate. `whose` is the owner of the certificate to
-    replace, with a name as in `expiry`; "" means this machine.
+    replace: "" for this machine, `AUTHORITY`, or a text such as "the router tls/HOST:PORT".
     """
     directory, name = Path(tls), common_name(tls)
     if whose == AUTHORITY:
         return (
             f"on the machine that has {CA_KEY}, in the directory of that file, run `acsard tls "
-            "init --force --directory .`; then make and copy a new certificate for everybody"
+            "init --force --directory .`; then make and copy a new certificate for each client"
         )
     if not whose and name == OWN:
         there = "" if (directory / CA_KEY).exists() else f", after you have put {CA_KEY} there"
@@ -84,7 +85,7 @@ def renewal(tls: str, whose: str) -> str:
 
 
 def _mend_of_absent(directory: Path) -> str:
-    """Return the remedy if a certificate file in the directory is missing or cannot be used."""
+    """Return the remedy if a certificate file in the directory is missing or cannot be read."""
     if (directory / CA_KEY).exists():
         return f"run `{_command('renew', directory)}`, or this command with sudo"
     if not directory.is_dir() or not any(directory.iterdir()):
@@ -98,8 +99,8 @@ def _mend_of_absent(directory: Path) -> str:
 def _command(action: str, directory: Path) -> str:
     """Return the command line of an action of `acsard tls` in this directory.
 
-    If the command needs sudo, it contains the full path of the program, because sudo does not
-    search this user's PATH.
+    If it needs sudo, it contains the full path of acsard, because sudo does not search this user's
+    PATH.
     """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"

@@ -1,7 +1,7 @@
-"""Makes and renews the certificates of the authority, of the robot and of the clients, as files.
+"""Makes and renews certificates: those of the authority, of the robot and of its clients.
 
 The robot admits a client if the robot's authority has signed the client's certificate. The common
-name in that certificate determines the client's permissions (`[access]`).
+name in that certificate determines the client's permissions (`[access]` in acsard.toml).
 """
 
 from __future__ import annotations
@@ -34,21 +34,19 @@ OWN = "robot"
 """Common name of the certificate that `tls init` makes for the robot itself."""
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
-"""Matches a host name or an IP address."""
+"""Pattern of a host name or an IP address."""
 
 LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
 HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
-"""Matches a common name in the form of a host name.
-
-OpenSSL takes such a name for a host name if it has a dot, even if it is `10.0.0.5`.
-"""
+"""Pattern of a common name that looks like a host name. `10.0.0.5` matches it as well."""
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
-    """Create an authority and the first certificates, and return the robot's names and addresses.
+    """Create an authority, the robot's certificate and one for each role, in `directory`.
 
-    `addresses` are further names and addresses of the robot. `days` is the validity of the
-    certificates. An existing authority is replaced only if `force` is set.
+    Returns the names and addresses in the robot's certificate. They are the machine's own ones and
+    `addresses`. `days` is the validity of the certificates. An existing authority is replaced only
+    if `force` is set.
     """
     if (directory / CA).exists() and not force:
         raise MendableError(
@@ -67,10 +65,10 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 
 
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Create one more client certificate with the common name `name`, and return its directory.
+    """Create a client certificate with the common name `name`, and return its directory.
 
     `directory` contains the authority. `addresses` are host names and IP addresses of the client.
-    `days` is the validity of the certificate.
+    `days` is the validity of the certificate in days.
     """
     authority = _load(directory)
     place = directory / "clients" / name
@@ -83,10 +81,10 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 
 
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Replace the certificate that `add` made for this name, and return its directory.
+    """Replace the client certificate with the common name `name`, and return its directory.
 
-    The new certificate contains `addresses`, and the host names and addresses of the old one for
-    which the authority may sign. `days` is its validity.
+    The new certificate contains `addresses`, and those addresses of the old one for which the
+    authority may sign. `days` is its validity in days.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -107,8 +105,8 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     """Replace the robot's own certificate, and return the names and addresses in the new one.
 
-    These include `addresses`, and those of the old certificate for which the authority may sign.
-    `days` is the validity of the new certificate.
+    They are `addresses`, and those of the machine and of the old certificate for which the
+    authority may sign. `days` is the validity of the new certificate in days.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
@@ -120,11 +118,11 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 
 
 def _names_of(name: str) -> list[str]:
-    """Return the host names for a certificate with this common name.
+    """Return the host names that a certificate with this common name should contain.
 
-    The result includes the mDNS name NAME.local even for a common name like `anna.meyer` or
-    `10.0.0.5`. If a certificate has no host name, TLS takes such a common name for the host name,
-    and refuses it if the authority may not sign for it.
+    They are the name itself and NAME.local, if they are possible host names. If a certificate
+    contains no host name, OpenSSL takes a common name such as `anna.meyer` or `10.0.0.5` for one.
+    It then refuses the certificate if the authority may not sign for this name.
     """
     named = [name] if ADDRESS.match(name) else []
     if not HOST_LIKE.match(name) or name.endswith(".local"):
@@ -146,14 +144,14 @@ def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
-    """Return the robot's names: in DNS and mDNS, loopback, its present addresses, and `more`."""
+    """Return the host names and addresses of this machine, and those in `more`."""
     host = socket.gethostname()
     names = [host, f"{host}.local", "localhost", "127.0.0.1", *own_addresses(), *more]
     return list(dict.fromkeys(names))
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """Return the settings that open the bus to the network. Existing TLS endpoints are kept."""
+    """Return the settings that open the bus to the network with the certificates in `directory`."""
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):
         listen.append(f"tls/0.0.0.0:{PORT}")
@@ -169,7 +167,7 @@ def _maker() -> type[Authority]:
 
 
 def _load(directory: Path) -> Authority:
-    """Load the authority from `directory`, after a check that certificates can be written there."""
+    """Load the authority from `directory`, after checking that this user may write files there."""
     maker = _maker()
     _writable(directory)
     try:
@@ -200,7 +198,7 @@ def _password() -> str:
 
 
 def _writable(directory: Path) -> None:
-    """Raise `MendableError` unless the directory can be created or written to. Create nothing."""
+    """Raise `MendableError` if this user cannot create the directory or write files into it."""
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     if not there.is_dir():
         raise MendableError(f"{there} is not a directory; name a directory with --directory")

@@ -1,12 +1,12 @@
-"""All examinations of the doctor in their order, from the configuration to a moving robot.
+"""Runs all examinations of `acsard doctor` in order.
 
 This module itself examines the configuration, the machine and the serial port.
 `certificate_findings.py` examines the certificates, and `daemon_findings.py` examines the daemon
-and its link. The doctor opens no port and sends nothing to a robot.
+and its link. The doctor opens no port, and only queries a robot.
 
-If a daemon runs, its own configuration is examined, because the file may have changed since the
-daemon's start, and options may override the file. If the daemon runs on another machine, only its
-reports are examined, because its port, files and gateway are on that machine.
+If a daemon runs, the doctor examines the daemon's configuration. The file may have changed since
+the daemon's start, and options may override the file. If the daemon runs on another machine, the
+doctor examines only its reports, because its port, files and gateway are on that machine.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
 REAL = (
-    "run the daemon as the service (deploy/systemd), which has it; without it, load makes "
-    "the daemon late"
+    "run the daemon as the service (deploy/systemd), which has real-time priority; without it, "
+    "load makes the daemon late"
 )
 
 
@@ -41,7 +41,7 @@ def meddlers() -> Iterator[Finding]:
     """Yield findings about programs that take or disturb serial ports."""
     if running("brltty"):
         mend = (
-            "sudo apt remove brltty, unless you use a Braille display: it takes CH340 and "
+            "sudo apt remove brltty, unless you use a Braille display: brltty takes CH340 and "
             "FTDI ports"
         )
         yield Finding("brltty", "failure", "runs", mend)
@@ -51,21 +51,21 @@ def meddlers() -> Iterator[Finding]:
 
 
 def clock_set() -> Iterator[Finding]:
-    """Yield a finding about the wall clock, from which the stamps of messages are taken."""
+    """Yield a finding that says whether the wall clock, which dates all messages, is set."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < 2026:  # boards without a battery start in the past
-        mend = "set it (timedatectl), or let chrony set it; odometry stamps are wall-clock times"
+        mend = "set the clock (timedatectl), or run chrony; odometry stamps are wall-clock times"
         yield Finding("clock", "warning", f"the year is {year}", mend)
     else:
         yield Finding("clock", "ok", f"the year is {year}")
 
 
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
-    """Yield a finding about real-time scheduling.
+    """Yield a finding that says whether the daemon has or would get real-time scheduling.
 
     Args:
         wanted: the setting control.real_time.
-        pid: the daemon's process on this machine; None checks the permissions of this process.
+        pid: the process id of the daemon. If it is None, the permissions of this user are examined.
     """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
@@ -81,11 +81,11 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
 
 
 LOOK_S = 0.3
-"""Time between two readings of the kernel's counters, s: 30 ticks of the kernel's clock."""
+"""Time between two readings of the kernel's counters, s. It is 30 ticks of the kernel's clock."""
 
 
 def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
-    """Yield findings about the causes that make any program on this computer late now."""
+    """Yield findings about causes that make programs on this computer late now, such as heat."""
     kernel = kernel or Kernel()
     before, began_ns = kernel.read(), clock.mono_ns()
     time.sleep(LOOK_S)
@@ -99,7 +99,7 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
-    """Yield findings about the port: existence, permissions, and other programs that use it."""
+    """Yield findings about the port: whether it exists, may be opened, and is used by others."""
     path = config.mcu.port
     if path == "sim":
         mend = '`acsard ports` lists the ports; write, for example, mcu.port = "/dev/acsar"'
@@ -157,15 +157,15 @@ def examine(
     given: dict[str, dict[str, object]],
     told: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
-    """Yield all findings.
+    """Yield all findings of the doctor.
 
     Args:
-        where: the path of the configuration, for messages.
+        where: the path of the configuration file, for messages.
         text: the content of the configuration file.
-        given: values that override the file, by table and key.
+        given: values that override those of the file, by table and key.
         told: function that returns the daemon's address for a configuration.
 
-    Raises `UsageError` if that address is not a valid endpoint.
+    Raises `UsageError` if the address is not a valid endpoint.
     """
     try:
         config = parse(text, given)
@@ -196,8 +196,8 @@ def examine(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
     yield from slowness()
-    # The service made copies of the certificates when it started. So examine the original files
-    # too, because they may have been deleted since.
+    # The running daemon may use copies, which systemd made of the certificates at its start. So
+    # also examine the directories with the original files.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)

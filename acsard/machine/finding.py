@@ -1,4 +1,4 @@
-"""A finding of the doctor."""
+"""A finding of `acsard doctor`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
 LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
-"""Levels in the order of their numbers in ROS diagnostics, which begin with 0."""
+"""The levels, in order of severity. The index of a level is its number in ROS diagnostics."""
 
 
 class Finding(Struct, frozen=True):
-    """The doctor's result for one subject.
+    """The result of `acsard doctor` for one subject.
 
-    `mend` is the remedy, or advice if the level is ok. It is "" if there is neither.
+    `mend` is the remedy for a problem. If the level is ok, it is advice or "".
     """
 
     subject: str

@@ -1,6 +1,6 @@
-"""The serial ports of this machine, with the boards on them and the processes that use them.
+"""Lists the serial ports of this machine, the boards on them, and the processes that use them.
 
-The module reads sysfs and procfs and opens no port, so a running robot is not disturbed.
+The module reads /sys and /proc and opens no port, so a running robot is not disturbed.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ BOARDS: dict[str, str] = {
     "0403:6015": "FTDI FT-X",
     "10c4:ea60": "Silicon Labs CP210x",
 }
-"""USB ids of the boards and USB-to-serial chips through which a robot's microcontroller connects.
+"""USB ids of common microcontroller boards and USB-to-serial chips, with their names.
 
-A test proves that deploy/udev/70-acsar.rules contains the same ids.
+The file deploy/udev/70-acsar.rules must contain the same ids, and a test checks this.
 """
 
 BY_ID = Path("/dev/serial/by-id")
@@ -36,7 +36,7 @@ class SerialDevice(Struct, frozen=True):
 
     device: str
     names: list[str]
-    """Stable names of the port: by-id links and /dev/acsar."""
+    """Links to the port whose names stay the same when the device is plugged in again."""
     driver: str
     usb_id: str
     """`vid:pid` in hex; "" if the port is not on USB."""

@@ -1,9 +1,9 @@
-"""acsard as a system service: its files, its commands, and the steps that install or remove it.
+"""Installs acsard as a system service, or removes it.
 
-The files are those of `deploy/`, with the path of this installation in the units. A file that
-another person or program has written is neither overwritten nor removed without force. A service
-cannot run from every directory: `misplaced` returns why it cannot run from this one. A step is an
-object that can be shown as text, so that the user can read all steps before they are carried out.
+The files of the service come from `deploy/`; the path of this installation is inserted into the
+units. A file that another person or program has written is neither overwritten nor removed without
+force. Each step of an installation is an object with a text, so that the user can read all steps
+before they are carried out.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import called
 
 HOME = "/opt/acsard/venv"
-"""Path of the venv in the unit files of `deploy/`."""
+"""Path of the venv in the unit files of `deploy/`. The installation replaces it by the real one."""
 
 OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-"""Directories that a service cannot see."""
+"""Directories that are hidden from the service."""
 
 
 def misplaced(
@@ -37,7 +37,7 @@ def misplaced(
     executable: str = sys.executable,
     hidden: Sequence[str] = OUT_OF_SIGHT,
 ) -> str:
-    """Return why a service cannot run this installation, or "" if it can."""
+    """Return why a service cannot run this installation of acsard, or "" if it can."""
     if prefix == base or _hidden(Path(prefix), hidden):
         return (
             f"a service cannot run from {prefix}, because services have no access to home "
@@ -73,7 +73,7 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _closed(path: Path) -> Path | None:
-    """Return the first part of `path` that other users may not enter, or None."""
+    """Return the outermost directory of `path` that other users may not enter, or None."""
     for place in (*reversed(path.parents), path):
         try:
             mode = place.stat().st_mode
@@ -92,14 +92,14 @@ OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard
 
 
 class File(Struct, frozen=True):
-    """One file of the service."""
+    """A file that the installation writes."""
 
     path: Path
     content: bytes
     mode: int = 0o644
     kept: bool = False
-    """True for a file that the user may change. Such a file is never replaced. If it has been
-    changed, only a purge removes it."""
+    """True for a file that the user may change, such as the configuration. An installation never
+    replaces such a file. If it was changed, only a purge removes it."""
 
     def found(self) -> bytes | None:
         """Return the present content of the path, or None if the file does not exist."""
@@ -111,7 +111,7 @@ class File(Struct, frozen=True):
             raise _unreadable(self.path, error) from None
 
     def condition(self) -> str:
-        """Return the file's condition in a word or two."""
+        """Return "missing", "as installed", "changed" or "unreadable"."""
         try:
             found = self.found()
         except MendableError:
@@ -132,14 +132,13 @@ class Write(Struct, frozen=True):
         )
 
     def do(self) -> None:
-        """Write the file. New directories are open to the service's user, whatever the umask."""
+        """Write the file, and create its directories so that the service's user may enter them."""
         path = self.file.path
         made = [place for place in path.parents if not place.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         for place in made:
             place.chmod(0o755)
-        # This also replaces a symbolic link. Writing through it would change the file to which it
-        # points.
+        # If the path is a symbolic link, replace the link and not the file to which it points.
         replace(path, self.file.content, mode=self.file.mode, owner=(os.geteuid(), os.getegid()))
 
 
@@ -156,7 +155,7 @@ class Remove(Struct, frozen=True):
         return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        """Remove the path, and acsard's own directories that become empty."""
+        """Remove the path, and also those of acsard's own directories that become empty."""
         if self._is_directory:
             shutil.rmtree(self.path)
         else:
@@ -172,7 +171,7 @@ class Remove(Struct, frozen=True):
 
 
 class Keep(Struct, frozen=True):
-    """Step that leaves a file as it is. `why` is the reason that the user reads, or ""."""
+    """Step that leaves a path as it is. `why` is the reason that the user reads, or ""."""
 
     path: Path
     why: str = ""
@@ -189,9 +188,8 @@ class Run(Struct, frozen=True):
 
     words: tuple[str, ...]
     may_fail: bool = False
-    """True if a failure must not end the installation: the machine may have no udev, or a unit
-    that never failed cannot be reset.
-    """
+    """True if the installation goes on after a failure of the command. For example, the machine may
+    have no udev."""
 
     def __str__(self) -> str:
         return f"run     {' '.join(self.words)}"
@@ -231,14 +229,14 @@ STATES = {
 """State directories of the units, each with a description of its content."""
 
 Found = Mapping[Path, bytes | None]
-"""Present content of the file at each path; None if there is no file."""
+"""Maps the path of a file to its present content, or to None if the file does not exist."""
 
 RELOAD = (
     Run(("systemctl", "daemon-reload")),
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
 AGAIN = ("tty", "usb-serial", "misc")
-"""Subsystems of the devices that the udev rules cover. `udevadm trigger` selects them."""
+"""Subsystems of the devices to which `udevadm trigger` applies the new udev rules."""
 
 INSTALLED = (
     *RELOAD,
@@ -252,7 +250,7 @@ GONE = (*RELOAD, Run(("systemctl", "reset-failed", *ALL), may_fail=True))
 
 
 def files() -> list[File]:
-    """Return every file of the service, as this installation writes it."""
+    """Return every file that the installation of the service writes."""
     reference = _reference().read_text(encoding="utf-8")
     return [
         *(_unit(name) for name in ALL),
@@ -275,7 +273,7 @@ def _unit(name: str) -> File:
 
 
 def lan_drop_in(unit: str) -> File:
-    """Return the drop-in that gives a unit access to the local network and to the certificates."""
+    """Return the drop-in file that lets a unit use the local network and the certificates."""
     return File(UNITS / f"{unit}.d" / LAN, (source() / "systemd" / LAN).read_bytes())
 
 
@@ -294,10 +292,10 @@ def admitting(directory: Path) -> Write | Keep | None:
 
 
 def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
-    """Return the step that puts the certificates of `directory` into the drop-in.
+    """Return the step that makes a drop-in name the certificates in `directory`.
 
-    The new text is made from `found`, the drop-in's present content. If that is None, it is made
-    from the content of `file`.
+    A drop-in is a file that extends a unit of systemd. `file` is the drop-in as the installation
+    writes it. `found` is its present content, which the step changes, or None if it is missing.
     """
     place = str(directory).encode()
     text = re.sub(
@@ -311,15 +309,15 @@ def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
 
 
 def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
-    """Return the present content of each file's path."""
+    """Return the present content of each file, by path; None for a missing file."""
     return {file.path: file.found() for file in wanted}
 
 
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """Return the installation steps.
+    """Return the steps that install the service.
 
-    `found` gives the present contents of the files. Raises `MendableError` if a step would replace
-    a changed file, unless `force` is set.
+    `found` gives the present contents of the files `wanted`. Raises `MendableError` if a step would
+    replace a changed file, unless `force` is set.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -341,12 +339,12 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
 
 
 def own_places() -> list[Path]:
-    """Return the directories that may contain files that the installation did not write."""
+    """Return the service's directories in /etc, which may contain other files too."""
     return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the paths in `places` that are not in `files`: certificates, other drop-ins, ..."""
+    """Return the paths in the directories `places` that the installation did not write."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -363,13 +361,12 @@ def uninstalling(
 ) -> list[Step]:
     """Return the steps that remove the service, with a reason for each file that stays.
 
-    `found` gives the present contents of the files in `wanted`. `others` are further paths in the
-    directories of the service, and `stateful` are the units that have a state directory.
+    `found` gives the present contents of the files `wanted`. `others` are further paths in the
+    service's directories. `stateful` are the units that have a state directory.
 
-    A changed file stays unless `force` or `purge` is set. Three kinds of paths stay unless `purge`
-    is set: a changed file with `kept`, the `others`, and the state directories of the `stateful`
-    units. To purge these directories, the steps first install their units again if they are
-    missing.
+    A changed file stays unless `force` or `purge` is set. Only `purge` removes a changed file with
+    `kept`, the `others`, and the state directories. To purge a state directory, the steps first
+    install its unit again if the unit is missing.
     """
     wanted, stateful = list(wanted), list(stateful)
     # systemd knows the real path of a state directory, but only while the unit is installed. An
@@ -387,8 +384,8 @@ def uninstalling(
         elif not force:
             why[file.path] = "it has been edited; --force removes it"
     if any(path.name == UNIT for path in why):
-        # The daemon's unit stays and may start again. Then it needs the program that sends zeros
-        # after the daemon's end.
+        # The daemon's unit stays and may start again. Then it needs `acsard-stop`, which sends
+        # zeros after the daemon's end.
         why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
     steps: list[Step] = [
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
@@ -407,7 +404,7 @@ def uninstalling(
 
 
 def state(unit: str) -> str:
-    """Return systemd's report about a unit as lines `NAME=value`; "" if systemd does not answer."""
+    """Return the state of a unit as lines `NAME=value`; "" if systemd does not answer."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
         done = called(("systemctl", "show", unit, about), 10.0)
@@ -417,7 +414,7 @@ def state(unit: str) -> str:
 
 
 def source() -> Path:
-    """Return the directory `deploy/`, which is inside the package or beside it in a clone."""
+    """Return the directory `deploy/`, which is in an installed package or beside it in a clone."""
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
     if inside.is_dir():
@@ -429,6 +426,6 @@ def source() -> Path:
 
 
 def _reference() -> Path:
-    """Return the reference configuration, which is beside `deploy/` in a clone."""
+    """Return the path of the reference configuration, which is beside `deploy/` in a clone."""
     inside = source() / "acsard.toml"
     return inside if inside.is_file() else source().parent / "acsard.toml"

@@ -1,23 +1,23 @@
 """The black box: records the inputs and the outputs of every control step, and replays them.
 
-The pure modules:
+These modules are pure, so they do no I/O:
 - `recorded_steps`: one step as a recording stores it.
 - `rows`: encodes and decodes batches of steps, and refuses values that no daemon records.
 - `replay`: runs recorded inputs through `Robot.step` again and compares the outputs.
 - `replay_text`: describes the result of a replay in lines of text.
-- `unpickling`: rebuilds a robot from bytes that a stranger may have written.
+- `state`: encodes a `Robot` as bytes, decodes it, and applies another configuration to it.
+- `unpickling`: rebuilds a `Robot` from bytes that a stranger may have written.
 - `timeline`: describes a recording in sentences.
 - `retention`: decides which recordings are deleted and which are retained.
-- `published`: rebuilds the messages that were published.
+- `published`: rebuilds the messages that the robot published.
 
-The modules that do I/O:
+These modules do I/O:
 - `recorder`: queues the steps of the control loop. `step_writer` writes them in a thread.
 - `directory`: limits the directory of recordings in bytes and in days.
 - `file`: writes and reads one MCAP file; `mcap_records` and `end_record` are its parts.
 - `series`: finds the recordings of a range of time, and joins the files of one run of the daemon.
 - `time_span`: reads the times that a person types, and finds them in a recording.
 - `recovery`: finishes a file that was cut off.
-- `state`: encodes a robot as bytes, decodes it, and applies another configuration to it.
 - `file_replay`: replays a file, and compares the two copies of each event in it.
 - `export`: writes files for other programs. `atomic_output` renames each when it is complete.
 """

@@ -26,7 +26,7 @@ BAG_SUFFIXES = (".mcap", ".db3")
 
 
 def never(recording: Recording) -> bool:
-    """Return False, so that no recording is replaced. This is the default of `replacing`."""
+    """Return False for every recording, so that `replacing` replaces none by default."""
     return False
 
 

@@ -5,6 +5,7 @@
     000012-20261121T070027Z.near.mcap   finished, less than a minute from an incident
     000012-20261121T070027Z.kept.mcap   finished, and an incident happened in it
 
+An incident is a crash of the daemon, or one of the `INCIDENTS` in step_writer.py, such as a fault.
 The number gives the order of the files, even if the wall clock was adjusted in between.
 `retention.py` decides which files are deleted.
 """
@@ -46,8 +47,9 @@ OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
 """Modes of the directory and its files when the daemon records as a systemd service.
 
 Every user may read them. That is safe because only root can enter the parent directory. The systemd
-unit of the robot's web page mounts this directory read-only. A group cannot give that unit access:
-a dynamic group has no name, and on the disk systemd 257 gives a state directory to the user nobody.
+unit of the robot's web page mounts this directory read-only. Group permissions cannot give that
+unit access, because a dynamic group has no name, and systemd 257 makes the user nobody the owner of
+state directories.
 """
 
 PRIVATE = Path("/var/lib/private")
@@ -59,22 +61,22 @@ WHOLE = ".mcap"
 PART = ".mcap.part"
 
 MARKER = ".left"
-"""Suffix of the marker file that says that a `.part` file was not cut off by a crash."""
+"""Suffix of a marker file, which says that the disk, and not a crash, cut off a `.part` file."""
 
 ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
 
 TRIM_ROUNDS = 600
-"""Number of calls of `tend`, one each second, between two searches for files that are too old.
+"""Number of calls of `Ring.tend`, one each second, between two searches for files that are too old.
 
-Ten minutes are short enough, because a file may cover an hour.
+These ten minutes are short enough, because a file may cover an hour.
 """
 
 S_PER_DAY = 86400
 
 FRESH_S = 10.0
-"""Time since the last write, s, after which a `.part` file does not count as being recorded.
+"""Time without a write, s, after which a `.part` file no longer counts as being recorded.
 
-A daemon writes once a second. A disk that hangs for longer than this is reported in the log.
+A daemon writes once a second, and its log reports a disk that hangs.
 """
 
 STAMP = "%Y%m%dT%H%M%SZ"
@@ -114,10 +116,11 @@ def _stem(path: Path) -> str:
 
 
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """Mark a `.part` file whose end could not be written, so that it does not count as a crash.
+    """Create a marker file for a `.part` file whose end could not be written.
 
-    The marker is an empty file, and its name holds the retention class `kind` and the cause `cut`.
-    Even a full disk usually accepts a new name. Raises `OSError` if it does not.
+    Without the marker, the next start would treat the file as cut off by a crash. The marker is an
+    empty file whose name holds the retention class `kind` and the cause `cut`. Even a full disk
+    usually accepts a new name. Raises `OSError` if the disk does not.
     """
     part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
 
@@ -137,10 +140,10 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State that lasts as long as the daemon. After a disk error a new `Ring` takes it over."""
+    """State that lasts until the daemon ends. After a disk error the next `Ring` takes it over."""
 
     numbers: set[int] = field(default_factory=set)
-    """Numbers of the files that ended in this run of the daemon."""
+    """Numbers, from their names, of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
     """Maps the name of each file that a disk error cut off in this run to its retention class.
 
@@ -259,7 +262,7 @@ class Ring:
         os.close(self._lock)
 
     def begin(self, about: About) -> Writing:
-        """Begin a new file, with a number above the number of every other file."""
+        """Create a new file, whose number is one above the largest number in the directory."""
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
         stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
@@ -272,7 +275,8 @@ class Ring:
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
         """Finish a file, rename it for its retention class `kind`, and return its new path.
 
-        `cut` and `why` say how the daemon ended, as in `Writing.finish`.
+        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS`, and `why` may
+        explain that cause. Otherwise both are "".
         """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
@@ -300,9 +304,10 @@ class Ring:
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
-        """Trim the directory every ten minutes, and whenever the disk is nearly full.
+        """Delete old files every ten minutes, and whenever the disk is nearly full.
 
-        Also detect jumps of the wall clock. Call this method once a second.
+        After a jump of the wall clock, also correct the times of the files of this run. Call this
+        method once a second.
         """
         jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
@@ -325,9 +330,10 @@ class Ring:
                     os.utime(path, ns=(found.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Delete the files that exceed the limits in bytes or in age.
+        """Delete files that exceed the limits of total size, of age or of free disk space.
 
-        The file that is being written is never deleted.
+        A file that is being written is never deleted. This method also sets `file_bytes`, the size
+        above which the present file should end.
 
         Args:
             now: the present time, or None if it is not known; then no file counts as too old.

@@ -1,4 +1,7 @@
-"""The metadata record at the end of a recording: its times, its summary and how it was cut off."""
+"""The metadata record at the end of a finished recording.
+
+It holds the times of the recording, a summary of its events, and the cause if it was cut off.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +26,11 @@ END = "acsard end"
 TAIL_BYTES = 1 << 16
 """Number of bytes at the end of a file in which the end record is searched for.
 
-The end record of a plain recording begins 1960 bytes before the end of the file.
+The end record of a typical recording begins 1960 bytes before the end of the file.
 """
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
-"""The name of the end record with its length. These bytes follow the head of the record."""
+"""Length and name of the end record. In the file, these bytes follow the head of the record."""
 
 _FOOTER = HEAD.pack(Opcode.FOOTER, 20)
 """Head of the MCAP footer, which has 20 bytes."""
@@ -45,7 +48,7 @@ CUTS = {
     "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut, or still being recorded, when it was recovered",
 }
-"""Maps each cause for which a recording has no ordinary end to its description.
+"""Maps each cause that cuts off a recording to its description.
 
 For the cause `bug`, the failing daemon itself finishes the file. For every other cause, the file is
 finished later.
@@ -53,7 +56,10 @@ finished later.
 
 
 class EndRecord(Struct, frozen=True):
-    """Content of the last metadata record. To list recordings, only this record is read."""
+    """Content of the metadata record at the end of a recording.
+
+    A list of recordings needs only this record of each file.
+    """
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
@@ -67,7 +73,7 @@ class EndRecord(Struct, frozen=True):
     cut: str = ""
     """Why the recording was cut off: a key of `CUTS`, or "" if it ends with an ordinary end."""
     why: str = ""
-    """For the cause `bug`: the step in which the daemon failed, and the exception."""
+    """For the cause `bug`, the step in which the daemon failed and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
     """Earliest wall-clock time of a message, ns since 1970; None if it is not known.
 
@@ -100,8 +106,8 @@ def as_metadata(last: EndRecord) -> dict[str, str]:
 def read_end(path: Path) -> EndRecord | None:
     """Read the end record of a file. Return None if it has no end record or cannot be read.
 
-    This function reads only the last `TAIL_BYTES`. It does not follow the index, and it does not
-    unpack chunks, because the lengths in a forged file may claim gigabytes.
+    This function reads only the first bytes and the last `TAIL_BYTES`. It does not follow the MCAP
+    index or unpack chunks, because a forged file may claim lengths of gigabytes.
     """
     try:
         with path.open("rb") as stream:

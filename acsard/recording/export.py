@@ -1,9 +1,9 @@
 """Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV.
 
 In the CSV table each feedback line and each gyro sample has its own row. The columns for `acsard
-calibrate` come first. The pose from odometry is in the columns `odom_...`. Calibration does not use
-these columns as a measured position: odometry is computed from the wheels, and calibration must not
-compare the wheels with themselves.
+calibrate` come first. The columns `odom_...` hold the pose from odometry. Calibration must not use
+them as a measured position: odometry is computed from the wheels, so calibration would compare the
+wheels with themselves.
 """
 
 from __future__ import annotations
@@ -125,8 +125,10 @@ def _quoted(text: str) -> str:
 
 
 MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
-"""Columns that calibration reads. `t` is the wall-clock time, s since 1970. `yaw_rate` is from a
-gyro, and the others are the speeds of the wheels.
+"""Columns that calibration reads.
+
+`t` is the wall-clock time, s since 1970. `yaw_rate` is from a gyro. The others are the speeds of
+the wheels: front right, front left, rear left and rear right.
 """
 
 OUTPUT_COLUMNS = (
@@ -166,16 +168,16 @@ def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def wheel_columns(estimate: Estimate) -> str:
-    """Return the measured columns of one feedback line: time, wheel speeds, no yaw rate."""
+    """Return the columns of `MEASURED` for a feedback line. The yaw rate is empty."""
     wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
     return f"{_csv_seconds(estimate.at.wall_ns)},{wheels},"
 
 
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
-    """Return the measured columns of a gyro sample.
+    """Return the columns of `MEASURED` for a gyro sample. The wheel speeds are empty.
 
-    The time is the sample's stamp. For a sample without a stamp it is the arrival of the sample,
-    converted from the monotonic clock to the wall clock. `now` gives the offset of the two clocks.
+    The time is the sample's stamp. Without a stamp it is the sample's arrival, converted from the
+    monotonic clock to the wall clock with the offset of the two clocks at `now`.
     """
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
@@ -198,7 +200,7 @@ class ExportResult(Struct, frozen=True):
     count: int
     """Number of messages, or of rows of a CSV table."""
     gaps: list[Gap]
-    """The gaps of the recording that overlap the time span. Their steps are not exported."""
+    """Gaps of the recording that overlap the exported time span. Their steps are missing."""
 
 
 class _Writer:
@@ -219,7 +221,10 @@ class _Writer:
         """
 
     def end(self, ending: str = "") -> None:
-        """Write the log lines after the last step; `ending` is as in `TimelineWriter.end`."""
+        """Write the log lines after the last step.
+
+        `ending` says how the recording was cut off; it is "" if the daemon ended normally.
+        """
 
     def finish(self) -> None:
         """Write the end of the file."""

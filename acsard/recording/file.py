@@ -3,9 +3,10 @@
 A file has four channels:
 - `steps`: batches of steps, as `rows.py` encodes them.
 - `events`: one event per message, in JSON.
-- `state`: the robot between two steps, as `state.py` encodes it. Each of these messages has its own
-  chunk. Therefore damage to a chunk of steps does not destroy a state, and damage to a state does
-  not destroy steps. A file that begins after the daemon's start has a `state` message first.
+- `state`: the complete `Robot` object between two steps, as `state.py` encodes it. Each of these
+  messages has its own chunk. Therefore damage to a chunk of steps does not destroy a state, and
+  damage to a state does not destroy steps. A file that begins after the daemon's first step has a
+  `state` message first.
 - `unfinished`: the inputs of the step in which the daemon failed.
 
 A metadata record names the robot and the version of acsard, and an attachment holds the
@@ -56,9 +57,9 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import INCIDENTS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
-"""Longest time that a chunk covers, ns.
+"""Longest time that an MCAP chunk covers, ns.
 
-Longer chunks save little space, and more data is lost if one of them is damaged.
+Longer chunks would save little space, and damage to a chunk would destroy more data.
 """
 
 CHUNK_BYTES = 1 << 20
@@ -141,9 +142,9 @@ class EndRecordBuilder:
         """True if the messages so far include the daemon's first step."""
 
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Process a message of any channel; `wall_ns` is its wall-clock time, ns since 1970.
+        """Add a message of any channel; `wall_ns` is its wall-clock time, ns since 1970.
 
-        For a message of the channel `events`, call `event` as well.
+        The caller must also pass each message of the channel `events` to `event`.
         """
         self._last_ns = max(self._last_ns, wall_ns)
         self._earliest_ns = min(self._earliest_ns, wall_ns)
@@ -196,7 +197,6 @@ class Index:
         counts[channel] = counts.get(channel, 0) + 1
 
     def chunk(self) -> None:
-        """Count a chunk."""
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
@@ -320,7 +320,8 @@ class Writing:
     def finish(self, cut: str = "", why: str = "") -> None:
         """Write the end of the file and close it.
 
-        `cut` and `why` say how the daemon ended, as in `EndRecordBuilder.end_record`.
+        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS`, and `why` may
+        explain that cause. Otherwise both are "".
         """
         self.end_chunk()
         for record in self._about:
@@ -395,15 +396,14 @@ class Recording:
         self.ended = False
         """True if the file is finished. This is known only after `messages` was read to its end.
 
-        It is also true if damage separates the end of the file from the readable messages.
-        `damaged` counts such damage.
+        It is also true if the data just before the end is damaged. `damaged` counts that damage.
         """
         self.damaged = 0
-        """Number of damaged places, mostly chunks, that have readable data after them."""
+        """Number of damaged places, mostly MCAP chunks, that have readable data after them."""
         self.cut = ""
         """Key of `CUTS` if the daemon did not end in the ordinary way, else ""."""
         self.why = ""
-        """For the cause `bug`: the step in which the daemon failed, and the exception."""
+        """For the cause `bug`, the step in which the daemon failed and the exception, else ""."""
         self.unfinished: bytes | None = None
         """Encoded inputs of the step in which the daemon failed; None if it did not fail."""
         self.about = self._about()
@@ -437,7 +437,7 @@ class Recording:
         return "; ".join(filter(None, [damaged, self.ending]))
 
     def compute_end_record(self) -> EndRecord:
-        """Build an end record from all messages of the recording. Its `cut` is ""."""
+        """Build an end record from all messages of the recording, with "" as its cause `cut`."""
         builder = EndRecordBuilder(self.about)
         for topic, wall_ns, data in self.messages():
             builder.message(topic, wall_ns, data)
@@ -477,7 +477,7 @@ class Recording:
     def _about(self) -> About:
         metadata: dict[str, str] = {}
         config, intact = None, False
-        # If the beginning is damaged, the copies at the end of a finished file are as good.
+        # If the beginning is damaged, read the copies at the end of a finished file.
         is_finished = end_in(self._data) is not None
         for place in walk(self._data):
             record = place.record
@@ -531,9 +531,9 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def is_part(part: Recording, recording: Recording) -> bool:
-    """Return whether `recording` has the same metadata as `part` and contains all its messages.
+    """Return whether `recording` has the metadata and all the messages of `part`.
 
-    Then `recording` may replace `part`.
+    If so, no data is lost when `recording` replaces `part`.
     """
     if part.about != recording.about:
         return False

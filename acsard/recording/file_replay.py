@@ -1,6 +1,6 @@
 """Replays a recording file, from its first step to its end.
 
-After a damaged place the replay goes on with the next state of the robot in the file.
+After a damaged place the replay goes on at the next point for which the file has the robot's state.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def no_progress(wall_ns: int) -> None:
 INCOMPLETE_STATE_ERRORS = (
     AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError
 )  # fmt: skip
-"""Exceptions in the code of a robot whose recorded state lacks parts that this version expects."""
+"""Exceptions that the robot's code raises if its recorded state lacks parts that it expects."""
 
 
 class Gap(Struct):
@@ -62,7 +62,7 @@ class Gap(Struct):
     unreadable: int = 0
     """Number of steps that cannot be read, as far as the step numbers show it."""
     skipped: int = 0
-    """Number of steps that are readable, but not replayed: they precede the next robot state."""
+    """Number of readable steps before the next state of the robot, which are not replayed."""
     lines: int = 0
     """Number of lines to the board in the skipped steps."""
     end_lost: bool = False
@@ -146,7 +146,7 @@ class _Source:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._state: State | None = None
-        """The last robot that was decoded from the file; None if the robot is a new one."""
+        """The last robot that was decoded from the file; None if the replay uses a new one."""
         self._left = MAX_BYTES
         """Total size of the states that may still be decoded after gaps, bytes."""
         for path in recording.paths:
@@ -178,10 +178,10 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Decode the robot in `saved` if it is the robot before the step `number`.
+        """Decode the robot in the checkpoint `saved` if it was made just before the step `number`.
 
-        Returns None if it is not, if this version cannot read it, or if the states that were
-        decoded after gaps exceed their limit in size.
+        Otherwise return None. Also return None if this version cannot read the robot, or if the
+        states that were decoded after gaps exceed their limit in size.
 
         Args:
             saved: the last checkpoint that was read; None if there is none.
@@ -229,12 +229,12 @@ class RecordedRun(_Source):
         self.copies = EventCopies(recording)
         """Compares the events in the steps with their copies in the channel `events`."""
         self._next, self._state = _first_state(recording)
-        """`_next` is the number of the step before which `robot` is known.
+        """Number of the step that `robot` can replay next, and the recorded robot.
 
-        `_state` is None for a new robot.
+        `_state` is None if the replay begins with a new robot.
         """
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
-        """The robot with which to replay, and its guard's memory. A gap replaces both objects."""
+        """The robot with which to replay, and its guard's memory. Both are replaced after a gap."""
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
@@ -295,7 +295,7 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Continue with the robot in `saved` if it is the robot before the step `number`.
+        """Continue with the robot in `saved` if it is the robot just before the step `number`.
 
         Returns whether the replay can continue.
         """
@@ -369,7 +369,8 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
 class DisplayReplay(_Source):
     """Replay of a recording for display.
 
-    It also replays the steps that come after missing steps and before the next state of the robot.
+    After missing steps it goes on at once with the robot as it was before them. Until the next
+    state of the robot in the file, this robot may differ from the recorded one.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -389,14 +390,14 @@ class DisplayReplay(_Source):
         except RecordingError as error:
             self._state, self.replay = None, Replay(self.config)
             self.notes.append(
-                "the replay begins with a new robot, which knows nothing of the "
-                f"time before: {error}"
+                "the replay begins with a robot that has just started, so it may differ from the "
+                f"recorded one: {error}"
             )
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
         """Yield each recorded step, its replayed outputs, and the robot after the step.
 
-        After a gap the robot differs from the recorded one until the next state in the file.
+        After a gap the robot may differ from the recorded one until the next state in the file.
         Raises `RecordingError` if the recorded state lacks a part that a step uses.
         """
         saved: Checkpoint | None = None
@@ -450,8 +451,8 @@ def _foreign(recording: Recording, reason: str) -> RecordingError:
 class EventCopies:
     """Finds the first copy of an event that differs from the event of its step.
 
-    A file has each event twice: in its step, where the replay checks it, and as a message of the
-    channel `events`, from which the list of recordings makes its summary.
+    A file has each event twice: in its step, where the replay checks the event, and as a message of
+    the channel `events`, from which the summary of the recording is made.
 
     Call `batch` for each batch of steps, `copy` for each message of the channel `events`, both in
     the order of the file, and `end` after the last message.
@@ -471,7 +472,7 @@ class EventCopies:
         """Number of damaged places before the last batch."""
 
     def batch(self, steps: list[Step]) -> None:
-        """Add a batch of steps. `copy` must then be called for the copies of its events."""
+        """Add a batch of steps. Then call `copy` for the copies of its events."""
         self._compare(last=False, follows=self._number in (None, steps[0].number))
         self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [

@@ -1,4 +1,4 @@
-"""The MCAP records of a recording: chunks written second by second, and a reader that skips damage.
+"""Writes MCAP chunks second by second, and reads MCAP records of files that may be damaged.
 
 The head of an MCAP chunk holds the chunk's length and checksum. Most programs therefore write a
 chunk only when it is complete, and a power cut costs the whole chunk. A recording writes its chunk
@@ -45,7 +45,7 @@ PARAMETERS = ZstdCompressionParameters.from_level(
 LAST_BLOCK = b"\x01\0\0"
 """The empty zstd block that ends a chunk.
 
-Appended to a chunk that was cut off after a whole block, it completes the chunk.
+If a chunk was cut off after a whole block, this block completes it.
 """
 
 MAX_CHUNK_BYTES = 1 << 23
@@ -63,10 +63,10 @@ length and name of the compression, compressed size.
 """
 
 _AFTER_LENGTH = _HEAD.size - 9
-"""Number of bytes of the head after the field `length`. The value of this field includes them."""
+"""Number of bytes after the length field of a chunk's head. The length counts these bytes too."""
 
 _NAME_AT = 37
-"""Offset of `ZSTD` in the head."""
+"""Offset of `ZSTD` in the head of a chunk, bytes."""
 
 ZSTD = struct.pack("<I4s", 4, b"zstd")
 """The length and the name of the compression. Every chunk has these bytes in its head."""
@@ -81,10 +81,10 @@ MAX_DATA_BYTES = MAX_MESSAGE_BYTES - _MESSAGE.size
 """Largest size of the data of a message that is read, in bytes."""
 
 _CHECKED = struct.Struct("<HQ")
-"""Channel and time of a message, which its checksum covers besides the data."""
+"""Layout of the channel and time of a message, which its checksum covers besides the data."""
 
 _BESIDE_DATA = _MESSAGE.size - 9
-"""Number of bytes of a message's head after the field `length`, whose value includes them."""
+"""Number of bytes after the length field of a message's head. The length counts these bytes too."""
 
 _LONGEST_FRAME_HEAD = 18
 
@@ -92,7 +92,7 @@ _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed and uncompressed."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Effort that each block counts in addition to its unpacked bytes, bytes.
+"""Allowance for each block in the work of unpacking, which is counted in unpacked bytes.
 
 Unpacking an empty block takes about as long as unpacking 1 KiB of a large block.
 """
@@ -131,7 +131,7 @@ class GrowingChunk:
         """Uncompressed size of the messages so far, in bytes."""
         self._crc = self._length = 0
         self.first_ns, self._last_ns = _ENDLESS, 0
-        """Earliest and latest time of a message, ns since 1970."""
+        """Earliest and latest wall-clock time of a message, ns since 1970."""
         self._out: list[bytes] = []
         """Compressed bytes since the last `take`."""
 
@@ -151,9 +151,9 @@ class GrowingChunk:
         self._out += [self._compressor.compress(head), self._compressor.compress(data)]
 
     def take(self) -> bytes:
-        """Return the compressed bytes of the messages since the last call.
+        """Return the compressed bytes of the messages since the last call of `take`.
 
-        The bytes of all calls, one after the other, contain all messages so far.
+        The concatenated bytes of all calls hold all messages so far.
         """
         self._out.append(self._compressor.flush(COMPRESSOBJ_FLUSH_BLOCK))
         return self._taken()
@@ -185,13 +185,13 @@ class ReadChunk(NamedTuple):
     complete: bool
     """True if the whole chunk can be read."""
     effort: int = 0
-    """Number of bytes that were unpacked, with an allowance for each block."""
+    """Work of reading the chunk: its unpacked bytes, plus `_BLOCK_EFFORT` for each block."""
 
     def head(self, data: bytes) -> bytes:
-        """Return the true head for the readable part of the chunk; `data` is the whole file.
+        """Return a head whose lengths and checksum are those of the readable part of the chunk.
 
-        If `complete` is false, `LAST_BLOCK` must be written at `end`. The lengths in the head
-        include this block.
+        `data` is the whole file. If `complete` is false, the caller must also write `LAST_BLOCK` at
+        the offset `self.end`. The length in the head includes this block.
         """
         times = [message.wall_ns for message in self.messages]
         blocks = _blocks(data[: self.end], self.begin + _HEAD.size)
@@ -303,10 +303,10 @@ MAGIC = b"\x89MCAP0\r\n"
 """Magic bytes at the start of every MCAP file."""
 
 MAX_EFFORT = 256
-"""Largest effort for damaged chunks, in unpacked bytes for each byte of the file.
+"""Limit on the work of unpacking damaged chunks, in unpacked bytes for each byte of the file.
 
-The chunks in the recordings of the tests have an effort of 5 to 13. A damaged chunk is read up to
-three times, and a damaged block in it counts as 128 KiB.
+The chunks in the recordings of the tests take 5 to 13. A damaged chunk is read up to three
+times, and a damaged block in it counts as 128 KiB.
 """
 
 HEAD = struct.Struct("<BQ")
@@ -340,9 +340,9 @@ class Found(NamedTuple):
     chunk: ReadChunk | None
     """The readable part of a chunk; None for other records."""
     end: int
-    """Offset of the end in the file, bytes. After a damaged place, the reader goes on there."""
+    """Offset in the file, bytes, at which this item ends and the reader goes on."""
     damaged: bool = False
-    """True for a damaged place. The torn end of a file that was cut off is not a damaged place."""
+    """True for a damaged place, but false for the torn end of a file that was cut off."""
 
     @property
     def messages(self) -> list[Message]:
@@ -353,8 +353,8 @@ class Found(NamedTuple):
 def walk(data: bytes) -> Iterator[Found]:
     """Yield the records, chunks and damaged places of a file, up to its footer or its end.
 
-    If the damaged chunks need more effort than `MAX_EFFORT` allows, the rest of the file is one
-    damaged place.
+    If unpacking the damaged chunks takes more work than `MAX_EFFORT` allows, the rest of the file
+    is one damaged place.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
     # If the first bytes of a finished file are damaged, its last bytes still identify it.
@@ -417,15 +417,15 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 class _Chunks:
     """Reads chunks, and searches for the next complete chunk without searching a place twice.
 
-    A hostile file may have thousands of incomplete chunks that share their last blocks, so that
-    each takes megabytes to unpack. Therefore the effort for incomplete chunks is limited in
+    In a hostile file thousands of incomplete chunks may share their last blocks, and each chunk
+    then unpacks to megabytes. Therefore the work of unpacking incomplete chunks is limited in
     proportion to the size of the file.
     """
 
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._effort = MAX_CHUNK_BYTES + MAX_EFFORT * len(data)
-        """Effort that is left for incomplete chunks."""
+        """Work that is left for incomplete chunks, in unpacked bytes."""
         self._searched = 0
         """Offset up to which `later` has searched."""
         self._found: int | None = None
@@ -433,14 +433,13 @@ class _Chunks:
 
     @property
     def spent(self) -> bool:
-        """True if no effort is left. From then on `later` returns None."""
+        """True if the work for incomplete chunks exceeds its limit. Then `later` stops too."""
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:
         """Read the chunk whose head begins at the offset `begin`; return None if there is none.
 
-        Each chunk that is incomplete or empty uses up a part of the effort that is allowed for the
-        file.
+        The work of reading an incomplete or empty chunk counts towards the limit for the file.
         """
         chunk = read_chunk(self._data, begin)
         if chunk is not None and not (chunk.complete and chunk.messages):
@@ -448,9 +447,10 @@ class _Chunks:
         return chunk
 
     def later(self, begin: int) -> int | None:
-        """Return the offset of the first complete chunk from `begin` on, or None.
+        """Return the offset of the first complete chunk from the offset `begin` on.
 
-        `begin` must not decrease from call to call.
+        Returns None if no such chunk is found within the limit of work. `begin` must not decrease
+        from call to call.
         """
         if self._found is not None and self._found >= begin:
             return self._found

@@ -2,10 +2,9 @@
 
 `Report`, which the daemon uses too, builds the messages as if a client had subscribed to every
 topic all the time. A recording does not hold the daemon's measurements of itself, so the rows of
-`diagnostics` with such measurements are omitted. The messages of `log` are the entries of the
-timeline, so that `log` agrees with `acsard recording show` and with the report. These entries
-include all events of the robot, and also entries that the robot does not publish, such as `drive`
-and `reason`.
+`diagnostics` with such measurements are omitted. The messages of `log` are the entries of
+`timeline.py`, as in `acsard recording show`. They include all events of the robot, and also entries
+that the robot does not publish, such as `drive` and `reason`.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from acsard.recording.recorded_steps import Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
 MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
-"""Rows of `diagnostics` whose values a recording does not hold."""
+"""Names of the rows of `diagnostics` whose values a recording does not hold."""
 
 
 ROUNDED_NS = 1000
@@ -65,7 +64,7 @@ class Publisher:
         """Time of the last step."""
         self._static: TFMessage | None = None
         self._static_due = True
-        """True if `tf_static` must be built: before the first step, and after a changed setting."""
+        """True if `tf_static` must be built: at the first step, and when a setting has changed."""
 
     def _wanted_keys(self) -> frozenset[str]:
         names = {channel.native for channel in published_channels(left_out(self._config))}
@@ -97,7 +96,10 @@ class Publisher:
         yield from map(self._line, self._timeline.step(step))
 
     def end(self, ending: str = "") -> Iterator[Published]:
-        """Yield the log lines after the last step; `ending` is as in `TimelineWriter.end`."""
+        """Yield the log lines after the last step.
+
+        `ending` says how the recording was cut off; it is "" if the daemon ended normally.
+        """
         yield from map(self._line, self._timeline.end(ending))
 
     def _line(self, entry: TimelineEntry) -> Published:
@@ -129,7 +131,7 @@ class Publisher:
 
 
 def _without_measurements(message: Any) -> Any:
-    """Return the message without the values that a recording does not hold."""
+    """Return the message without the daemon's measurements of itself, which are not recorded."""
     match message:
         case RobotState():
             return replace(message, certificate_expiry="", certificate_days=None, latencies={})

@@ -1,7 +1,7 @@
 """One control step as a recording stores it: all of its inputs, and its outputs.
 
-Poses are stored in um and urad. A checksum covers every bit of all estimates. `rows.py` encodes
-batches of steps.
+Poses from odometry are stored in um and urad. A checksum covers every bit of the exact values.
+`rows.py` encodes batches of steps.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from acsard.core.values import (
 MICRO = 1e6
 
 Status = tuple[str, str, str, str]
-"""Mode, reason, link and source, as in `Outputs`."""
+"""Mode of the robot, its reason in words, state of the link, and commanding source ("" if none)."""
 
 Micropose = tuple[int, int, int]
 """Pose as integers: x and y in um, yaw in urad."""
@@ -48,16 +48,16 @@ class Taken(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The robot as it is before step `number`, so that a new file can begin there.
+    """State of the robot before step `number`, with which a new file can begin.
 
-    If no new file is necessary, the robot is added to the current file as a checkpoint.
+    If no new file is necessary, the state is added to the current file as a checkpoint.
     """
 
     number: int
     state: bytes
     """The robot and its guard, encoded by `state.freeze`; empty for a new robot."""
     config: Config
-    """Configuration before that step. Settings may have changed since the daemon's start."""
+    """Configuration before step `number`. Settings may have changed since the daemon's start."""
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
@@ -80,7 +80,7 @@ class BlackBox(Protocol):
     """Interface of the recorder for the control loop. No method waits for the disk."""
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Record the robot and its guard before the first step."""
+        """Record the state of the robot and of its guard before the first step."""
 
     def step(
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
@@ -111,7 +111,7 @@ class RecordedOutputs(Struct, frozen=True):
     """One pose for each feedback line that odometry accepted."""
     events: tuple[Event, ...] = ()
     checksum: int | None = None
-    """CRC-32 of all estimates of the batch, in its last step; None in the other steps."""
+    """CRC-32 of all exact poses and twists of the batch, in its last step; None in the others."""
     names: int | None = None
     """CRC-32 of all `input_names` of the batch, in its last step.
 
@@ -130,7 +130,7 @@ class Step(Struct, frozen=True):
 
 
 class UnfinishedError(AcsardError):
-    """The bytes are not an unfinished step."""
+    """The bytes do not encode the step in which the daemon failed."""
 
 
 class Unfinished(Struct, frozen=True):
@@ -158,9 +158,9 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Return the CRC-32 `before`, extended over all bits of the poses, twists and wheel angles.
+    """Return the CRC-32 of the poses, twists and wheel angles of estimates, with all their bits.
 
-    `before` is the CRC-32 of the earlier estimates of the batch, or 0 if there is none.
+    The result continues `before`, the CRC-32 of the earlier estimates of the batch, or 0.
     """
     for e in estimates:
         pose, twist = e.pose, e.twist
@@ -191,7 +191,7 @@ def count_superseded(commands: Sequence[Command]) -> int:
 
 
 def status_of(outputs: Outputs) -> Status:
-    """Return the mode, reason, link and source of a step."""
+    """Return the mode, reason, link and source of a step's outputs."""
     return outputs.mode, outputs.reason, outputs.link, outputs.source
 
 

@@ -30,15 +30,15 @@ At 400 steps a second, a disk may hang for 10 s without a loss of steps.
 """
 
 SLOW_NS = 3 * NS_PER_S
-"""Duration of a sync of the recording above which the disk counts as hanging, ns."""
+"""Duration of a sync of the recording above which the log reports a hanging disk, ns."""
 
 SLOW = "the disk has accepted nothing for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Longest part of the time between two steps that is counted as waiting for the disk, ns.
+"""Longest time between two steps that is counted as waiting for the disk, ns.
 
-During a longer pause this process did not run. Then the recorder's thread did not run either, and
-the disk is not the cause.
+Of a longer time only this part is counted. During a longer pause this process did not run, so the
+recorder's thread did not run either, and the disk is not the cause.
 """
 
 FLUSH_S = 0.98
@@ -78,9 +78,9 @@ class Recorder:
         """Number of steps lost because the queue was full."""
         self._full = False
         self._syncs = 0
-        """`StepWriter.syncs` at the last step."""
+        """Value of `StepWriter.syncs` at the last step."""
         self._waited_ns = self._now_ns = 0
-        """Time for which the present sync has lasted, and monotonic time of the last step, ns."""
+        """Duration of the present sync so far, and monotonic time of the last step, ns."""
         self._slow = False
         """True from the report that the disk hangs until the report that it accepts data again."""
         self._lost_before = 0
@@ -100,9 +100,9 @@ class Recorder:
     # These methods run in the control loop's thread.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Begin the first file with this robot and its guard.
+        """Begin the first file with the state of this robot and its guard.
 
-        Without this call, a replay of the first file begins with new ones.
+        Without this call, a replay of the first file begins with a new robot and a new guard.
         """
         self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
 
@@ -189,9 +189,10 @@ class Recorder:
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
-        """Write the last steps and the end of the file if the disk is quick enough.
+        """Write the last steps and the end of the file within `CLOSE_S`.
 
-        If it is not, write a marker that says so, except after a failure of the daemon.
+        If the disk is too slow for this, write a marker that says so, except after a failure of the
+        daemon.
 
         `error` is the exception that ends the daemon, or None for an ordinary end. A
         `BaseException` that is not an `Exception`, such as a `KeyboardInterrupt`, counts as an

@@ -1,7 +1,7 @@
 """Finishes a recording that was cut off: as a copy, or in place if the disk has no room for a copy.
 
 No readable data is thrown away. If this version cannot read a file, or the disk has no room even
-for the end of a file, the file keeps its content.
+for the end of a file, the file is only renamed.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
 
 NOTHING_BYTES = 64 << 10
-"""Largest size of a file that may hold no data, bytes.
+"""Size up to which a file may be without data, bytes.
 
-A larger file has more than a header and one second of steps, so it holds data, even if the data is
-unreadable.
+A larger file has more than a header and one second of steps. It is never deleted, even if its data
+is unreadable.
 """
 
 
@@ -106,7 +106,7 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the end of the file after the last readable second, over the incomplete data there.
+    """Write the end of the file after its last readable second, over the incomplete data there.
 
     Also write the true head of each chunk that still has the head of a growing chunk. If a power
     cut interrupted an earlier recovery after it had written the end, write only the heads.
@@ -143,8 +143,8 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
     """Return the writes that finish a file, each with its offset, and the file's new size.
 
-    `before` is the present content of the file, and `last` is the end record to write. The first
-    write is that of the end, because the disk may have no room for it. The heads follow.
+    `before` is the present content of the file, and `last` is the end record to write. The end of
+    the file comes first, because the disk may have no room for it. The heads of chunks follow.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()

@@ -49,10 +49,10 @@ Output = Literal[
 ]
 """Name of an output whose recorded and replayed values are compared.
 
-`line` is the line that the robot decided, and `sent line` the line that the guard let pass. `event`
-is the name, level, kind or count of an event, and `client` the name of the client in an event.
-`input names` are the names in the inputs of a batch of steps. They are compared by a checksum of
-the whole batch, so a difference belongs to the last step of the batch.
+`line` is the line that the robot decided to send, and `sent line` the line after the check by the
+guard. `event` is the name, level, kind or count of an event, and `client` the name of the client in
+an event. `input names` are the names in the inputs of a batch of steps. They are compared by a
+checksum of the whole batch, so a difference is reported at the last step of the batch.
 """
 
 WORDING: frozenset[Output] = frozenset({"reason", "event text"})
@@ -73,11 +73,11 @@ class Difference(Struct, frozen=True):
 
 
 class Comparison(Struct):
-    """Totals of the replay up to now."""
+    """Counts of all and of equal outputs in the replay so far, and the first differences."""
 
     steps: int = 0
     lines: int = 0
-    """Number of steps in which the recording, the replay or both have a line."""
+    """Number of steps that have a line to the board in the recording, in the replay or in both."""
     lines_same: int = 0
     poses: int = 0
     poses_same: int = 0
@@ -89,18 +89,18 @@ class Comparison(Struct):
     """Number of compared events: for each step, the larger of the recorded and replayed numbers."""
     events_same: int = 0
     exact: bool = True
-    """True if every checksum so far matches. Then all estimates are equal to the last bit."""
+    """True if every checksum so far matches, so that all poses are equal to the last bit."""
     first: Difference | None = None
     first_by_output: dict[Output, Difference] = {}
-    """First difference of each output that differs."""
+    """Maps each output that differs to the first step in which it differs."""
     fault: Difference | None = None
-    """First step in which the replay is in fault and the recording is not."""
+    """First step in which only the replayed robot is in the mode `fault`."""
     apart: float = 0.0
     """Largest distance between the recorded and the replayed pose, m."""
     fastest: tuple[int, int] = (0, 0)
-    """Speed of the fastest wheel in any line, recorded and replayed, in hundredths of rad/s."""
+    """Highest wheel speed in any line, recorded and replayed, in hundredths of rad/s."""
     end: tuple[Micropose, Micropose] | None = None
-    """The last recorded pose, and the replayed pose at the same step."""
+    """The last recorded pose, and the replayed pose at the same step; None before any pose."""
 
     @property
     def same(self) -> bool:
@@ -116,8 +116,8 @@ class Comparison(Struct):
 def replay_step(robot: Robot, step: Step) -> Outputs:
     """Run a recorded step on the robot, and return its outputs.
 
-    The robot's counters of sent and superseded lines and of superseded commands are increased as
-    the daemon's control loop increased them during the recorded step.
+    Also increase the robot's counters of sent lines, superseded lines and superseded commands, as
+    the daemon's control loop did in the recorded step.
     """
     recorded, inputs = step.recorded, step.inputs
     if superseded := count_superseded(inputs.commands):
@@ -149,7 +149,7 @@ class Replay:
         """The last replayed pose."""
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
-        """Continue with another robot and its guard's memory, for example after missing steps."""
+        """Continue with another robot and the memory of its guard, for example after a gap."""
         self.robot = robot
         self._config = robot.config
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
@@ -185,7 +185,7 @@ class Replay:
     def _keep(self, difference: Difference) -> None:
         """Store the difference if it is the first one, the first of an output, or the first fault.
 
-        A fault is stored only if the recording is not in fault at that step.
+        A fault counts only if the recorded robot is not in fault at that step.
         """
         comparison = self.comparison
         comparison.first = comparison.first or difference

@@ -62,7 +62,7 @@ def explain_verdict(other: bool) -> str:
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
     """Describe in a sentence how much the gaps leave out, or return "" if there is no gap.
 
-    `how` says what did not happen to the steps in the gaps, for example "not compared".
+    The sentence begins with `how`, which says what the gaps prevented, for example "not compared".
     """
     if not gaps:
         return ""
@@ -84,7 +84,7 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
 
 
 def describe_difference(difference: Difference, began_ns: int) -> list[str]:
-    """Return lines of text that show the recorded and the replayed outputs of a step.
+    """Return lines of text with the recorded and the replayed outputs of the first differing step.
 
     `began_ns` is the monotonic time at which the recording began, ns.
     """

@@ -1,10 +1,11 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
-A recording is protected if an incident happened in it, or within a minute of it. Protected
-recordings are deleted last. The total size of all recordings is limited, and a part of the disk
-(`Disk.spare`) is left to other programs. If less than that part is free, old unprotected recordings
-are deleted, but not the newest recording. Protected recordings and the newest one are deleted only
-if less than a fifth of that part is free, or if the limit of the total size is exceeded.
+A recording is protected if an incident, such as a fault, happened in it or within a minute of it.
+Protected recordings are deleted last. The total size of all recordings is limited, and a part of
+the disk (`Disk.spare`) is left to other programs. If less than that part is free, old unprotected
+recordings are deleted, but not the newest recording. Protected recordings and the newest recording
+are deleted only if less than a fifth of `Disk.spare` is free, or if the limit of the total size is
+exceeded.
 
 `ClockWatch` decides whether the wall clock can be trusted for the age of a recording.
 """
@@ -31,16 +32,16 @@ AROUND_NS = 60 * NS_PER_S
 """Time before and after an incident within which recordings are retained, ns."""
 
 KEPT_FILES = 50
-"""Largest number of recordings with an incident that are protected. The newest are chosen."""
+"""Largest number of `kept` recordings that are protected. Older ones count as unprotected."""
 
 FILES = 100
-"""The largest size of a file is the total size divided by this number.
+"""Number of recording files of the largest size that fit into the allowed total size.
 
-Then 50 protected files take about half of the total size.
+Then the 50 protected files take about half of the total size.
 """
 
 LEAST_BYTES = 100_000
-"""Size up to which a file may grow even on a small disk, bytes."""
+"""Size up to which a recording file may grow even if the disk is nearly full, bytes."""
 
 SPARE = 0.05
 """Fraction of the disk that is left to other programs, but at most `SPARE_BYTES`."""
@@ -71,7 +72,7 @@ class Disk(NamedTuple):
 
     @property
     def low(self) -> bool:
-        """True if less is free than the recordings leave to other programs."""
+        """True if less than `spare` is free."""
         return self.free < self.spare
 
 
@@ -147,7 +148,7 @@ def to_delete(
 
 
 def _protected(ended: Sequence[Ended]) -> set[str]:
-    """Return the names of the newest recordings with an incident, and of those near them."""
+    """Return the names of the newest `kept` recordings and of the `near` recordings around them."""
     kept = {file.name for file in [file for file in ended if file.kind == "kept"][-KEPT_FILES:]}
     return {
         file.name
@@ -159,7 +160,7 @@ def _protected(ended: Sequence[Ended]) -> set[str]:
 
 
 def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    """Yield groups of recordings with consecutive numbers, without the `plain` recordings."""
+    """Yield the recordings that are not `plain`, in groups with consecutive numbers."""
     group: list[Ended] = []
     for file in ended:
         if file.kind == "plain":
@@ -207,7 +208,7 @@ class IncidentWindow(Generic[File]):
         self.kind: Kind = "plain"
         """Retention class of the file that is being written."""
         self._recent: list[tuple[File, int]] = []
-        """Plain files that ended less than a minute ago, each with its end time."""
+        """Plain files that ended less than a minute ago, each with the time of its end, ns."""
         self._happened_ns = -AROUND_NS
 
     def begin(self, now_ns: int) -> None:
@@ -215,7 +216,7 @@ class IncidentWindow(Generic[File]):
         self.kind = "near" if now_ns - self._happened_ns < AROUND_NS else "plain"
 
     def happened(self, now_ns: int) -> list[File]:
-        """Retain the current file because of an incident at the monotonic time `now_ns`, ns.
+        """Register an incident at the monotonic time `now_ns`, ns. The current file becomes `kept`.
 
         Returns the plain files that ended less than a minute before the incident. The caller must
         retain them too.

@@ -1,10 +1,9 @@
 """Encodes steps as rows, in batches of about one second, and decodes them.
 
-A row is one step. Its numbers are differences from the previous row or from the previous tick of
-the control loop's clock. Similar steps therefore give equal bytes, which the compression of a chunk
-then removes. Each batch can be decoded alone, and decoding returns every `Step` exactly as it was
-encoded. A file may come from a stranger, so `decode` refuses a batch with values that no daemon
-records.
+A row is one step. Its times and poses are differences from earlier ones. Similar steps therefore
+give equal bytes, which compress well. Each batch can be decoded alone, and decoding returns every
+`Step` exactly as it was encoded. A file may come from a stranger, so `decode` refuses a batch with
+values that no daemon records.
 
 If you change one of these structs, change `FORMAT` as well.
 """
@@ -49,12 +48,15 @@ MAX_ROWS = 4096
 """Largest number of rows in a batch. The recorder's queue never holds more steps."""
 
 MAX_TIME_NS = 1 << 61
-"""Largest time since the computer's start, and largest age of a serial read, ns: 73 years."""
+"""Bound on the age of a serial read and on a lateness, ns: 73 years.
+
+A monotonic time may be up to twice as large.
+"""
 
 MAX_OFFSET_NS = 1 << 62
-"""Largest offset of the wall clock from the monotonic clock, ns. A recording reaches it in 2116.
+"""Bound on the offset of the wall clock from the monotonic clock, ns. Clocks reach it in 2116.
 
-The sum of such an offset, a time and an age fits in 64 bits.
+The sum of such an offset and a monotonic time fits in 64 bits.
 """
 
 
@@ -66,7 +68,7 @@ class Rare(Struct, frozen=True, omit_defaults=True):
     """Values that most steps do not have.
 
     None in `opened`, `trouble` or `status` means that the value of the previous row still applies.
-    `guard_trip` is the input that says why the guard replaced the previous line.
+    `guard_trip` says why the guard replaced the line of the previous step, or is "".
     """
 
     opened: int | None = None
@@ -92,7 +94,7 @@ class Read(NamedTuple):
     age: int
     """Time from the read to the step that processes the bytes."""
     offset: int
-    """Offset of the wall clock at the read, encoded as in `Row.offset`."""
+    """Offset of the wall clock from the monotonic clock at the read, minus `Batch.offset_ns`."""
     data: bytes
 
 
@@ -105,7 +107,7 @@ class Row(Struct, frozen=True, array_like=True):
     shutting_down: bool
     superseded: bool
     now: int
-    """Time since the previous tick of the batch, or since `Batch.mono_ns` before the first tick."""
+    """Time since the previous row of the batch with a true `tick`, else since `Batch.mono_ns`."""
     offset: int
     """Offset of the wall clock from the monotonic clock, minus `Batch.offset_ns`."""
     reads: tuple[Read, ...]
@@ -113,7 +115,7 @@ class Row(Struct, frozen=True, array_like=True):
     sent: bytes | bool
     """True if `line` was sent, False if no line was sent, or the bytes that were sent instead."""
     poses: tuple[Micropose, ...]
-    """Poses, each minus the previous pose of the batch. The first pose is unchanged."""
+    """Poses in um and urad, each minus the previous pose of the batch. The first is unchanged."""
     rare: Rare | None
 
 
@@ -127,12 +129,15 @@ class Batch(Struct, frozen=True, array_like=True):
     offset_ns: int
     """Offset of the wall clock from the monotonic clock at the first step, ns."""
     unit: Annotated[int, Meta(ge=1)]
-    """Common divisor of all times, ns. Many clocks count in us, and then it is 1000 or more."""
+    """Common divisor of all times, ns. It is at least 1000 if the clocks count in us."""
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
-    """CRC-32 of all estimates of the batch."""
+    """CRC-32 of all estimates (pose, twist and wheel angles) of the batch."""
     names: int | None = None
-    """CRC-32 of all names in the inputs of the batch; None if an older version recorded it."""
+    """CRC-32 of all names of sources, senders and clients in the inputs of the batch.
+
+    None if an older version recorded the batch.
+    """
 
 
 class _First(Struct, frozen=True, array_like=True):
@@ -311,7 +316,7 @@ def _sent(row: Row) -> bytes | None:
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
     """Return the instant at `mono_ns`; raise `ValueError` if one of its times is out of range.
 
-    `offset` is the offset of the wall clock, encoded as in `Row.offset`.
+    `offset` is `Row.offset` or `Read.offset`.
     """
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
@@ -320,7 +325,7 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
 
 
 def _require_finite(rare: Rare) -> None:
-    """Raise `ValueError` for a NaN or an infinity. The robot itself checks the commands."""
+    """Raise `ValueError` for a NaN or an infinity, except in commands, which the robot checks."""
     for request in rare.requests:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):

@@ -1,8 +1,8 @@
-"""Maps a range of time to the recordings in a directory, and reads the files of a drive as one.
+"""Finds the recordings of a range of time in a directory, and reads the files of a drive as one.
 
-A rotation splits the recording of one run of the daemon into files. The last step of a file and the
-first step of the next one have consecutive numbers. Files with this property are one `Series`, so
-that a drive or a replay goes on across a rotation.
+The daemon splits the recording of one run into several files. The last step of a file and the first
+step of the next one have consecutive numbers. Such files are read as one `Series`, so that a drive
+or a replay goes on from file to file.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ from acsard.recording.time_span import Contents, Span, clock, part_between, read
 MARGIN_S = 60.0
 """Tolerance for the times in an end record, s.
 
-A file is read completely if it covers a time within this tolerance of the searched range. The
-tolerance is necessary because the end record gives only the time at which the last message began,
-and messages are long if the disk is slow. The pause between two files of one series is also shorter
-than this.
+A file is read completely if the times in its end record are within this tolerance of the searched
+range. The end record gives only the time at which the last message began, and messages are long if
+the disk is slow. The pause between two files of one series is also shorter than this.
 """
 
 GAP_S = 2.0
@@ -43,7 +42,11 @@ class Series(Recording):
         self.paths = list(paths)
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the messages of all files as `Recording.messages` does."""
+        """Yield the topic, the wall-clock time in ns since 1970 and the bytes of each message.
+
+        The messages of all files come in order. `ended`, `cut`, `why` and `unfinished` are those of
+        the last file, and `damaged` counts the damaged places of all files.
+        """
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
         for path in self.paths:
@@ -71,7 +74,7 @@ class Search(Struct):
     unreadable: list[str] = field(default_factory=list)
     """A sentence for each file that cannot be read."""
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    """Begin and end of each time in the range in which nothing was recorded, s since 1970."""
+    """Beginning and end of each time in the range without a recording, s since 1970."""
 
 
 class NothingRecordedError(AcsardError):
@@ -137,7 +140,8 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
     """Return the indices in `files` of the chosen files, grouped into series.
 
-    Each group begins with the files that `_earlier` adds.
+    If a drive is under way at the beginning of a group, the group also has the files before it
+    that contain the beginning of the drive.
     """
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
@@ -183,7 +187,7 @@ def _covered(path: Path) -> _Piece:
 
 
 def _present(path: Path) -> Path:
-    """Return the present path of a recording. The daemon renames each file that it finishes."""
+    """Return the present path of a recording, which the daemon may have renamed at its end."""
     if path.exists() or not path.parent.is_dir():
         return path
     stem = path.name.partition(".")[0]
@@ -191,7 +195,7 @@ def _present(path: Path) -> Path:
 
 
 def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
-    """Return the sentence that nothing was recorded, with the nearest recordings."""
+    """Return a sentence which says that nothing was recorded, and names the nearest recordings."""
     before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
     after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
     text = f"nothing was recorded {in_words(first, last)}"

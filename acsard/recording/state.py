@@ -1,13 +1,13 @@
-"""Encodes a robot between two steps as bytes, decodes it, and applies another configuration to it.
+"""Encodes a `Robot` between two steps, decodes it, and applies another configuration to it.
 
-A file that begins during a drive begins with such a robot. Every file has another one about every
-20 s, from which a replay goes on after a damaged place.
+A file that begins during a drive begins with an encoded robot. In every file further ones follow
+about every 20 s, so that a replay can go on after a damaged place.
 
 `freeze` uses pickle, which encodes a robot in a fraction of a millisecond. `thaw` does not use
 pickle, because a forged file could run code through it. It uses `unpickling.py`, which makes only
 plain values and the robot's own parts.
 
-`adopt` lets a drive be replayed from its middle with another configuration.
+With `adopt`, a drive can be replayed from its middle with another configuration.
 """
 
 from __future__ import annotations
@@ -65,7 +65,10 @@ class StateError(AcsardError):
 
 
 class State(NamedTuple):
-    """A robot and its guard's memory. The next steps depend only on these and on their inputs."""
+    """A robot and the memory of its guard.
+
+    The outputs of the next steps depend only on these two and on the inputs of those steps.
+    """
 
     robot: Robot
     memory: Memory
@@ -123,7 +126,7 @@ def thaw(data: bytes) -> State:
 
 
 def short(error: Exception) -> str:
-    """Return the error's text, shortened and printable, because it may quote a forged file."""
+    """Return the text of an error, shortened and printable, because it may quote a forged file."""
     return printable(str(error))[:MAX_TEXT]
 
 
@@ -176,7 +179,7 @@ class _Walk:
     def into(self, now: Any, begun: Any, other: Any) -> None:
         """Merge the attributes of the object `now` in place.
 
-        `now`, `begun` and `other` are the same object in the three robots of `adopt`.
+        `now`, `begun` and `other` are the corresponding objects of the three robots in `adopt`.
         """
         if id(now) in self._visited:
             return
@@ -196,7 +199,7 @@ class _Walk:
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
         """Return the merged value of an attribute: `now`, perhaps with changed parts, or `other`.
 
-        `now`, `begun` and `other` are the values of the attribute in the three robots of `adopt`.
+        `now`, `begun` and `other` are the values of the attribute in the three robots in `adopt`.
         """
         if type(now) is not type(other):
             return other if _same(now, begun) else now

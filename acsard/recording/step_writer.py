@@ -37,11 +37,11 @@ BATCH = 256
 """Largest number of steps in one message. A second has fewer, unless many commands arrive."""
 
 CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
-"""Time from a checkpoint in a file to the request for the next one, ns: about two chunks.
+"""Time from a checkpoint, the robot's state in a file, to the request for the next one, ns.
 
-After damage to a chunk of steps, a replay then lacks at most 20 s. A checkpoint takes 0.6 ms of the
-control loop's step, after the loop has written its line to the port. In the file a checkpoint takes
-6 kB at rest and 13 kB while driving.
+This is about two chunks of steps, so that after damage to a chunk a replay lacks at most 20 s. A
+checkpoint takes 0.6 ms of the control loop's step, after the loop has written its line to the port.
+In the file it takes 6 kB at rest and 13 kB while driving.
 """
 
 MAX_FILE_NS = 3600 * NS_PER_S
@@ -51,17 +51,18 @@ INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
     "port_lost",
 })  # fmt: skip
-"""Names of the events for which all files within a minute of the event are retained."""
+"""Names of the events that count as an incident, so that all files within a minute are retained."""
 
 
 class Bug(NamedTuple):
-    """A failure of the daemon itself, which ends the daemon."""
+    """An internal error that ends the daemon."""
 
     why: str
+    """The exception, after the number of its step if a step raised it."""
     at: Instant | None
     """Instant of the step that failed; None if the daemon failed outside a step."""
     unfinished: bytes
-    """Encoded inputs of that step; empty if they cannot be encoded."""
+    """Encoded inputs of the step that failed; empty if there are none or they cannot be encoded."""
 
 
 class StepWriter:
@@ -79,7 +80,7 @@ class StepWriter:
         Args:
             config: the configuration at the daemon's start.
             report: function that receives each event for the log.
-            request_state: function that asks the control loop for a `Start`.
+            request_state: function that asks the control loop to queue the robot's state (`Start`).
             started_ns: wall-clock time of the daemon's start, ns since 1970.
         """
         self._started_ns = started_ns
@@ -87,7 +88,7 @@ class StepWriter:
         self.trouble = ""
         """The error of the disk, in words for the user; "" if the disk accepts data."""
         self.lost = 0
-        """Number of steps lost because the disk refused to write."""
+        """Number of steps that were not written because of errors of the disk."""
         self.syncs = 0
         """Number of syncs begun plus number of syncs ended. It is odd during a sync."""
         self._lost_before = 0
@@ -98,16 +99,16 @@ class StepWriter:
         self._ring: Ring | None = None
         self._writing: Writing | None = None
         self._start: Start | None = Start(0, b"", config)
-        """The robot with which the next file begins.
+        """State of the robot with which the next file begins.
 
-        It is None after a file has begun with it, and after steps were lost. Before a new file
-        the writer then requests a new `Start`.
+        It is None once a file has begun with it, and after steps were lost. Then the writer
+        requests a new `Start` before it begins a file.
         """
         self._incidents = IncidentWindow[Path]()
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
         self._reported = False
-        """True once the log has the event that recording works."""
+        """True once the event that recording works was reported."""
         self._refused = False
         """True if the last write failed because the disk was full."""
         self._looked_back = False
@@ -153,7 +154,7 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Mark the unfinished file with the cause `cut`, so that it does not count as a crash.
+        """Mark the unfinished file with the cause `cut`, so that no later start assumes a crash.
 
         Another thread may call this method while `write` waits for the disk.
         """
@@ -174,8 +175,8 @@ class StepWriter:
     def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
         """Write steps to the current file, after the robot's state if `start` is not None.
 
-        A new file begins with `start` if steps are missing before `start`, or if the current file
-        is long enough.
+        A new file begins with `start` if there is no current file, if steps are missing before
+        `start`, or if the current file is long enough.
         """
         if start is not None and self._writing is not None and self._goes_on(ring, start):
             self._add_checkpoint(self._writing, start, self._last)

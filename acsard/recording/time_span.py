@@ -1,7 +1,7 @@
-"""Times that a person types, and the part of a recording between two of them.
+"""Reads the times that a person types, and finds the part of a recording between two of them.
 
 A recording may cross midnight, and the wall clock may be set during the recording. A time is
-therefore looked up in every `Stretch`, a part of the recording between two settings of the clock.
+therefore looked up in every `Stretch`, a part of the recording in which the clock was not set.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from acsard.recording.timeline import SET_NS
 
 
 class Span(NamedTuple):
-    """A part of a recording. Its limits are monotonic times, s after the recording began."""
+    """A part of a recording, limited by monotonic times in s after the recording began."""
 
     begin: float = -math.inf
     end: float = math.inf
@@ -47,7 +47,7 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A moment, or a day from `begin` to `end`, s since 1970. In a moment, both are equal."""
+    """A moment or a whole day, from `begin` to `end`, s since 1970. A moment has both equal."""
 
     begin: float
     end: float
@@ -137,7 +137,7 @@ def _unknown(text: str) -> TimeError:
 
 
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
-    """Return the range of time that `begin` and `end` mean, s since 1970. It may be infinite.
+    """Return the range of time that `begin` and `end` mean, s since 1970. A limit may be infinite.
 
     - None, or an `Offset`, does not limit the range on its side.
     - A time of day in `begin` means its last occurrence before `end` if `end` is a `Moment`.
@@ -195,7 +195,7 @@ class Stretch(NamedTuple):
 
 
 def span(recording: Recording, begin: When | None, end: When | None) -> Span:
-    """Return the part of a recording between two times. None does not limit the part."""
+    """Return the part of a recording from `begin` to `end`. None means no limit on that side."""
     by_clock = any(isinstance(when, TimeOfDay | Moment) for when in (begin, end))
     found = stretches(recording) if by_clock else []
     first = None if begin is None else _seconds(begin, found, end=False)

@@ -1,8 +1,9 @@
 """Describes a recording as a timeline of short texts.
 
-The timeline has an entry for each event of the log, and one for each drive. A drive is a time in
-mode `driving`; its entry gives the distance and the duration. `acsard recording show`, the report
-and the exported `log` print the same entries, so a reader needs only one of them.
+The timeline has an entry for each event of the log, and further entries, such as one for each
+drive. A drive is a time in mode `driving`; its entry gives the distance and the duration. The same
+entries are in the output of `acsard recording show`, in that of `acsard recording report`, and in
+the exported `log`.
 """
 
 from __future__ import annotations
@@ -26,32 +27,33 @@ from acsard.core.values import NS_PER_S, Command, Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
-"""Largest distance of an entry's time from 1970, s: 292 years. No recording has other times."""
+"""Largest distance of an entry's time from 1970, s: 292 years, the limit of 64 bits for ns."""
 
 
 REASON_NS = NS_PER_S
-"""Shortest time between two entries about a reason, ns.
+"""Shortest time between two entries about a changed reason of the robot's mode, ns.
 
-Without it, two sources that alternate in every step would fill the timeline.
+Without this limit, two sources that alternate in every step would fill the timeline. Entries about
+waiting senders and about the board have the same limit.
 """
 
 POSE_NS = NS_PER_S
-"""Longest time, ns, for which the entry `continues` is delayed until a pose is known.
+"""Longest time, ns, for which the entry `continues` waits for the first pose.
 
-Without a link to the board no pose arrives.
+Without a link to the board there is no pose.
 """
 
 SET_NS = 5 * NS_PER_S
 """Change of the wall clock against the monotonic clock that counts as a clock step, ns."""
 
 WAITS_NS = NS_PER_S
-"""Time, ns, for which a sender must send speeds without effect before it gets an entry.
+"""Time, ns, for which a sender must send speeds without effect before the timeline mentions it.
 
 When one sender takes over from another one, both send for a shorter time than this.
 """
 
 SILENT_NS = NS_PER_S
-"""Pause of a sender, ns, after which its waiting time restarts at 0."""
+"""Pause of a waiting sender, ns, after which its waiting time restarts at 0."""
 
 MAX_IDENTITY_BYTES = 256
 """Largest length of a line with which a microcontroller names itself, bytes.
@@ -60,12 +62,12 @@ The firmware's line has 150 bytes.
 """
 
 MAX_WAITING = 16
-"""Largest number of senders that are watched. A stranger may send under any number of names."""
+"""Largest number of waiting senders that are watched. A stranger may send under many names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
 """Pattern that finds a number, but not a digit in a name.
 
-Reasons that differ only in numbers, such as a duration, count as one reason.
+Reasons of a mode that differ only in numbers, such as a duration, count as one reason.
 """
 
 
@@ -82,7 +84,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     - `drive`: a drive has ended, or is under way as the recording ends.
     - `link_late`: an event `link_stale` that this computer caused.
     - `link_heard`: a further event about a link that is already lost.
-    - `reason`: the reason has changed, but the mode has not.
+    - `reason`: the reason of the robot's mode has changed, but the mode has not.
     - `waits`: a sender must wait while another one drives.
     - `board`: a microcontroller has named itself and its last reset.
     - `clock`: the wall clock was set.
@@ -133,20 +135,20 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Detects changes of the reason that neither a change of the mode nor an event reports."""
+    """Detects changes of the mode's reason that neither the mode nor an event shows."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. The reason has `#` for each number."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry, or of the last event about a lost link, ns."""
+        """Monotonic time of the last entry or of the last change shown in mode `waiting`, ns."""
         self._sender = ("", "")
         """The last source that the robot followed, and the last sender on that source."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the reason changed and the mode did not.
+        """Yield an entry if the reason changed, the mode is the same, and no event has that reason.
 
-        In the timeline the events of the step come before this entry.
+        There is no entry while the robot drives, and at most one entry each second.
         """
         mode, text, _, source = step.recorded.status
         now, reason = step.inputs.now, NUMBER.sub("#", text)
@@ -175,8 +177,8 @@ class BoardIdentity:
     """Detects the line with which a microcontroller names itself.
 
     The board sends this line after its start, and when the daemon asks for it. The robot reports
-    the line as an event only if the link was up. If a board starts slowly, the link is lost before
-    the line arrives. Then only the line explains why the board was silent.
+    the line as an event only if the link was up. If a board restarts slowly, the link is lost
+    before the line arrives, and only the line explains why the board was silent.
     """
 
     def __init__(self) -> None:
@@ -278,11 +280,10 @@ class WaitingSenders:
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return why the source `waiting` waits for the source `followed`.
+        """Return why the robot follows the source `followed` and not the source `waiting`.
 
-        Returns "" if the source `waiting` does not wait, because the robot refuses its commands.
-        That is so if one of the sources is unknown, or if the source `waiting` has the higher
-        priority and the robot still does not follow it.
+        Returns "" if the priorities do not explain this, because one of the sources is unknown or
+        the source `waiting` has the higher priority. Then the robot refuses its commands.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -312,7 +313,7 @@ class TimelineWriter:
         self._sources: list[str] = []
         """The sources that commanded the present drive, in the order in which they began."""
         self._since = ""
-        """Words in the entry of a drive that began before the first step; "" for other drives."""
+        """Words for the entry of a drive that began before this recording; "" for other drives."""
         self._now: Instant | None = None
         """Time of the last step."""
         self._shutting_down = False
@@ -411,10 +412,9 @@ class TimelineWriter:
             self._began_ns = None
 
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
-        """Yield the entries after the last step: an unfinished drive, and the text `ending`.
+        """Yield the entries after the last step: an unfinished drive, and `ending` if it is not "".
 
-        `ending` is `Recording.ending`: how the recording ended, or "" if the daemon ended normally.
-        In the latter case there is no entry for it.
+        `ending` says how the recording was cut off; it is "" if the daemon ended normally.
         """
         yield from self._continues()
         if self._now is None:
@@ -446,9 +446,9 @@ INCIDENTS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Maps the name of an event to its word in a summary.
+"""Maps the name of an event to its word in the summary of a recording.
 
-`link_up` has no word. It is in the table because it ends the loss of a link.
+`link_up` has no word. It is in the table because a later loss of the link is counted separately.
 """
 
 

@@ -1,4 +1,4 @@
-"""Rebuilds a pickled robot, and nothing else, even if a stranger wrote the bytes.
+"""Rebuilds a pickled `Robot`, and nothing else, even if a stranger wrote the bytes.
 
 A recording may come from a stranger, and Python's own unpickler obeys its bytes: it calls
 functions, imports modules, changes classes, and nests objects without limit. This reader knows only
@@ -11,9 +11,9 @@ each part when it makes the part:
     any other object         made without its constructor, then given attributes; no attribute
                              hides an attribute of the class
 
-A list of allowed classes in `Unpickler.find_class` is not enough. With the classes that `state.py`
-allows, forged bytes still did this: nested tuples as keys, keys with equal hashes, and copies of
-one dict each took more than 3 s of processor time. A few bytes allocated more than 2 GB. One attack
+A list of allowed classes in `Unpickler.find_class` is not enough. Forged bytes did harm with only
+the classes that `state.py` allows. Nested tuples as keys, keys with equal hashes, and copies of one
+dict each took more than 3 s of processor time. A few bytes allocated more than 2 GB. One attack
 changed the class of the robot for the whole process. The commands that read a recording have no
 limits of time or memory that would stop such an attack.
 
@@ -56,7 +56,7 @@ Below this bound every integer except -1 is its own hash, so that forged keys ca
 """
 
 MAX_DEPTH = 50
-"""Largest nesting depth."""
+"""Largest depth to which values may be nested in each other."""
 
 MAX_INT_BITS = 128
 """Largest number of bits of an integer. Sums of times in ns have more than 64 bits."""
@@ -86,7 +86,7 @@ TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 """Opcodes that make a tuple of the top values, each with the number of these values."""
 
 SIMPLE = (str, int, float, bool, bytes, type(None))
-"""Types of the values that a key may consist of, besides enum members."""
+"""Types of a key, or of the elements of a tuple that is a key. Enum members are allowed too."""
 
 
 def unpickle(data: bytes, find: FindClass) -> object:
@@ -310,7 +310,10 @@ class _Machine:
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
-            raise ValueError(f"it sets attributes of a {type(whole.value).__name__}, not of a part")
+            raise ValueError(
+                f"it sets attributes of a {type(whole.value).__name__}, which no recording of "
+                "acsard does"
+            )
         for name in named:
             if not isinstance(name, str) or hasattr(type(whole.value), name):
                 raise ValueError(
@@ -339,7 +342,9 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
     "NEWOBJ": _Machine.make_bare,
     "BUILD": _Machine.set_attributes,
 }
-"""Maps an opcode to the method that executes it. The tables above have the simpler opcodes."""
+"""Maps an opcode to the method that executes it. `ARGUMENTS`, `VALUES`, `CONTAINERS` and `TUPLES`
+have the simpler opcodes.
+"""
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
@@ -354,9 +359,9 @@ def _keys(entries: Sequence[_Entry]) -> None:
 
 
 def _is_part(kind: Any) -> bool:
-    """Return whether an object of the class `kind` consists of nothing but its attributes.
+    """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
 
-    Such an object can be rebuilt without its constructor and without other code of the class.
+    No code of such a class has to run for this: no `__new__` or `__setstate__` of its own.
     """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")

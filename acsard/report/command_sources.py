@@ -14,29 +14,30 @@ from acsard.core.values import NS_PER_S, Command, Outputs, Twist
 from acsard.recording.recorded_steps import Step
 
 STATES = ("refused", "waits", "sends", "drives")
-"""States of a source that is not silent. If short spans must be merged, the first of these wins.
+"""States of a command source that is not silent.
 
 In the state `sends` the robot accepts the source's commands, but does not drive for another reason.
+If short spans of time are merged, the state that comes first in this list is kept.
 """
 
 MOVES = ("ready", "driving")
 """Modes in which the robot follows a source. In the other modes it follows no source."""
 
 OTHERS = "others"
-"""Common name of all sources that are not in the configuration."""
+"""Common name of all command sources that are not in the configuration."""
 
 SAMPLE_S = 0.1
-"""Time between two samples of the sources, s. A change of mode or source is sampled at once."""
+"""Time between two samples of the sources' states, s. A new mode or source is sampled at once."""
 
 MAX_TEXT = 300
-"""Largest number of characters that are kept of a sentence or a name."""
+"""Largest number of characters that are kept of a sentence or a name in a recording."""
 
 MAX_SENDERS = 256
 """Largest number of senders whose last command is kept."""
 
 
 class CommandSources:
-    """The states of all sources, one band of time for each source."""
+    """The states of all command sources over time, with a `Band` for each source."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
         self._timeouts = {
@@ -47,12 +48,12 @@ class CommandSources:
         self._newest: dict[tuple[str, str], Command] = {}
         """The last command of each source and sender, the newest last."""
         self._counted: Counter[str] = Counter()
-        """For each reason, the number of commands refused from the start to the last step."""
+        """For each reason, the number of commands that the robot has refused so far."""
         self._refused: dict[str, tuple[float, str]] = {}
         """For each refused source: the time until which it counts as refused, s, and the reason."""
 
     def name(self, source: str) -> str:
-        """Return the name of a configured source, or `OTHERS`."""
+        """Return the name of a source, or `OTHERS` if the source is not configured."""
         return source if source in self._timeouts else OTHERS
 
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
@@ -74,7 +75,7 @@ class CommandSources:
         return before != self._refused
 
     def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
-        """Find the commands of this step that the robot refused.
+        """Find the commands of this step that the robot refused, and note their sources.
 
         The robot's counters give the reasons, but not the sources. A source was refused if its last
         accepted command is older than its command of this step.

@@ -34,11 +34,11 @@ from acsard.report.plot_elements import (
 from acsard.report.report_data import Mark, Marks, ReportData
 
 ROW_PX, AXIS_PX = 54, 68
-"""Height of a row of bands, and additional height for the time axis, px."""
+"""Height of each row in the picture of the sources, and extra height for its time axis, px."""
 
 
 class Line(NamedTuple):
-    """A curve of a picture."""
+    """A curve in a diagram."""
 
     name: str
     colour: str
@@ -55,7 +55,7 @@ class Line(NamedTuple):
 
 
 GAP_PX = 30
-"""Height of the gap above each part of a picture, px. The gap holds the title of the part."""
+"""Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
 
 LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
 """Smallest span of the speed scales, m/s and rad/s, for a robot that never moves."""
@@ -63,23 +63,23 @@ LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
 BENEATH = 3.4
 """Width of a curve that another curve nearly covers, px.
 
-Its colour stays visible on both sides of the other curve.
+The wider curve stays visible on both sides of the other one.
 """
 
 
 class Clip(NamedTuple):
-    """A time during which a curve is outside of its diagram, and is drawn at the edge."""
+    """An excursion of a curve beyond the scale of its diagram, drawn at the diagram's edge."""
 
     t: float
     """Time at which the curve leaves the diagram, s."""
     edge: float
     """Value of the edge at which the curve is drawn."""
     value: float
-    """The value of the curve that is furthest from the edge."""
+    """The curve's furthest value beyond the edge."""
 
 
 MARKS_APART = 0.02
-"""Smallest distance between two marks of a curve that leaves its diagram.
+"""Smallest distance between two marks where a curve leaves its diagram.
 
 It is a fraction of the diagram's width.
 """
@@ -88,20 +88,20 @@ HEADROOM = 0.5
 """Room for commanded speeds above and below the limited and measured speeds.
 
 It is a fraction of the span of the limited and measured speeds. A command that the robot reaches
-after a ramp stays visible. A command of 99 m/s does not flatten the other curves.
+after a ramp stays visible, but a command of 99 m/s does not flatten the other curves.
 """
 
 
 def clipped(
     points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
 ) -> tuple[list[Point], list[Clip]]:
-    """Limit a curve to the scale of others. Return it, and the times when it exceeds the scale.
+    """Limit a curve to the scale of a diagram. Return the limited curve and its excursions.
 
     Args:
         points: the curve; NaN interrupts it.
-        others: the curves that determine the scale, with `HEADROOM`.
+        others: the curves that determine the scale, with `HEADROOM` added.
         least: smallest span of the scale, for a robot that does not move.
-        gap: if the curve leaves the diagram again within this time, s, it gets no second mark.
+        gap: time, s, within which a second excursion beyond the same edge belongs to the first.
     """
     values = [0.0, *(p.value for curve in others for p in curve if math.isfinite(p.value))]
     room = HEADROOM * max(max(values) - min(values), least)
@@ -126,7 +126,7 @@ class Part(NamedTuple):
     title: str
     lines: list[Line]
     beyond: Sequence[Clip] = ()
-    """The times at which the first curve of `lines` is outside of the diagram."""
+    """The excursions of the first curve of `lines` beyond the scale of the diagram."""
 
 
 Row = tuple[str, list[Span]]
@@ -136,17 +136,18 @@ DRIVES = "drives"
 
 
 class BandStyle(NamedTuple):
-    """Appearance of the bands of one kind. Each driving source has a style of its own."""
+    """Appearance of the bands that show one state. Each source that drives has its own style."""
 
     kind: str
+    """State that the bands show, such as "drives"."""
     source: str
-    """Name of the driving source; "" if the style applies to all rows."""
+    """Name of the source that drives; "" if the style applies to all rows."""
     colour: str
     pattern: str = ""
 
     @property
     def meaning(self) -> str:
-        """Text in the legend."""
+        """Text of the style in the legend."""
         return f"{self.source} {self.kind}".strip()
 
     def of(self, row: Row) -> list[Span]:
@@ -190,7 +191,7 @@ NOTED = {
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),
 }
-"""Events that are drawn on the path: symbol in the legend, plotly's name of the symbol, colour."""
+"""Events that are drawn on the path, each with its symbol, plotly's name for it, and its colour."""
 
 
 def path_figure(data: ReportData) -> Figure:
@@ -264,7 +265,6 @@ def _spread(places: list[Place]) -> list[Place]:
 
 
 def _arrows(places: list[Place]) -> dict[str, Any]:
-    """Return markers that point along the heading."""
     # Plotly's angles are in degrees, clockwise from up.
     angles = [round(90 - math.degrees(place.yaw), 2) for place in places]
     return {"symbol": "arrow", "size": 13, "color": LIMITED, "angle": angles}
@@ -430,7 +430,6 @@ class TimeFigures:
         }
 
     def events(self) -> Figure:
-        """Draw all events as marks."""
         levels, kept = ("info", "warning", "error"), self._data.marks
         traces = [
             self._marks(level, at, [mark for mark in kept.all() if mark.level == level])

@@ -1,9 +1,9 @@
 """Makes the report: one HTML file that needs no other file.
 
-No text of unknown origin can become code in it. Each text passes `escaped`. The pictures are JSON
-without any `<`, in a block that browsers do not execute. As a second barrier, the security policy
-of the page allows only the page's two scripts, which it identifies by their hashes. It also forbids
-the page to load anything.
+No text of unknown origin can become code in the file. Each text passes `escaped`. The pictures are
+JSON without any `<`, in a block that browsers do not execute. As a second barrier, the file's
+content security policy allows only its two scripts, identified by their hashes, and forbids it to
+load anything.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ addEventListener("afterprint", () => paper(false));
 
 
 MAX_OPEN = 40
-"""Largest number of events with which the list of events is open when the page is loaded."""
+"""Largest number of events for which the list of events is unfolded when the page loads."""
 
 
 def escaped(text: str) -> str:
@@ -250,7 +250,7 @@ def _reasons(data: ReportData) -> str:
 
 def _events(data: ReportData, clock: Clock) -> str:
     left_out, marks = data.marks.left_out, data.marks.all()
-    # A recording may cross midnight, and its clock may be set.
+    # A recording may cross midnight, and the clock may be set while it is made.
     dated = len({date(mark.seconds) for mark in marks}) > 1
 
     def time_of(mark: Mark) -> str:

@@ -1,7 +1,7 @@
-"""Makes the elements of the pictures, in the format of the library plotly.
+"""Makes the elements of a report's pictures, in the format of the library plotly.
 
-The pictures are plain lists and dicts. Columns of numbers are doubles in base64, which plotly
-reads, because JSON cannot represent NaN. `page.py` sets the colours of paper, grid and text. The
+The pictures are plain lists and dicts. Columns of numbers are doubles in base64, because plotly
+reads that and JSON cannot represent NaN. `page.py` sets the colours of paper, grid and text. The
 colours in this module suit a light and a dark background.
 """
 
@@ -34,14 +34,14 @@ UNKNOWN = "#9a9a9a"
 SOURCE_COLOURS = (
     "#159a6b", "#2f6fd8", "#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f",
 )  # fmt: skip
-"""Colours of the driving sources. Neighbours in this list are easy to distinguish."""
+"""Colours of the command sources that drive. Neighbours in this list are easy to distinguish."""
 
 PATTERNS = ("", "/", "x", ".", "-")
 """Fill patterns of the bands. When all colours are used, the colours repeat with a new pattern."""
 
 
 def source_style(number: int) -> tuple[str, str]:
-    """Return the colour and the pattern of a driving source; `number` counts them from 0."""
+    """Return the colour and the pattern of a source that drives; `number` counts from 0."""
     beyond, place = divmod(number, len(SOURCE_COLOURS))
     return SOURCE_COLOURS[place], PATTERNS[beyond % len(PATTERNS)]
 
@@ -80,7 +80,7 @@ class Figure(NamedTuple):
 
 
 def label(text: str) -> str:
-    """Return any text escaped for plotly, in short lines."""
+    """Return any text escaped for plotly, wrapped to lines of `WRAP` characters."""
     lines = textwrap.wrap(printable(text), WRAP) or [""]
     return "<br>".join(html.escape(line) for line in lines)
 

@@ -25,16 +25,16 @@ from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
 NS_PER_MS = 1_000_000
 
 MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
-"""Modes of the robot. If short spans must be merged, the first of these modes wins."""
+"""Modes of the robot. If short spans are merged, the mode that comes first here is kept."""
 
 LINKS = ("down", "stale", "booting", "up")
-"""States of the link. If short spans must be merged, the first of these states wins."""
+"""States of the serial link. If short spans are merged, the state that comes first is kept."""
 
 MAX_EVENT_TEXT = 1000
 """Largest number of characters that are kept of an event's text.
 
-A recording from a stranger may have longer texts. An entry `continues` with the reason of a fault
-has 308 characters.
+A recording from a stranger may have longer texts. The longest text of the daemon itself, that of
+`continues` with the reason of a fault, has 308 characters.
 """
 
 FIRST, LAST = 30, 30
@@ -42,10 +42,10 @@ FIRST, LAST = 30, 30
 
 
 class Mark(Struct, frozen=True):
-    """An event, with the place of the robot at that time."""
+    """An event of a recording, with the place of the robot at that time."""
 
     t: float
-    """Time since the first collected step, s."""
+    """Time since the first step of the report, s."""
     name: str
     text: str
     level: str
@@ -74,12 +74,12 @@ class Marks:
         self._count = 0
         """Number of calls of `add`."""
         self.counts: Counter[str] = Counter()
-        """Number of events of each name. A mark for several equal events adds their number."""
+        """Number of events of each name. A mark for several equal events counts as all of them."""
         self.left_out = 0
-        """Number of events that were dropped."""
+        """Number of marks that were dropped."""
 
     def add(self, mark: Mark) -> None:
-        """Add an event. If there are too many events of its name, drop one from their middle."""
+        """Add an event. If `FIRST` + `LAST` events of its name are kept, drop one in the middle."""
         self.counts[mark.name] += mark.count
         self._count += 1
         row = (self._count, mark)
@@ -105,11 +105,11 @@ class Driven(Struct):
 
 
 class Lateness:
-    """Delay of each period's step, relative to the step with the smallest delay.
+    """Measures how late the daemon ran the step of each control period.
 
-    The recording gives the number of missed periods, so each period's number is known. The time
-    at which a period was due is then known except for a constant offset. The step with the smallest
-    delay gives this offset.
+    The recording gives the number of missed periods, so each period's number is known. The time at
+    which a period was due is then known except for a constant offset. The offset is chosen so that
+    the smallest delay is 0.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -118,23 +118,23 @@ class Lateness:
         self._number = 0
         """Number of the last period."""
         self._ahead = 0
-        """Number of lines since the last period that were sent before the period they belong to."""
+        """Number of lines since the last period that the daemon sent at once."""
         self._began_ns: int | None = None
         self._earliest = math.inf
-        """Smallest delay, ns."""
+        """Smallest delay so far, ns, measured from the first period. It may be negative."""
         self.missed = 0
         """Number of periods without a step."""
 
     def at_once(self) -> None:
-        """Register a line that was sent at once, instead of in the next period."""
+        """Count a line that was sent at once for a fresh command, instead of in the next period."""
         self._ahead += 1
 
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
-        """Process the step of a period.
+        """Process the step of a control period.
 
-        `t` (s) and `now_ns` (monotonic, ns) are its time, and `missed` is the number of periods
-        since the previous tick that had no step. `known` is False if the recording lacks steps
-        before this one. Then the number of the period is computed from the clock.
+        `t` (s) and `now_ns` (monotonic, ns) are the time of the step, and `missed` is the number of
+        periods since the previous tick that had no step. `known` is False if the recording lacks
+        steps before this one. The number of the period is then computed from the clock.
         """
         period_ns, began_ns = self._period_ns, self._began_ns
         if began_ns is None:
@@ -146,7 +146,7 @@ class Lateness:
             self._number, missed = round((now_ns - began_ns) / period_ns), 0
         behind_ns = now_ns - began_ns - self._number * period_ns
         if missed and self._ahead and behind_ns < self._earliest - period_ns / 2:
-            # The line that was sent at once took the place of a missed period.
+            # The line that was sent at once was that of the missed period.
             self._number -= 1
             behind_ns += period_ns
         self._ahead = 0
@@ -155,18 +155,18 @@ class Lateness:
         self._curve.add(t, (behind_ns + missed * period_ns) / NS_PER_MS)
 
     def points(self) -> list[Point]:
-        """Return the delay in ms over the time in s."""
+        """Return the delay of each period in ms over the time in s. The smallest delay is 0."""
         least = self._earliest / NS_PER_MS
         return [Point(t, value - least) for t, value in self._curve.points()]
 
     @property
     def most_ms(self) -> float:
-        """Largest delay, ms."""
+        """Largest delay of a period, ms."""
         return max([point.value for point in self.points()], default=0.0)
 
 
 class LineCount:
-    """Number of lines of one kind, in each second and in all."""
+    """Number of serial lines of one kind, in each second and in all."""
 
     def __init__(self) -> None:
         self.curve, self.total = Curve(), 0
@@ -178,7 +178,7 @@ class LineCount:
 
 
 class SerialCounts:
-    """Number of sent, accepted, dropped and unanswered lines in each second."""
+    """Number of sent, accepted, dropped and unanswered serial lines in each second."""
 
     def __init__(self) -> None:
         self.sent, self.good = LineCount(), LineCount()
@@ -187,7 +187,7 @@ class SerialCounts:
         self._sent = 0
         """Lines sent in this second."""
         self._base = 0
-        """Lines received before the first collected step."""
+        """Lines received up to the first step of the report."""
         self._before = (0, 0)
         """Good and dropped lines since the daemon's start, at the beginning of this second."""
         self._now = (0, 0)
@@ -199,7 +199,7 @@ class SerialCounts:
         smallest number tells how many answers are lost.
         """
         self._lost: int | None = None
-        """Largest `_outstanding` of all earlier seconds."""
+        """Largest `_outstanding` of the earlier seconds: the answers lost before this second."""
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
         """Process a step at time `t`, s.
@@ -240,16 +240,16 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the number of accepted and dropped lines.
+    """Return the number of accepted and of dropped lines.
 
-    The counter `lines` includes the implausible lines, which count as dropped.
+    The counter `lines` includes implausible lines, but they count as dropped here.
     """
     bad = sum(count for name, count in counters.items() if name.startswith("line_"))
     return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
 
 class ReportData:
-    """The data of a report, from the steps in a window of time."""
+    """Collects the data of a report from the steps in a window of time."""
 
     def __init__(
         self, config: Config, begin: float | None = None, end: float | None = None
@@ -260,7 +260,7 @@ class ReportData:
         """
         self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
         self.config = config
-        """Configuration at the beginning."""
+        """Configuration at the beginning of the recording."""
         self.path = Track()
         self.linear = {name: Curve() for name in ("commanded", "limited", "measured")}
         self.angular = {name: Curve() for name in ("commanded", "limited", "measured")}
@@ -332,7 +332,7 @@ class ReportData:
         self._number = step.number
 
     def end(self, ending: str = "") -> None:
-        """Finish the data. `ending` is as in `TimelineWriter.end`."""
+        """Finish the data. `ending` tells how the recording ends, as in `TimelineWriter.end`."""
         t = self.seconds
         for entry in self._timeline.end(ending) if self.began is not None else ():
             self.marks.add(self._mark(entry, t))
@@ -415,9 +415,9 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Sample the status if it has changed, or if the last sample is older than `SAMPLE_S`.
+        """Sample mode, link and sources if they have changed, or after `SAMPLE_S`.
 
-        Also sample it if `refused` is true, because the refused sources have changed.
+        `refused` is true if the refused sources have changed.
         """
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:

@@ -31,7 +31,7 @@ MAX_REASONS = 8
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 FINE_S = 0.05
-"""If a point of a picture stands for more than this time, s, a note says so."""
+"""Longest time that a point of a picture may stand for without a note in the report, s."""
 
 MAX_NAMES = 5
 """Largest number of names or texts in a list."""
@@ -63,7 +63,7 @@ OF_THE_BOARD = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""Maps the name of each event in which the board caused a stop to its words in the text."""
+"""Words for the events in which the board caused a stop, by the name of the event."""
 
 
 def differences(config: Config) -> list[Setting]:
@@ -121,10 +121,10 @@ def _names(marks: list[Mark]) -> str:
 
 
 def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
-    """Return why sources did not drive: rows of source, state, reason, and duration in s.
+    """Return why command sources did not drive: rows of source, state, reason, and duration in s.
 
-    The row with the longest duration comes first. There are at most `MAX_REASONS` rows. Reasons
-    that differ only in numbers share a row, which has the text of the longest one.
+    The longest duration comes first, and there are at most `MAX_REASONS` rows. Reasons that differ
+    only in numbers share a row, with the text of the reason that lasted longest.
     """
     durations: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in data.sources.bands.items():
@@ -162,7 +162,7 @@ def _late(marks: Iterable[Mark], clock: Clock) -> str:
 def notes(data: ReportData, origin: Origin) -> list[str]:
     """Return the notes for the reader of the report.
 
-    They are the notes of `origin`, and notes about missing steps, about a clock that was set, and
+    They are the notes of `origin`, and notes about missing steps, about a change of the clock, and
     about the resolution of the pictures.
     """
     found = list(origin.notes)

@@ -2,8 +2,8 @@
 
 This module writes texts and questions to standard output as JSON objects, one per line. It reads
 answers, key presses and signs of life from standard input. The program must send a line again and
-again while it is in contact with the person. The end of the input interrupts the subcommand as
-Ctrl-C does, and so does a silence of the program while something may move.
+again while it is in contact with the person. If the input ends, or if the program is silent while
+something may move, this module interrupts the subcommand as Ctrl-C does.
 
 deploy/web/README.md describes the fields. The page's server relays the lines, and `web/openapi.py`
 describes them for other programs, with the docstrings of their classes.
@@ -35,14 +35,14 @@ T = TypeVar("T")
 HEARD_S = 0.9
 """Longest silence of the asking program while something may move, s.
 
-After a longer silence the subcommand sends zeros, so they follow the program's last line within a
-second. The program sends a line every 0.1 s, even if the line is only `{}`. TCP resends a lost
-packet after 0.2 s, and again after another 0.4 s, so a line that is lost twice still arrives in
-time. A STOP that is lost three times would be as late as these zeros.
+After a longer silence the subcommand sends zero speeds, so the robot begins to stop within a second
+of the program's last line. The program sends a line every 0.1 s, even if the line is only `{}`. TCP
+resends a lost packet after 0.2 s, and again after another 0.4 s, so a line that is lost twice still
+arrives in time. A key press that is lost three times would arrive as late as these zeros.
 
-On a computer that is too busy for this limit, the leg has ended earlier, because the daemon was
-silent for 0.5 s (calibration/guided/leg_driver.py). This limit is not for driving by hand: there
-each command is a sign of life, and the timeout of the command source applies.
+If this computer is too busy to keep the limit, a guided drive ends earlier, because the daemon was
+silent for 0.5 s (calibration/guided/leg_driver.py). When a person drives by hand, this limit does
+not apply. Then each command is a sign of life, and the timeout of the command source applies.
 """
 
 LISTEN_S = 0.05
@@ -104,7 +104,7 @@ class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
     leg: bool = False
     """True if the robot drives after the answer; a key press stops it."""
     by_key: bool = False
-    """True if a key press is the intended end of the leg."""
+    """True if a key press is the intended end of the drive that follows the answer."""
     wrong: str = ""
     """Explanation of why the previous answer was rejected."""
 
@@ -195,11 +195,10 @@ class JsonPrompt:
             return " " if pressed else ""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Offer to write these keys into the configuration file.
+        """Offer to write these keys into the configuration file; return whether they were written.
 
-        Returns whether the keys were written. The question is asked only if the file can be
-        changed. `config` is the path of the file, or None to search for it.
-        `trouble` is a reason not to write, or "".
+        The question is asked only if the file can be changed. `config` is the path of the file, or
+        None to search for it. `trouble` is a reason not to write, or "".
         """
         try:
             if trouble:
@@ -259,7 +258,7 @@ class JsonPrompt:
     # Input
 
     def _listen(self) -> None:
-        """Read the input until the conversation ends; any other end interrupts the subcommand."""
+        """Read the input until the conversation is over. If it ends earlier, send SIGINT."""
         try:
             self._end(self._heard_out())
         except BaseException as error:

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 WHOLE = 10_000
-"""Width in characters that wraps no row of a table, so that a row can be copied."""
+"""Width in characters at which no row of a table is wrapped, so that a row can be copied."""
 
 SENTENCES = 100
 """Largest width of output that contains sentences, characters."""
@@ -46,7 +46,7 @@ def table(
 
 
 def has_screen() -> bool:
-    """Return whether standard output is a terminal that can show a whole screen."""
+    """Return whether standard output is a terminal that can show full-screen output."""
     return sys.stdout.isatty() and os.environ.get("TERM", "") not in ("", "dumb", "unknown")
 
 

@@ -33,7 +33,7 @@ class Ask(Struct, frozen=True):
     usual: float | None = None
     """The number that an empty answer stands for, or None if there is none."""
     name: str = ""
-    """The name by which a measurement refers to the answer."""
+    """The name by which a method of calibration refers to the answer."""
 
     def number(self, text: str) -> float:
         """Return the number in an answer, which may have a decimal comma.
@@ -50,9 +50,10 @@ class Ask(Struct, frozen=True):
 
 
 class Prompt(Protocol):
-    """Interface of a prompt. A leg is a part of a guided drive in which the robot moves.
+    """Interface through which a subcommand asks the person near the robot.
 
-    Every question raises `KeyboardInterrupt` if the person quits.
+    Every question raises `KeyboardInterrupt` if the person quits. A leg is one drive of a guided
+    calibration, which the person starts and any key stops.
     """
 
     def begin(self, subject: str, *, simulated: bool) -> None:
@@ -62,13 +63,13 @@ class Prompt(Protocol):
         """Show a text that stays visible."""
 
     def doing(self, text: str) -> None:
-        """Show this text about the present activity until the next call."""
+        """Show a text about the present activity, which replaces the text of the last call."""
 
     def progress(self, share: float) -> None:
-        """Show which share of the leg or of the check is done, 0 to 1."""
+        """Show which share of the present drive or check is done, 0 to 1."""
 
     def found(self, finding: Finding) -> None:
-        """Show a finding as it is made."""
+        """Show a finding of a check, as soon as it is made."""
 
     def result(self, text: str) -> None:
         """Show the result. From now on nothing moves."""
@@ -84,9 +85,9 @@ class Prompt(Protocol):
         """Ask the question. Return one of `answers`, or None if no person watches the robot."""
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Show the text, and wait until the person starts the leg.
+        """Show the text, and wait until the person starts the next drive.
 
-        `by_key` says that a key press is the intended end of the leg.
+        `by_key` is true if a key press is the intended end of that drive.
         """
 
     def number(self, ask: Ask) -> float:
@@ -108,10 +109,10 @@ Ctrl-Z is included because a suspended program would leave a wheel turning.
 
 @contextmanager
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
-    """End the block on a signal as on Ctrl-C, so that zeros are sent; ignore further signals.
+    """Raise `KeyboardInterrupt` in the block on any of `SIGNALS`, and ignore further signals.
 
-    Print `says` if a signal ends the block. With `exits`, a signal other than Ctrl-C raises
-    `SystemExit` with the exit code of that signal.
+    So the cleanup of the block can send zero speeds. `says` is printed when a signal arrives. With
+    `exits`, a signal other than Ctrl-C raises `SystemExit` with the exit code of that signal.
     """
     before = [signal.getsignal(number) for number in SIGNALS]
 

@@ -33,9 +33,9 @@ COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_
 class Screen:
     """Output of a subcommand that asks questions.
 
-    The present activity is a line on the terminal that the next output overwrites. It is left out
-    if standard error is a pipe. With `as_json`, the subcommand prints one JSON object at its end,
-    so that only texts and questions are shown.
+    The present activity is a line on the terminal that the next output overwrites. There is no such
+    line if standard error is not a terminal. With `as_json`, only texts and questions are shown,
+    because the subcommand prints one JSON object at its end.
     """
 
     def __init__(self, as_json: bool = False) -> None:
@@ -73,7 +73,7 @@ class Screen:
         print(text)
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Return False: at a terminal the option --write changes the file."""
+        """Return False without a question, because at a terminal `--write` changes the file."""
         return False
 
     def _clear(self) -> None:
@@ -86,14 +86,14 @@ class Screen:
 
 
 class NoPrompt(Screen):
-    """Prompt without a person.
+    """Prompt that asks no person and answers the questions itself.
 
-    It confirms each request that has only one answer, and starts every leg. It answers no question
-    that needs an observer, and gives only the default for a measured number.
+    It confirms each request that has only one possible answer, starts every drive at once, and
+    gives the default if a number is asked for. It leaves all other questions without an answer.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Return the answer if there is only one, or None if a person must look and answer."""
+        """Return the only possible answer, or None if there are several."""
         return answers[0] if len(answers) == 1 else None
 
     def start(self, text: str, by_key: bool = False) -> None:
@@ -114,9 +114,10 @@ class NoPrompt(Screen):
 
 
 class TerminalPrompt(Screen):
-    """Prompt on standard input.
+    """Prompt that asks a person on standard error and reads the answers from standard input.
 
-    Legs need a terminal that delivers single keys (`host.terminal_modes.one_by_one`).
+    To start and stop the robot with a key, the terminal must be in the mode
+    `host.terminal_modes.one_by_one`, which delivers single keys.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
@@ -174,7 +175,7 @@ class TerminalPrompt(Screen):
 
 
 def row(finding: Finding) -> Table:
-    """Return the verdict with name and figure, then the meaning and the remedy."""
+    """Return a finding as a table: verdict, name and figure, and below them meaning and remedy."""
     verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
     below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
     head = f"{finding.name:<22} {finding.figure}"

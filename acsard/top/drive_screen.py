@@ -1,6 +1,7 @@
-"""The lines that `acsard drive` shows of the robot, for any width. This module is pure.
+"""The lines in which `acsard drive` shows the robot, for any width. This module is pure.
 
-A terminal shows the lines as a screen (`terminal.py`); any other output gets single lines.
+A terminal shows these lines as a screen (`terminal.py`). Any other output gets reports of fewer
+lines.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def parting(seen: Teleop, width: int) -> list[str]:
 
 
 def moves(state: RobotState) -> bool:
-    """Return whether any measured speed differs from zero. Without feedback, this is False."""
+    """Return whether any measured speed differs from zero; False if no speed is known."""
     return any((state.linear, state.angular, *state.wheels))
 
 
@@ -112,7 +113,10 @@ def reason(state: RobotState) -> str:
 
 
 def refused(objection: str) -> str:
-    """Return why the robot does not follow the keys, and how to send a zero with keys."""
+    """Return a sentence which says why the robot does not follow the keys.
+
+    If the robot waits for a zero, the sentence also says how to send one with the keys.
+    """
     release = " (release the key, and press it again)" if "must send a zero" in objection else ""
     return f"your keys do not drive: {printable(objection)}{release}"
 

@@ -26,7 +26,7 @@ class Feed:
     def ask(self) -> None:
         """Query the present state instead of waiting for the next published one.
 
-        Raises `ReplyError`.
+        Raises `ReplyError` if the reply cannot be decoded, and the errors of `Client.get`.
         """
         try:
             state: RobotState = self._robot.get("state")
@@ -44,7 +44,7 @@ class Feed:
             self._take(state, now)
 
     def poll(self) -> None:
-        """Store the newest of the states that arrived since the last call, if any."""
+        """Store the newest of the states that arrived since the last call, if one arrived."""
         now = time.monotonic()
         for state in self._watch.look(now)[-1:]:
             self._take(state, now)

@@ -1,8 +1,8 @@
 """Drives the robot from the keyboard with the keys of teleop_twist_keyboard.
 
-A terminal reports a key press but never its release. Each press therefore drives for `HOLD_S`. Once
-the keyboard repeats a held key, each repeat drives for `REPEAT_S` only. After that the tool sends
-three zeros and then nothing.
+A terminal reports a key press but never its release. Each press therefore drives the robot for
+`HOLD_S`. Once the keyboard repeats a held key, each repeat drives the robot for `REPEAT_S` only.
+When this time is over, the tool sends three zeros and then nothing.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ would stutter.
 """
 
 REPEAT_S, REPEATS = 0.25, 3
-"""Time for which a repeat of a held key drives the robot, s, and the number of presses after which
-the key counts as held, each within `REPEAT_S` of the press before.
+"""A held key drives the robot for `REPEAT_S` seconds after each of its repeats.
 
-Keyboards repeat a held key 10 to 30 times a second.
+A key counts as held after `REPEATS` repeats, each within `REPEAT_S` of the press before. Keyboards
+repeat a held key 10 to 30 times a second.
 """
 
 BURST = 8
@@ -37,7 +37,7 @@ connection that stalled, and the operator may have released the key long ago.
 """
 
 BURST_S = 0.2
-"""Time for which keys that follow a burst belong to it, s."""
+"""Time after a burst of keys for which further keys belong to the burst, s."""
 
 STOP = " "
 
@@ -59,7 +59,7 @@ class Keyboard:
         self.linear, self.angular = linear, angular
         self._move = (0, 0)
         self._pressed, self._repeats = 0.0, 0
-        """Monotonic time of the last press of a move, s, and the number of repeats until then."""
+        """Monotonic time of the last press of a driving key, s, and number of its repeats."""
         self._until = 0.0
         self._old_until = 0.0
         """Monotonic time until which all keys belong to the last burst, s."""
@@ -68,7 +68,7 @@ class Keyboard:
     def take(self, text: str, now: float) -> None:
         """Process the text of one terminal read at `now` (monotonic clock, s).
 
-        A burst of keys only stops the robot: it does not show what the operator wants now.
+        A burst of keys stops the robot, because old keys do not show what the operator wants now.
         """
         keys = split(text)
         if len(keys) > BURST:
@@ -102,7 +102,7 @@ class Keyboard:
 
 
 class Ride:
-    """Connects the keys and the robot: sends the commands, and receives the robot's state."""
+    """Sends the commands of the typed keys to the robot, and receives the robot's state."""
 
     def __init__(self, robot: Client, keyboard: Keyboard) -> None:
         self._robot, self._keyboard = robot, keyboard

@@ -1,7 +1,8 @@
-"""The parts of a narrow screen: the same figures as on a wide one, but one below the other.
+"""Builds the parts of the screen of `acsard top` for a narrow terminal. This module is pure.
 
-This module is pure. Continued lines are indented. The figures since the start of the daemon come
-last, so a screen with few lines cuts them off first.
+The figures are those of `wide_screen.py`, but they are below each other. Continued lines are
+indented. The figures since the start of the daemon come last, so a screen with few lines cuts them
+off first.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from acsard.top.wide_screen import (
 )
 
 BELOW = 80
-"""Width in cells from which the wide layout is used."""
+"""Width of the terminal, in character cells, from which the wide layout is used."""
 
 BAR = 4
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Return pose and twist, then the wheels in their positions on the robot."""
+    """Return lines with pose and twist, then lines with the speeds of the front and rear wheels."""
     told = [
         f"x {signed(state.x, 3, 8)} m",
         f"y {signed(state.y, 3, 8)} m",
@@ -57,9 +58,10 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return a line with priority and age for each source, and why it does not drive, if so.
+    """Return lines about each command source: its priority, its age, and what it waits for.
 
-    There are about `room` lines. If the sources do not fit, the last line names the others.
+    If the sources need more than about `room` lines, the last line names the sources that are left
+    out.
     """
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)
@@ -80,7 +82,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link, the commands and the refusals."""
+    """Return the lines about the serial link, the commands, and rejected lines and commands."""
     before = seen.before or state
     lines = [rule(width, [(0, title(seen, state))])]
     if state.certificate_expiry:

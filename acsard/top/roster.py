@@ -18,19 +18,22 @@ from acsard.top.drive_screen import reason
 HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
 
 ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
-"""Maximum widths of all columns except the last, which gets the remaining width. The first column
-is as wide as its longest id."""
+"""Maximum widths, in characters, of all columns except the last, which gets the remaining width."""
 
 NAME, WHY = 12, 32
-"""Minimum widths of the first and last column. The first column becomes narrower to leave the last
-one its minimum, but never narrower than its own minimum."""
+"""Minimum widths of the columns ROBOT and WHY, in characters.
+
+On a narrow terminal the column ROBOT shrinks, but not below its minimum, so that WHY gets its own.
+"""
 
 BATTERY = HEADS.index("BATTERY")
 """Column of the state of charge. The table shows it only if a robot reports a battery."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""Modes that need attention. Robots in these modes are listed first, because the lines may not all
-fit. Robots with a warning come next."""
+"""Modes of a robot that need attention, and the words for a robot that is absent.
+
+The table lists such robots first, because not all lines may fit. Robots with a warning come next.
+"""
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
@@ -83,7 +86,7 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
 
 
 def told(row: Row) -> tuple[str, ...]:
-    """Return the cells of a row in the order of `HEADS`."""
+    """Return the texts of the cells of a robot's row, in the order of the headings `HEADS`."""
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"

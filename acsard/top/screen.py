@@ -1,8 +1,8 @@
 """One screen of `acsard top`: turns a robot's state into lines of coloured text.
 
 This module is pure. Each line is cut to the width of the terminal, and the number of lines to its
-height, so no message can break the layout. If space is short, empty lines are left out first, then
-sources.
+height, so no message can break the layout. If space is short, the screen first leaves out empty
+lines, and then command sources.
 """
 
 from __future__ import annotations
@@ -90,7 +90,10 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return the warnings, in one line on a wide screen. Show details if there is only one."""
+    """Return the lines with the warnings: one line on a wide screen, and none without a warning.
+
+    A single warning is shown with its details.
+    """
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
     wide = width >= narrow_screen.BELOW

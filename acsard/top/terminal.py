@@ -1,6 +1,6 @@
-"""The screens of `top`, `fleet` and `drive`, and lines for a terminal that shows no screens.
+"""Shows the screens of `acsard top`, `fleet` and `drive`. A simple terminal gets lines for `drive`.
 
-A screen ends with a key or a signal. ^Z suspends it, and `fg` resumes.
+A key or a signal ends a screen. Ctrl-Z suspends it, and `fg` resumes it.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ KEYS_S = 0.05
 """Interval at which the keys of a drive are read, s."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Shortest intervals between two reports on a terminal without a screen, s.
+"""Shortest times between two reports of a drive on a terminal that cannot show a screen, s.
 
-They apply, in this order, after a change, while the robot moves, and at other times.
+The first applies after a change, the second while the robot moves, and the third otherwise.
 """
 
 NO_END = 10**9
@@ -98,7 +98,7 @@ def part(ride: Ride) -> None:
 
 
 def roster(fleet: Roster) -> None:
-    """Show a line for each robot, and update them until `q`, the end of input or a signal."""
+    """Show a line for each robot until `q` is typed, the input ends or a signal arrives."""
     console = Console()
 
     def draw() -> RenderableType:
@@ -141,8 +141,8 @@ def _screen(console: Console) -> Live:
 def _hold(shows: Callable[[list[bool]], bool]) -> None:
     """Show a screen until a signal arrives or `shows` returns False.
 
-    `shows` gets a list that becomes non-empty when the user presses ^Z. It must then leave its
-    screen and return True, and is called again after `fg`.
+    `shows` gets a list that becomes non-empty when the user presses Ctrl-Z. Then `shows` must leave
+    the screen and return True, and this function calls it again after `fg`.
     """
     _be_lenient()
     suspend: list[bool] = []
@@ -154,7 +154,7 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
 
 
 def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
-    """Drive and show the screen. Return True at ^Z, and False when the input ends."""
+    """Drive and show the screen. Return True on Ctrl-Z, and False when the input ends."""
     with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
@@ -209,9 +209,10 @@ def until_told() -> Iterator[None]:
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str | None]]:
-    """Yield a function that waits up to a number of seconds for keys.
+    """Yield a function that takes a number of seconds, waits that long for keys, and returns them.
 
-    The function returns "" if no key was typed, and None when the input has ended.
+    The function returns "" if no key was typed, and None when the input has ended. If standard
+    input is not a terminal, it always returns "".
     """
 
     def read(seconds: float) -> str | None:
@@ -253,7 +254,7 @@ def output_size() -> os.terminal_size:
 
 
 class News:
-    """Decides when a report is due on a terminal that cannot show a screen. The class is pure."""
+    """Decides when a report of a drive is due on a terminal that cannot show a screen."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
@@ -273,14 +274,14 @@ class News:
 
 
 class Page:
-    """Adds the help to reports, again before it scrolls out of sight. The class is pure."""
+    """Repeats the help about the keys whenever reports would scroll it out of sight."""
 
     def __init__(self) -> None:
         self._shown = NO_END
         """Number of lines printed since the first line of the help."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """Return the lines of a report. Put the help first if it would be out of sight otherwise.
+        """Return the lines `told` of a report, with the help first if it is no longer in sight.
 
         `height` is the number of lines of the terminal.
         """

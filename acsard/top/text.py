@@ -1,4 +1,4 @@
-"""The data, the values and the lines on the screen of `acsard top`. This module is pure.
+"""Formats the values and the lines of the screen of `acsard top`. This module is pure.
 
 Every value becomes a text of bounded length, whatever arrives on the bus. Text from the bus reaches
 the terminal only through `clean`, and only inside rich's `Text`, which does not interpret markup.
@@ -29,7 +29,7 @@ MODES = {
 
 
 class ScreenData(Struct, frozen=True):
-    """Everything that the screen shows; `before` is an earlier state, used to compute rates."""
+    """Everything that the screen shows. Rates are computed from the earlier state `before`."""
 
     robot_id: str
     endpoint: str
@@ -44,8 +44,11 @@ class ScreenData(Struct, frozen=True):
     silent: bool = False
     """True if the robot is silent, so the shown data is old."""
     passed: float = 0.0
-    """Seconds from `before` to `state` on the local clock. The difference of their stamps deviates
-    from it by more than the network delay only if the robot's clock was set."""
+    """Seconds from the arrival of `before` to the arrival of `state`, on the local clock.
+
+    If the time between their stamps differs from it by more than the network delay, the robot's
+    clock was set.
+    """
 
 
 _EIGHTHS = " ▏▎▍▌▋▊▉█"

@@ -1,6 +1,6 @@
-"""Builds the parts of a wide screen that follow the mode. Each begins with a horizontal rule.
+"""Builds the parts of the screen of `acsard top` for a wide terminal. This module is pure.
 
-This module is pure.
+The parts are below the mode of the robot, and each begins with a horizontal line.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ from acsard.daemon.latencies import NAMES
 from acsard.top.text import ScreenData, bar, clean, count, rate, row, rule
 
 WIDEST = 116
-"""Maximum width in cells; longer lines are harder to read."""
+"""Maximum width of the screen in character cells. Longer lines are harder to read."""
 
 SHORT_WORDS, LONG_WORDS = 21, 56
-"""Widths of the explanation of each figure, cells. The long form is used from `WIDEST` on."""
+"""Widths of the short and the long explanation of a figure, in character cells.
+
+The long explanation is used if the screen is `WIDEST` cells wide.
+"""
 
 MOST_REASONS, MOST_PORT = 16, 34
 
@@ -36,12 +39,14 @@ FIGURES = {
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
-"""Short and long explanation of each `latencies.Name`. An arrow leads from the first moment of the
-interval to the last."""
+"""Maps each latency (`latencies.Name`) to a short and a long explanation.
+
+In the short one, an arrow leads from the beginning of the measured interval to its end.
+"""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Return pose and twist on the left, and the wheels in their places on the right."""
+    """Return lines with pose and twist on the left, and the wheel speeds on the right."""
     (right, left, rear_left, rear_right), scale = speeds(state)
     cells = 6 + max(0, width - 80) // 2
     at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))
@@ -59,7 +64,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Return the four wheel speeds (NaN if unknown) and the speed of a full bar, rad/s."""
+    """Return the four wheel speeds (NaN if unknown) and the speed that fills a bar, rad/s."""
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
     return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
@@ -102,7 +107,7 @@ def drives(source: SourceState, state: RobotState) -> bool:
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return what a source waits for before it drives, or "nothing" with an explanation."""
+    """Return in words what a source waits for. If that is nothing, say why it drives or not."""
     if source.waits_for:
         return clean(source.waits_for)
     if drives(source, state):
@@ -121,7 +126,7 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link, the commands and the refusals."""
+    """Return the lines about the serial link, the commands, and rejected lines and commands."""
     before = seen.before or state
     head = title(seen, state)
     titles: list[tuple[int, str | Text]] = [(0, head)]
@@ -167,9 +172,9 @@ def certificate(state: RobotState) -> Text:
 
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
-    """Return a function that formats the rate and the total of a counter."""
-    # Stamps are exact. If they differ from the local clock by more than a network's delay, the
-    # robot's clock was set, so the local clock is used.
+    """Return a function that takes the name of a counter, and formats its rate and its total."""
+    # The stamps of the states give the exact time between them. If that time differs from the local
+    # one by more than a network's delay, the robot's clock was set, so use the local time.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
     if abs(seconds - seen.passed) > 0.2:
         seconds = seen.passed

@@ -1,1 +1,1 @@
-"""The robot's web page: `acsard web` is a process of its own and a client of the bus."""
+"""`acsard web`: a process that serves the robot's web page, and is a client of the bus."""

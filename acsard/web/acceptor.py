@@ -3,15 +3,15 @@
 No other module counts connections. A connection goes through these states:
 
 1. silent: it has only a socket and a place in `Sockets`. TLS starts with the first byte, so a
-   silent connection costs a file descriptor and no memory;
+   silent connection costs a file descriptor and almost no memory;
 2. waiting, if `HANDSHAKES_AT_ONCE` others are in the TLS handshake, or if its network has begun too
    many handshakes lately;
 3. starting: in the TLS handshake, for at most `HANDSHAKE_S`, or `HURRIED_S` if others wait;
 4. open: aiohttp reads its requests.
 
 If all places are taken, `Sockets` chooses the connection to close. The first request must arrive
-within `REQUEST_S`. By itself, aiohttp answers bytes that are not an HTTP request with a bare line,
-and logs a traceback each time. `Reader` answers them with an explanation, and counts the refusal.
+within `REQUEST_S`. `Reader` answers bytes that are not an HTTP request with an explanation, and
+counts the refusal. aiohttp alone would log a traceback each time.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 """Time limit for a TLS handshake, s, and maximum number of handshakes at once."""
 
 HURRIED_S = 0.3
-"""Time limit, s, for a TLS handshake of the network with the most handshakes, while other
-connections wait for theirs. Clients that fall silent in their handshakes must not keep a phone
-waiting for `HANDSHAKE_S`."""
+"""Time limit, s, for a TLS handshake while other connections wait for theirs. It applies to the
+network with the most handshakes. Without it, clients that fall silent in their handshakes would
+delay a phone by `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit, s, from accepting a connection to the head of its first request. After that, the
@@ -52,12 +52,12 @@ connection is cut."""
 
 UNREAD_S = 5.0
 """Time limit, s, for a client that does not read its answers, or whose network is lost. The kernel
-ends the connection if the client has not acknowledged sent data for this long, or has kept its
-receive window closed for this long."""
+ends the connection if the client acknowledges no data, or keeps its receive window closed, for this
+long."""
 
 READ_BYTES = 16384
-"""Size of asyncio's read buffer per TLS connection: one TLS record. Its default of 256 KiB is the
-larger part of the memory of an idle connection."""
+"""Size of asyncio's read buffer per TLS connection, bytes: one TLS record. The default of 256 KiB
+would be most of the memory of an idle connection."""
 
 PAUSE_S = 0.05
 """Time, s, for which a listening address accepts no connection after the process has reached its
@@ -67,10 +67,10 @@ Factory = Callable[[], "Reader"]
 
 
 class Acceptor:
-    """The listening addresses and their connections.
+    """Accepts TCP connections at the listening addresses, and closes those beyond a limit.
 
-    Clients on the robot itself have places of their own, so clients from the network can never lock
-    out a browser on the robot.
+    Connections from the robot itself are counted separately, so clients from the network can never
+    lock out a browser on the robot.
     """
 
     def __init__(self, counts: Counts) -> None:
@@ -80,8 +80,8 @@ class Acceptor:
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
-        """The connections that wait for their handshake, by network. After a start, the network of
-        the started connection moves to the end."""
+        """The connections that wait for their handshake, by network. When a handshake starts, its
+        network moves to the end."""
         self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
         """The connections in the TLS handshake, each with the time of its start, oldest first."""
@@ -91,7 +91,7 @@ class Acceptor:
         """The connections whose token was no longer valid at the last call of `tidy`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Accept connections at a listening socket; `make` creates their protocol.
+        """Accept connections at a listening socket; `make` creates the handler of each.
 
         `secure` is None for plain HTTP.
         """
@@ -103,7 +103,7 @@ class Acceptor:
         self._resume(opened, secure, make)
 
     def close(self) -> None:
-        """Accept no more connections, and cut those whose client is not known (see `admitted`)."""
+        """Accept no more connections, and cut those on which no client has been identified."""
         loop = asyncio.get_running_loop()
         for opened in self._listeners:
             loop.remove_reader(opened)
@@ -114,14 +114,17 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """Cancel the time limit of a connection on which a request with this body has begun."""
+        """Record that a request has begun on this connection, which ends the limit `REQUEST_S`.
+
+        `body` is the body of the request.
+        """
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
-        """Record that `who` is the client of this connection.
+        """Record that the client of this connection has been identified as `who`.
 
-        When places run out, connections without a known client are closed first.
+        If all places are taken, connections without an identified client are closed first.
         """
         if (one := _connection(transport)) is not None:
             one.pool.prove(one, who.token)
@@ -161,8 +164,8 @@ class Acceptor:
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Close a connection to free its file descriptor; accept again after `PAUSE_S`.
 
-        A connection from the robot itself is closed only if `Sockets` allows closing none from
-        another machine.
+        A connection from another machine is closed if `Sockets` allows that, else one from the
+        robot itself.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
@@ -173,7 +176,7 @@ class Acceptor:
     # The connections call the methods below.
 
     def crowded(self, one: _Connection) -> None:
-        """Cut a connection that has no place or sends endless headers, and count the refusal."""
+        """Cut a connection that has no place or sends too long a header, and count the refusal."""
         self._counts.refuse("crowded", one.peer)
         one.cut()
 
@@ -189,14 +192,14 @@ class Acceptor:
             self._next()
 
     def give_up(self, one: _Connection) -> None:
-        """Forget a connection that waits for its handshake."""
+        """Remove a connection from those that wait for their TLS handshake."""
         same = self._waiting.get(one.network, {})
         same.pop(one, None)
         if not same:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Record the end of this connection's handshake, and start the next one."""
+        """Record that a connection's handshake has ended, and let the next one start."""
         self._starting.pop(one, None)
         if self._again is None:
             self._next()
@@ -223,9 +226,9 @@ class Acceptor:
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a handshake may start.
+        """Return whether another handshake may start.
 
-        If the limit is reached, make room by cutting a handshake that is older than `HURRIED_S`.
+        If `HANDSHAKES_AT_ONCE` are running, cut one that is older than `HURRIED_S` to make room.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
@@ -244,7 +247,7 @@ class Acceptor:
 
 
 class _Connection(asyncio.Protocol):
-    """One connection, which passes its data on to the inner protocol once it is open."""
+    """One TCP connection. Once it is open, it passes its data to a `Reader`."""
 
     def __init__(
         self,
@@ -262,13 +265,13 @@ class _Connection(asyncio.Protocol):
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
         self._head = 0
-        """Number of bytes received of the next request's head."""
+        """Number of bytes of the next request's head (request line and headers) received so far."""
         self._body: StreamReader | None = None
         """The body of the last request."""
         self._inner: Reader | None = None
 
     def enter(self) -> None:
-        """Acquire a place and wait for the first byte; cut the connection if no place is free."""
+        """Acquire a place and wait for the first byte. Cut the connection if it gets no place."""
         gone = self.pool.enter(self.network, self)
         if gone is self:
             self._acceptor.crowded(self)
@@ -324,7 +327,6 @@ class _Connection(asyncio.Protocol):
                 self._leave()
 
     def cut(self) -> None:
-        """Close the connection at once."""
         self._leave()
         if self._transport is not None:
             self._transport.abort()  # type: ignore[attr-defined]
@@ -338,7 +340,7 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Cancel the limits for a request's head, because a request with `body` has begun."""
+        """End the limits for a request's head, because the head of a request has arrived."""
         self._head, self._body = 0, body
         self._cancel_timer()
 
@@ -347,7 +349,6 @@ class _Connection(asyncio.Protocol):
             self._timer.cancel()
 
     def _leave(self) -> None:
-        """Cancel the timer, and release the place in the pool."""
         self._cancel_timer()
         self.pool.leave(self)
 
@@ -398,7 +399,7 @@ def _connection(transport: asyncio.BaseTransport | None) -> _Connection | None:
 
 
 class Reader(RequestHandler):
-    """Protocol handler of one connection."""
+    """aiohttp's handler of one connection, with an answer of its own to invalid requests."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
         """Create a handler for `server`, which is the server of the application's runner."""
@@ -420,9 +421,9 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """Answer bytes that are not a valid HTTP request.
+        """Answer bytes that are not a valid HTTP request, and count the refusal.
 
-        aiohttp answers errors of the application (status 500 and above) itself.
+        Errors of the application (status 500 and above) are left to aiohttp.
         """
         if status >= 500:
             return super().handle_error(request, status, exc, message)

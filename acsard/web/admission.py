@@ -1,9 +1,9 @@
-"""Admission of requests, between the socket and the handler of a row in the table of routes.
+"""Decides whether an HTTP request reaches the handler of its row in the table of routes.
 
 `Admission` checks each request in this order: whether the client is on the robot (`callers.py`),
-the origin of the web page that sent the request, its token, its rate, and the role that the row
-requires. Only then does the handler see the request, and with it the caller's identity (a `Who`). A
-path without a row requires a token as well, so a stranger does not learn which paths exist.
+the origin of the web page that sent the request, the token, the request rate, and the role that the
+row requires. The handler of an admitted request finds the client's identity, a `Who`, in the
+request. A path without a row also requires a token, so a stranger does not learn which paths exist.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?
 header."""
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""Refusal reason per HTTP status that aiohttp raises by itself. Every other status counts as
-`malformed`."""
+"""The reason under which an error of aiohttp is counted as a refusal, by HTTP status. Every other
+status counts as `malformed`."""
 
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
@@ -57,8 +57,8 @@ WORDS = {
 }
 
 WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
-"""Key of the caller's identity in a request. A request to a row that is open to everybody has no
-identity."""
+"""Key under which a request contains the client's identity. There is none for a path that is open
+to every client."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -77,9 +77,10 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the tokens, read after this call, so that none of them was revoked before it.
+        """Return the tokens from a read of the token file that starts after this call.
 
-        Raises `TimeoutError` if the disk does not answer.
+        So a token that was revoked before the call is not among them. Raises `TimeoutError` if the
+        disk does not answer.
         """
         if self._next is None:
             self._next = asyncio.create_task(self._later())
@@ -95,7 +96,7 @@ class Lookups:
 
 
 class Admission:
-    """Finds the row of each request, and refuses the request or hands it to the row's handler."""
+    """Finds the route of each HTTP request, and refuses the request or passes it to the handler."""
 
     def __init__(
         self,
@@ -132,10 +133,10 @@ class Admission:
         return app
 
     async def owner(self, peer: str, shown: Sequence[str]) -> Who:
-        """Return the owner of the first valid token in `shown`.
+        """Return the owner of the first valid token in `shown`, the tokens that a client has sent.
 
-        `peer` is the client's IP address. Raises `RefusedError`, and `TimeoutError` if the disk
-        does not answer within `READ_S`.
+        `peer` is the client's IP address. Raises `RefusedError` if no token is valid, and
+        `TimeoutError` if the disk does not answer within `READ_S`.
         """
         if not any(shown):
             raise RefusedError(
@@ -202,8 +203,9 @@ class Admission:
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
         """Check a request; return whether it, or its answer, must wait because of its rate.
 
-        `row` is None for a path that does not exist. The identity of the caller is stored in the
-        request unless the row is open to everybody. Raises `RefusedError`.
+        `row` is the route of the request, None for a path that does not exist. The identity of the
+        client is stored in the request unless the route is open to every client. Raises
+        `RefusedError`.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -237,7 +239,6 @@ class Admission:
         return fast
 
     def _too_fast(self, who: Who, row: Route | None) -> bool:
-        """Count a request; return whether it exceeds the rate of `row`, or `REQUESTS` for None."""
         if not who.token:
             return False  # clients on the robot itself have no rate limit
         rate = row.rate if row else REQUESTS
@@ -270,7 +271,7 @@ class Admission:
 
 
 def asked_of(request: web.Request) -> Asked:
-    """Return the facts of a request that decide about its admission, none of them trusted yet."""
+    """Return the facts of a request that decide about its admission. The headers may be forged."""
     hosts = request.headers.getall("Host", [])
     return Asked(
         peer_of(request),
@@ -287,33 +288,37 @@ def asked_of(request: web.Request) -> Asked:
 
 
 def peer_of(request: web.Request) -> str:
-    """Return the address of the client."""
+    """Return the IP address of the client."""
     return unmapped(request.remote or "")
 
 
 def own_address(request: web.Request) -> str:
-    """Return the local address that the client connected to.
+    """Return the IP address of this machine that the client connected to.
 
-    Unlike a host name, it cannot be forged.
+    Unlike the `Host` header, this address cannot be forged.
     """
     return unmapped(_reached(request)[0].lower())
 
 
 def own_port(request: web.Request) -> int:
-    """Return the local port that the client connected to."""
+    """Return the port of this machine that the client connected to."""
     return _reached(request)[1]
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens of a request, the likeliest to be valid first.
+    """Return the tokens in a request, the likeliest to be valid first.
 
-    They come from its headers or, if these contain none, from the browser's cookies for `robot`.
+    The tokens are those in its headers. If the headers contain none, they are those in its cookies
+    for the page of the robot with the id `robot`.
     """
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the bearer token or, without one, the tokens in the subprotocols of a WebSocket."""
+    """Return the token in the header `Authorization`, as a list of one.
+
+    Without this header, return the tokens in the subprotocols that a WebSocket client offers.
+    """
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

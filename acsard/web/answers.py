@@ -53,12 +53,16 @@ POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy. `{connect}` stands for the WebSocket URLs of the page's host. A refusal
-names none, because a refused request may have a foreign `Host`, which must not be echoed."""
+"""Content security policy of every answer except a report. `{connect}` stands for the WebSocket
+URLs of the page's host. It is empty in a refusal, because a refused request may have a foreign
+`Host`, which must not be sent back."""
 
 
 class TroubleError(AcsardError):
-    """A request that cannot be fulfilled now or here, with its HTTP status and an explanation."""
+    """A request that is allowed cannot be fulfilled. The text of the error gives the reason.
+
+    `status` is the HTTP status of the answer.
+    """
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -71,7 +75,7 @@ def reply(body: object, status: int = 200) -> web.Response:
 
 
 def problem(status: int, text: str) -> web.Response:
-    """Return an error response with an explanation."""
+    """Return an error response with the reason `text` in JSON."""
     return reply(Problem(text), status)
 
 
@@ -113,7 +117,6 @@ async def sent_in_pieces(
 
 
 def takes_gzip(request: web.Request) -> bool:
-    """Return whether the client accepts gzip."""
     return "gzip" in request.headers.get("Accept-Encoding", "")
 
 
@@ -153,12 +156,15 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Maps a file to the files that are sent inside it. Each of these comes with the HTML element that
-loads it in the source of the outer file, and the name of the element that contains it when sent."""
+"""The files that are sent inside another file, by the name of the outer file.
+
+The value of an inner file has two parts: the HTML element in the outer file that would load it, and
+the name of the element that replaces this one and contains the inner file.
+"""
 
 
 class File(Struct, frozen=True):
-    """A file in the form in which it is sent."""
+    """A file of the page in the form in which it is sent."""
 
     kind: str
     body: bytes
@@ -166,12 +172,13 @@ class File(Struct, frozen=True):
     """The gzip form of the body, or None if it is not shorter."""
     tag: str
     policy: str
-    """Directives of the content security policy for the files inside this one."""
+    """Directives of the content security policy that allow the files inside this one."""
     stamp: tuple[tuple[int, int], ...]
+    """Modification time, ns, and size, bytes, of this file and of the files inside it."""
 
 
 class Files:
-    """The files of a directory, cached until they change on disk."""
+    """The page's files in a directory, kept in memory until they change on the disk."""
 
     def __init__(self, directory: Path = PAGE) -> None:
         self._directory = directory

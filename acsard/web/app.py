@@ -1,8 +1,8 @@
 """The request handlers of the page's server, and the table of all its paths (`ROUTES`).
 
-A request comes to a handler here after `Admission` has found its row in `ROUTES` and admitted the
-caller. If a request fails through the caller's fault, the handler raises `RefusedError`, which is
-counted. If it cannot be fulfilled now, the handler raises `TroubleError`.
+`Admission` finds the row of a request in `ROUTES`, and calls the row's handler if the client may
+use the path. If the request itself is at fault, the handler raises `RefusedError`, which is
+counted. If the request cannot be fulfilled now, the handler raises `TroubleError`.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
-"""Time limit for a body of a few hundred bytes, s. A client that withholds its body occupies a
-connection."""
+"""Time limit for the body of a request, s. A body has a few hundred bytes, and a client that does
+not send it occupies a connection."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status for each state of a report."""
@@ -94,7 +94,7 @@ class Setting(Struct, frozen=True, omit_defaults=True):
 
 
 class Page:
-    """The application and the state that its request handlers share."""
+    """The web application of the robot's page: its request handlers and their common state."""
 
     def __init__(
         self,
@@ -104,25 +104,28 @@ class Page:
         acceptor: Acceptor,
         rules: WebConfig = DEFAULT,
     ) -> None:
-        """Make the application; `names` and `rules` are those of `Admission`."""
+        """Make the web application.
+
+        `names` are the host names and addresses of the robot, in lower case. `rules` is the table
+        `[web]` of the configuration. The other arguments are shared with the rest of the server.
+        """
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
         self._robots, self._files, self._reports = parts.robots, Files(), Reports()
         self._box = BlackBox(parts.robots)
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
-        """The files of the page by name. Each has the time at which it was last compared with the
-        disk, s on the event loop's clock."""
+        """The page's files by name, each with the time at which it was last compared with the disk,
+        s on the event loop's clock."""
         self._viewers: set[Viewer] = set()
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """End the report, the camera and every connection.
+        """Cancel the report, stop reading the camera, and close every WebSocket.
 
-        `Viewer.end` also stops a robot that a viewer is driving.
-
-        `why` is sent as the close reason, at most 120 characters.
+        A robot that a viewer drives gets a last zero. `why` is sent to the clients as the reason
+        for closing, at most 120 characters.
         """
         self._reports.end()
         self._camera.close()
@@ -130,11 +133,11 @@ class Page:
             viewer.end(why)
 
     async def tidy(self) -> None:
-        """Drop expired work; the server calls this once a second.
+        """End connections whose token is not valid any more, and reports that no client waits for.
 
-        A connection is ended if its token has expired, was revoked, or cannot be read from the
-        disk within `READ_S`. A WebSocket gets the reason first. A report that no client waits for
-        is given up.
+        The server calls this method once a second. A token is not valid if it has expired, was
+        revoked, or cannot be read from the disk within `READ_S`. The client of a WebSocket is told
+        the reason before its connection ends.
         """
         self._reports.tidy()
         try:
@@ -174,7 +177,7 @@ class Page:
         return sent(request, file)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
-        """Exchange a posted token for an `HttpOnly` cookie, which scripts cannot read."""
+        """Check a posted token, and put the token into a cookie that no script can read."""
         form = await _token_posted(request)
         if not request.secure:
             raise RefusedError("plain", "this robot uses no tokens: connect without one")
@@ -201,7 +204,7 @@ class Page:
         who, peer = request[WHO], peer_of(request)
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
-            # aiohttp would log the names of all protocols if it knew none of them.
+            # If aiohttp knew none of the offered names, it would log all of them with the token.
             raise RefusedError(
                 "malformed", f"offer the subprotocol {PROTOCOL} as well as the token"
             )
@@ -278,9 +281,9 @@ class Page:
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Wait for a camera picture that the client has not seen; return it, or 304 if none comes.
+        """Wait for a camera picture that the client has not seen; answer 304 if none comes.
 
-        The header `If-None-Match` contains the number of the last picture that the client has seen.
+        The header `If-None-Match` has the number of the last picture that the client has seen.
         """
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.mono_ns()
@@ -330,7 +333,6 @@ class Page:
         return web.Response(body=await in_thread(lambda: decompress(body), None), headers=headers)
 
     async def _value(self, key: str) -> bytes:
-        """Return the last value of a key as JSON."""
         try:
             return as_json(*await self._parts.calls.get(self._robots.id, key))
         except NoAnswerError as error:
@@ -340,9 +342,9 @@ class Page:
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
-    """Return the settings that can be changed at run time, in the order of `config`.
+    """Return the settings in `config` that can be changed at run time, in the same order.
 
-    `config` is a decoded value of the bus key of that name.
+    `config` is the robot's configuration as plain tables, the decoded value of the key `config`.
     """
     return [
         Setting(key, value, told.what, WHEN[told.when], **_allowed(key))
@@ -352,7 +354,6 @@ def settings_in(config: Mapping[str, Any]) -> list[Setting]:
 
 
 def _allowed(key: str) -> dict[str, Any]:
-    """Return the range or the choices of a setting, as fields of `Setting`."""
     kind = kind_of(key)
     match kind.type if isinstance(kind, inspect.Metadata) else kind:
         case inspect.FloatType(ge=float(low), le=float(high)):
@@ -390,7 +391,7 @@ async def _token_posted(request: web.Request) -> TokenForm:
 def _limit_buffer(request: web.Request) -> None:
     at = None if request.transport is None else request.transport.get_extra_info("socket")
     if at is not None:
-        # A larger send buffer of the kernel would deliver stale data.
+        # Data that waits in a larger send buffer of the kernel would be old when it arrives.
         at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
 
 

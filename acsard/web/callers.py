@@ -3,11 +3,13 @@
 This module is pure.
 
 A client on the robot itself needs no token and has the role in `web.local`. However, any web page
-in a browser on the robot may open `ws://localhost`, or may point its own host name at 127.0.0.1. So
-`Host` must be a loopback name. `Origin`, if the browser sends it, must be that of the robot's own
-page or one in `web.origins`. A client from another machine must use HTTPS, a host name that the
-robot has, and a token. Requests through a proxy are refused: a proxy on the robot that rewrites
-`Host` would give every client behind it the role of a client on the robot itself.
+in a browser on the robot may open `ws://localhost`, or may let its own host name point to
+127.0.0.1. So the header `Host` must be a loopback name. If the browser sends the header `Origin`,
+it must be that of the robot's own page or one in `web.origins`. A client on another machine must
+use HTTPS, a host name of the robot, and a token.
+
+A request through a proxy is refused. A proxy on the robot that rewrites `Host` would give each of
+its clients the role of a client on the robot itself.
 """
 
 from __future__ import annotations
@@ -25,12 +27,12 @@ Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
     "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy", "stuck",
 ]  # fmt: skip
-"""Reason under which a refusal is counted."""
+"""Short name of the reason for a refusal, under which refusals are counted."""
 
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name of a client on the robot itself."""
+"""Name of every client on the robot itself, which shows no token."""
 
 COOKIE = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a `__Host-` cookie only if it is Secure, without a
@@ -45,7 +47,7 @@ tokens."""
 
 
 class RefusedError(AcsardError):
-    """A refusal of a request or a message; the text gives the reason and the remedy."""
+    """A request or message of a client is refused; the text gives the reason and the remedy."""
 
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(text)
@@ -68,7 +70,7 @@ class Who(Struct, frozen=True):
         return f"{self.address} ({self.name})" if self.token else self.address
 
     def may(self, least: Role) -> bool:
-        """Return whether the client has at least this role."""
+        """Return whether the client has at least the role `least`."""
         return has(self.role, least)
 
     def require(self, least: Role, what: str) -> None:
@@ -145,8 +147,8 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    `origins` are in lower case. The result is False for the robot's own page, even if its origin
-    is listed: cookies from a listed page are ignored, so the robot's page could not stop the robot.
+    `origins` are in lower case. The result is False for the robot's own page, even if its origin is
+    listed. Otherwise the cookies of the robot's page would be ignored, as those of other pages are.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False
@@ -176,10 +178,10 @@ def cookie_name(robot: str, port: int) -> str:
 
 
 def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
-    """Return the tokens in cookies that may be valid for the page of this robot at this port.
+    """Return the tokens in the cookies of a request to the page of this robot at this port.
 
-    The page's own cookie comes first, because it is the likeliest to be valid.
-    Cookies of the same robot at other ports follow.
+    The cookie for this port comes first, because it is the likeliest to be valid. The cookies for
+    other ports of the same robot follow.
     """
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
     names = [name for name in cookies if name.rpartition("-")[0] == ours]
@@ -202,9 +204,10 @@ def unmapped(address: str) -> str:
 
 
 def network_of(address: str) -> str:
-    """Return the name under which the limits count an address: for IPv6, its /64 network.
+    """Return the network under which the limits count an address.
 
-    One machine may use any number of addresses of its /64 network.
+    It is the /64 network of an IPv6 address, because one machine may use any address in it. For
+    IPv4, it is the address itself.
     """
     if ":" not in address:
         return address

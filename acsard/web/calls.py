@@ -1,8 +1,9 @@
 """Service calls and queries to the robot.
 
-Each call blocks a thread of its own, and the number of calls is limited, so a stop never waits
-for other calls. If one client sends several stops to one robot in quick succession, they are
-merged: each is answered with the reply to a stop that was sent to the robot after its arrival.
+Each call blocks a thread of its own. Stops have their own limits, so a stop never waits for other
+calls. If one client sends several stops to one robot in quick succession, the server may send one
+stop for several of them. This stop is sent after they have arrived, and each of them is answered
+with the reply to this stop.
 """
 
 from __future__ import annotations
@@ -28,20 +29,21 @@ from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Maximum number of concurrent requests of all viewers together, and of concurrent stops of the
-page's own robot. Stops beyond their limit share one request, because they stop the same robot."""
+"""Maximum number of concurrent requests of all clients together, and, counted separately, of stops
+of the page's own robot. Stops beyond their limit share one request, because they stop the same
+robot."""
 
 ELSEWHERE_AT_ONCE = 8
-"""Limit on concurrent stops of other robots that wait for an answer. A stop beyond the limit is
-still sent to its robot, but without waiting for the answer."""
+"""Maximum number of stops of other robots for whose answers the server waits at the same time. A
+stop beyond the limit is sent too, but the server does not wait for its answer."""
 
 MERGE_S = 0.02
-"""Shortest interval between two stops of one client to one robot, s. All stops that arrive within
-the interval are merged into one, which is sent at its end."""
+"""Shortest interval between two stops that the server sends for one client to one robot, s. Stops
+that arrive within the interval are merged into one, which is sent when the interval ends."""
 
 ANSWER_S = 8.0
-"""Time limit for an answer from the bus, s. The bus client gives up sooner, so the caller gets its
-error message."""
+"""Time limit for an answer from the bus, s. `Client` gives up sooner, with an error message for the
+user."""
 
 T = TypeVar("T")
 
@@ -50,12 +52,12 @@ Stop = Callable[[], Awaitable[ServiceReply]]
 
 
 class Ending(NamedTuple):
-    """Result of ending the check or calibration that the page's server had started."""
+    """The result of interrupting the check or calibration that the page's server runs."""
 
     words: str = ""
-    """Description of the result; empty if nothing was running."""
+    """The result in words; "" if nothing was running."""
     ended: bool = True
-    """False if the child process has not exited yet."""
+    """False if the interrupted process has not exited yet."""
 
 
 class Calls:
@@ -76,7 +78,7 @@ class Calls:
         self._stops, self._merged = Stops(), Merged()
         self._unknown = Buckets(STOPS_ELSEWHERE)
         self._answered: set[str] = set()
-        """The other robots that have answered a stop, so they exist."""
+        """Ids of the other robots that have answered a stop, which proves that they exist."""
         self._asks = Places(AT_ONCE, AT_ONCE)
         self._elsewhere = Places(ELSEWHERE_AT_ONCE, ELSEWHERE_AT_ONCE)
 
@@ -134,7 +136,7 @@ class Calls:
         """Query the last value of a key as JSON, and return its encoding and its payload.
 
         `robot` is the robot's id, and `name` is the key below it. Raises `MendableError` if there
-        is no connection, no answer, or no free slot.
+        is no connection or no answer, or if `AT_ONCE` other requests are running.
         """
         client = self._robots.client
         if client is None:
@@ -146,8 +148,8 @@ class Calls:
     ) -> ServiceReply:
         """Stop another robot, and return its reply.
 
-        The slots for waiting are limited, so stops of robots that do not exist cannot block other
-        callers. If no slot is free, the stop is sent without waiting for the reply.
+        A robot that does not exist never replies, so the number of stops that wait for a reply is
+        limited. Beyond the limit, the stop is sent without waiting for the reply.
         """
         with self._elsewhere.held() as free:
             if free:
@@ -173,8 +175,9 @@ class Calls:
             rate = STOPS_ELSEWHERE
             raise RefusedError(
                 "too_fast",
-                f"the stop was not sent: at most {rate.most:g} at once, and {rate.hz:g} a second, "
-                "may go to robots that have not answered yet; send it again",
+                "the stop was not sent: you have sent too many stops to robots that have not "
+                f"answered ({rate.most:g} at once and {rate.hz:g} a second are allowed); send it "
+                "again",
             )
 
     async def _ask(self, call: Callable[[], T]) -> T:
@@ -185,9 +188,9 @@ class Calls:
 
 
 class Merged:
-    """Sends the stops of each client to each robot, at most one every `MERGE_S`.
+    """Limits the stops of each client to each robot to one every `MERGE_S`.
 
-    No stop is lost: the stops that arrive within that time share one, which is sent at its end.
+    No stop is lost: the stops that arrive in that time after a sent stop share the next one.
     """
 
     def __init__(self) -> None:
@@ -195,12 +198,12 @@ class Merged:
         """An event for each name whose last stop was sent less than `MERGE_S` ago. The event is set
         when that time is over."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
-        """Per name, the task that waits for the event in `_rests` and then sends a stop."""
+        """For each name, the task that waits for the event in `_rests` and then sends a stop."""
 
     async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
         """Return the reply to a stop that is sent after this call began.
 
-        `name` stands for the client and the robot. `stop` sends a stop.
+        `name` identifies the client and the robot. `stop` sends a stop and returns its reply.
         """
         if name in self._next:
             return await asyncio.shield(self._next[name])
@@ -225,9 +228,9 @@ class Merged:
 
 
 class Stops:
-    """Sends stop requests, at most `STOPS_AT_ONCE` at the same time.
+    """Sends stops to the page's own robot, at most `STOPS_AT_ONCE` at the same time.
 
-    All further callers share one request that is sent later.
+    The callers beyond that number share one stop, which is sent when one of the others has ended.
     """
 
     def __init__(self) -> None:
@@ -237,8 +240,8 @@ class Stops:
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
         """Send a stop with `call`, and return the robot's reply.
 
-        If too many stops are under way, return the reply to a shared request that is sent after
-        this call began.
+        If `STOPS_AT_ONCE` stops are under way, share one later stop with the other callers that
+        wait, and return the reply to that stop.
         """
         if not self._room.locked():
             async with self._room:
@@ -278,7 +281,7 @@ def _require_stop(verb: str, robot: str) -> None:
 
 
 def _named(client: Client, robot: str, who: Who) -> Client:
-    """Return a client for `robot` under the caller's name, which the daemon logs."""
+    """Return a bus client for `robot`, which calls services under the name of `who` for the log."""
     other = client.like(robot)
     other.name = f"{who.name}@page"
     return other

@@ -24,7 +24,8 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Longest wait for a picture that the client has not seen, s."""
+"""Longest time, s, for which a request waits for a new picture, and then again for a free place to
+send it (`SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits for the connection to the camera's server, and for the next byte from it, s."""
@@ -34,17 +35,17 @@ MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
 has a few hundred thousand."""
 
 SENDS, SENDS_OF_TOKEN = 8, 2
-"""Limits on the pictures that are being sent: in all, and per token."""
+"""Maximum number of pictures that are being sent at the same time: in all, and to one token."""
 
 SEND_S = 5.0
-"""Time limit for sending a picture, s. The connection is cut after that, because the page in the
-browser does not wait any longer either."""
+"""Time limit for sending a picture, s. After that the connection is cut, because the page in the
+browser waits no longer than 5 s."""
 
 _LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
 
 
 class Picture(Struct, frozen=True):
-    """One JPEG picture, its number, and the monotonic time at which it arrived."""
+    """One JPEG picture, its number, and the monotonic time, ns, at which it arrived."""
 
     body: bytes
     number: int
@@ -52,7 +53,7 @@ class Picture(Struct, frozen=True):
 
 
 class Parts:
-    """Cuts a `multipart/x-mixed-replace` stream into its parts."""
+    """Cuts a `multipart/x-mixed-replace` stream into its parts, the pictures."""
 
     def __init__(self, boundary: str) -> None:
         """Store `boundary`, a parameter of the stream's content type.
@@ -63,11 +64,11 @@ class Parts:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
-        """Add received bytes; return the newest part that they complete, or None.
+        """Add received bytes; return the newest picture that they complete, or None.
 
         Raises:
-            ValueError: A part has more than `MAX_PICTURE` bytes, or no header lines end within
-                `MAX_HEAD` bytes.
+            ValueError: A picture has more than `MAX_PICTURE` bytes, or its header lines have more
+                than `MAX_HEAD` bytes.
         """
         self._buffer += data
         newest = None
@@ -96,7 +97,7 @@ class Parts:
 
 
 class Camera:
-    """Reads the stream at `url` while clients ask for pictures."""
+    """Reads the MJPEG stream of a camera while clients ask for pictures."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -110,10 +111,10 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Return the newest picture as soon as its number differs from `number`.
+        """Wait until there is a picture that is newer than number `number`, and return it.
 
-        Return None if there is no such picture within `WAIT_S`. Raises `TroubleError` if the robot
-        has no camera, or its stream cannot be read.
+        Return None if none comes within `WAIT_S`. Raises `TroubleError` if the robot has no camera,
+        or its stream cannot be read.
         """
         if not self._url:
             raise TroubleError(
@@ -133,7 +134,7 @@ class Camera:
 
     @asynccontextmanager
     async def sending(self, token: str) -> AsyncIterator[None]:
-        """Hold a place for sending a picture to a client with this token.
+        """Hold one of the places for sending a picture; `token` is the client's token.
 
         Raises `TroubleError` if no place becomes free within `WAIT_S`.
         """
@@ -152,7 +153,6 @@ class Camera:
             self._sent.clear()
 
     def close(self) -> None:
-        """Stop reading."""
         if self._reading is not None:
             self._reading.cancel()
 

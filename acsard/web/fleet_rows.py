@@ -1,4 +1,4 @@
-"""The robots on the bus or router, one row each, tracked while a viewer has subscribed to them."""
+"""The robots on the bus, one row each, for viewers of the page that have subscribed to them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BY_NAME = (
 
 
 class Fleet:
-    """Tracks all robots for as long as at least one viewer has joined."""
+    """Tracks all robots on the bus while at least one viewer of the page has joined."""
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
@@ -42,8 +42,8 @@ class Fleet:
         self._tracked: fleet.Fleet | None = None
         self._busy: set[asyncio.Task[None]] = set()
         self.note = ""
-        """Explanation of why robots may be missing from the rows; "" if all robots of a router are
-        visible."""
+        """Reason why robots may be missing from the rows, in words; "" if all robots of a router
+        are visible."""
 
     def join(self, viewer: object) -> None:
         """Start tracking on behalf of this viewer."""
@@ -56,22 +56,25 @@ class Fleet:
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """Return the rows sorted by robot id, and retry missing subscriptions and queries."""
+        """Return one row per robot, sorted by robot id.
+
+        If a subscription has failed or a query is due, start it in the background.
+        """
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()
         return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
 
     def sees(self, robot: str) -> bool:
-        """Return whether a viewer sees that this robot exists.
+        """Return whether this server knows that the robot with the id `robot` exists.
 
-        A viewer sees the robot's liveliness token in the fleet, or the robot's state.
+        It knows this while it sees the liveliness token of the robot's daemon, or if a viewer
+        follows the robot's state and a state has arrived.
         """
         states = self._robots.streams.followed(robot, STATE)
         here = self._tracked is not None and self._tracked.here(robot)
         return here or bool(states and states.number)
 
     def _look(self) -> None:
-        """Subscribe to the robots or query those that are due, unless a bus call is under way."""
         tracked, client = self._tracked, self._robots.client
         if not self._joined or client is None or self._busy:
             return

@@ -1,10 +1,10 @@
 """Runs a board check or a calibration for a browser, as a child process (`acsard` itself).
 
-Only one runs at a time. The child's lines (`--json-lines`, see terminal/json_prompt.py) go to the
-connection that started it, and only that connection may send answers and key presses. If the
-connection ends, the child is interrupted as by Ctrl-C, so it still sends zero speeds to the board.
-The child also watches its standard input, so it does not outlive this server. Replies are not
-queued: each question takes one reply, and any other reply is refused.
+Only one child runs at a time. The lines that it prints (`--json-lines`, terminal/json_prompt.py) go
+to the WebSocket that started it. Only this WebSocket may send answers and key presses. If this
+WebSocket ends, the child is interrupted as by Ctrl-C, so it still sends zero speeds to the board.
+The child watches its standard input, so it ends when this server ends. Each question takes one
+answer, and any other answer is refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
 PATIENCE_S = 6.0
-"""Time for the child to send zero speeds and exit after an interrupt, before it is killed, s."""
+"""Time, s, that an interrupted child has to send zero speeds and exit before it is killed."""
 
 NO_DEVICE = (
     "No serial port is visible from here. Is the board plugged in? If the page runs as a "
@@ -47,9 +47,9 @@ Say = Callable[[Guided], None]
 
 
 class Reach(Struct, frozen=True):
-    """The options that let a command reach the same daemon as this server.
+    """The options by which a child connects to the same daemon as this server.
 
-    An empty value omits its option.
+    An option whose value is "" is left out.
     """
 
     config: str
@@ -88,7 +88,7 @@ class _Said(Struct, frozen=True):
 
 
 class Guide:
-    """The running check or calibration and the viewers that are informed of it."""
+    """Runs one check or calibration at a time, and tells all viewers of the page which one."""
 
     def __init__(self, reach: Reach, configured: str) -> None:
         """Store how a child reaches the daemon, and `configured`, the configured serial port."""
@@ -107,10 +107,10 @@ class Guide:
         return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
 
     def join(self, viewer: object, say: Say) -> None:
-        """Add a viewer, and report to it the running check or calibration, or that nothing runs.
+        """Add a viewer, and tell it which check or calibration is running, or that nothing runs.
 
-        The report that nothing runs is for a page that was disconnected when the child ended.
-        `say` sends a message to the viewer.
+        A page that was disconnected when a child ended learns in this way that it ended. `say`
+        sends a message to the viewer.
         """
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
@@ -156,10 +156,10 @@ class Guide:
             errand.leave()
 
     async def stop(self) -> Ending:
-        """Interrupt the running child because an operator stops the robot, and return the outcome.
+        """Interrupt the running check or calibration because a client stops the robot.
 
-        Any operator's stop ends it, no matter which viewer started it. The daemon cannot stop the
-        wheels during a check, because the check holds the serial port.
+        Return the outcome. Any client may stop, no matter which viewer started the child. During a
+        check the daemon cannot stop the wheels, because the check holds the serial port.
         """
         if self._errand is None or self._task is None:
             return Ending()
@@ -169,7 +169,10 @@ class Guide:
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
     def heard(self, viewer: object) -> None:
-        """Relay a sign of life from a viewer to the child that this viewer started, if any."""
+        """Pass a sign of life of a viewer to the child, if this viewer has started the child.
+
+        The child needs signs of life while something moves. Each message of a viewer is one.
+        """
         if (errand := self._of(viewer)) is not None:
             errand.relay()
 
@@ -214,9 +217,9 @@ class Guide:
 
 
 def boards(configured: str) -> list[Board]:
-    """Return the configured port first, then the ports with a device, then the simulator.
+    """Return the serial ports that can be checked: the configured one first, the simulator last.
 
-    This scans the serial devices and the processes that hold them, so call it in a thread.
+    This function scans the serial devices and the processes that hold them, so call it in a thread.
     """
     found: dict[str, str] = {}
     for device in serial_devices():
@@ -229,20 +232,18 @@ def boards(configured: str) -> list[Board]:
         there = "" if os.path.exists(configured) else ", not there now"
         found = {configured: f"configured{there}", **found}
     found[SIMULATOR] = "the simulator: no real robot moves"
-    # The configured port comes first: a check that is started without looking at the list must run
-    # on the robot that the operator sees, because wheels turn.
+    # The configured port comes first, because wheels turn during a check. A check that is started
+    # without looking at the list must run on the robot that the operator sees.
     ports = sorted(found, key=lambda port: port != configured)
     return [Board(port, found[port]) for port in ports]
 
 
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
-    """Return the arguments of the `acsard` command for a request to begin a check or calibration.
+    """Return the arguments of the `acsard` command that carries out the request `begin`.
 
-    `ports` are the serial ports that may be checked. Raises `FrameError` if the request is not
-    allowed.
-
-    No text from the browser becomes an option by itself. The options are fixed here, and each value
-    is either one of a known set or a plain key.
+    `ports` are the serial ports that may be checked. Raises `FrameError` if a value in the request
+    is not allowed. A text from the browser is only ever the value of an option that is fixed here,
+    and the value must be one of a known set or a plain key.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
@@ -273,7 +274,7 @@ def _method(begin: Begin) -> list[str]:
 
 
 class _Errand:
-    """One child process and the connection that started it."""
+    """One child process, a check or calibration, and the WebSocket that started it."""
 
     def __init__(self, viewer: object, by: str, name: str, say: Say) -> None:
         self.viewer, self.by, self.name, self.say = viewer, by, name, say
@@ -287,7 +288,7 @@ class _Errand:
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
-        """Return the message that tells `viewer` which check or calibration is running."""
+        """Return the message that tells `viewer` that this check or calibration is running."""
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
@@ -314,7 +315,7 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """End the current leg of the drive, as a key press at a terminal does.
+        """End the present leg, one drive of a calibration, as a key press at a terminal does.
 
         Further presses in the same leg are ignored.
         """
@@ -323,7 +324,7 @@ class _Errand:
             self._write({"key": True})
 
     def relay(self) -> None:
-        """Send the child a sign of life: the operator who can stop the robot is still connected."""
+        """Tell the child that the operator's browser, which can stop it, is still connected."""
         if self._relayed.take(clock.mono_ns()):
             self._write({})
 

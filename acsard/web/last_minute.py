@@ -1,8 +1,8 @@
 """The plotted values of the last minute, for a page that has just been opened. This module is pure.
 
-All values except the commanded speeds come from the state, which the server receives anyway. The
-commanded speeds arrive a hundred times a second, so the server receives them only while a viewer
-has subscribed to them.
+All values except the commanded speeds come from the key `state`, which the server receives anyway.
+The commanded speeds arrive a hundred times a second on the key `cmd_vel_out`, so the server
+receives them only while a viewer has subscribed to that key.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from acsard.core.values import NS_PER_S, WHEELS
 LASTS_NS = 60 * NS_PER_S
 
 STEP_NS = NS_PER_S // 5
-"""Nominal interval of the rows, ns. It is about one pixel wide in a phone's plot."""
+"""Nominal interval of the rows, ns. It is about one pixel wide in a plot on a phone."""
 
 EARLY_NS = STEP_NS // 4
-"""Tolerance for states that arrive a little early, ns."""
+"""A state that arrives up to this time, ns, before the next row is due still makes that row."""
 
 ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
 """Maximum number of rows in a minute."""
@@ -29,12 +29,12 @@ ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
 MEASURED = 2 + len(WHEELS)
 
 WIDTH = MEASURED + 5
-"""Number of columns in a row: measured values, commanded twist (2), lateness (2), voltage."""
+"""Number of values in a row: measured speeds, commanded twist (2), lateness (2), voltage (1)."""
 
 MS = 1e-3
 
 Column = Sequence[float | None]
-"""Values of one line of a plot, oldest first; None where the value is unknown."""
+"""The values of one plotted line, oldest first; None where the value is unknown."""
 
 
 class Plotted(Struct, frozen=True):
@@ -50,33 +50,35 @@ class Plotted(Struct, frozen=True):
     angular: Column
     """Measured turn rate, rad/s, positive to the left."""
     wished_linear: Column
-    """Commanded forward speed after limits, m/s; known only while a viewer follows `cmd_vel_out`
-    here."""
+    """Commanded forward speed after the limits, m/s; None unless a viewer was subscribed to
+    `cmd_vel_out` at this server."""
     wished_angular: Column
-    """Commanded turn rate after limits, rad/s; known only while a viewer follows `cmd_vel_out`
-    here."""
+    """Commanded turn rate after the limits, rad/s; None unless a viewer was subscribed to
+    `cmd_vel_out` at this server."""
     wheels: Sequence[Column]
     """Measured wheel speeds in rad/s: front right, front left, rear left, rear right."""
     late_p99: Column
-    """99th percentile of the period lateness over the minute before the row, ms."""
+    """How late the control periods of the daemon began, ms: the 99th percentile over the minute
+    before the row."""
     late_max: Column
-    """Maximum of the period lateness over the minute before the row, ms."""
+    """How late the control periods of the daemon began, ms: the maximum over the minute before the
+    row."""
     volts: Column
     """Voltage of the battery, V; None if the board does not report it."""
 
 
 class Minute:
-    """The rows of the last minute. All times are ns on a monotonic clock."""
+    """The rows of plotted values of the last minute. All times are ns on a monotonic clock."""
 
     def __init__(self) -> None:
         self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=ROWS)
 
     def due(self, at_ns: int) -> bool:
-        """Return whether enough time has passed since the last row."""
+        """Return whether enough time has passed since the last row to add another one."""
         return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - EARLY_NS
 
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
-        """Append a row; `wished` is None while the commanded twist is unknown."""
+        """Append a row for `state`; `wished` is the commanded twist, or None if it is unknown."""
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
         if len(measured) != MEASURED:
             measured = [None] * MEASURED

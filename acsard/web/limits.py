@@ -1,7 +1,8 @@
-"""The limits of the page per client. This module is pure.
+"""The limits that the page's server sets to its clients. This module is pure.
 
 The rates of messages, commands, requests, TLS handshakes and wrong tokens are limited, and so are
-the numbers of TCP connections, WebSockets and subscriptions.
+the numbers of TCP connections, WebSockets and subscriptions. A network is an IPv4 address, or the
+/64 network of an IPv6 address (`callers.network_of`).
 """
 
 from __future__ import annotations
@@ -13,78 +14,82 @@ from typing import Generic, TypeVar
 from acsard.host.rate_limits import Places, Rate
 
 SOCKETS, SOCKETS_HERE = 256, 96
-"""Maximum number of TCP connections from other machines, and from the robot itself. A browser opens
-six in addition to its WebSocket."""
+"""Maximum numbers of TCP connections from other machines, and from the robot itself. A browser
+opens six connections in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
-"""Maximum number of TCP connections without a valid token from one network, and of connections that
-count under one token. Further connections with that token are treated as if they had no token."""
+"""Maximum numbers of TCP connections from one network without a valid token, and with one token.
+Further connections with that token count as connections without a token."""
 
 SOCKETS_OF_BROWSER = 7
-"""Number of connections of a token that are never displaced: those of one browser."""
+"""Number of connections that each token keeps when all places are taken: those of one browser."""
 
 SOCKETS_LEAST = 16
-"""Connections from other machines that are accepted even if the limit of open files is very low."""
+"""Number of connections from other machines that are accepted even if the process may open only few
+files."""
 
 OWN_FILES = 128
 """Number of open files that are reserved for other purposes than connections. The process has 20
-open without a connection, and needs more for a while for a report and a calibration."""
+files open without a connection. A report or a calibration needs more while it runs."""
 
 UNREAD_BYTES = 32768
-"""Limit on the bytes that wait for a client that does not read. Above it, the client's next request
-waits, and its WebSocket gets no new values. asyncio's limit for a TLS connection is 512 KiB."""
+"""Limit on the bytes that wait to be sent to a client that does not read. Above the limit, the
+client's next request waits, and its WebSocket gets no new values. The limit that asyncio sets by
+default for a TLS connection is 512 KiB."""
 
 OVERRUNS = 600
-"""Number of messages beyond the rate limit after which a connection is ended."""
+"""Number of messages beyond the rate limit `MESSAGES` after which a WebSocket is closed."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
-"""Limits on WebSockets from other machines: in all, per address, per token, and per token and
-address.
+"""Maximum numbers of WebSockets from other machines: in all, per address, per token, and per pair
+of token and address.
 
-The last limit keeps a program that opens one connection after another from locking out clients at
-the same address that use another token.
+Because of the last limit, a program that opens one WebSocket after another cannot lock out clients
+at the same address that use another token.
 """
 
 CONNECTIONS_HERE = 20
-"""Limit on WebSockets from the robot itself. It is separate, so clients from the network cannot
-lock out the robot's own browser."""
+"""Maximum number of WebSockets from the robot itself. They are counted separately, so clients from
+the network cannot lock out a browser on the robot."""
 
 STREAMS, STREAMS_OF_ONE = 200, 50
-"""Limits on subscribed keys of other robots: in all, and per token. Keys of the page's own robot
-are few and are not limited."""
+"""Maximum numbers of subscribed keys of other robots: in all, and per token. Keys of the page's own
+robot are few and are not counted."""
 
 
 REQUESTS = Rate(50.0, 200.0)
 """Limit on HTTP requests per token. The page's static files are exempt."""
 
 STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.0)
-"""Limits on the rates of stops, camera pictures and new WebSockets, for each token in one network.
-Requests beyond them wait. Three pages show a camera with 60 pictures a second."""
+"""Limits on the rates of stops, camera pictures and new WebSockets, for each token in each network.
+Requests beyond a limit wait. A page asks for at most 20 pictures a second."""
 
 STRANGERS = Rate(30.0, 150.0)
 """Limit on the rate of requests without a valid token from one network. Requests beyond it wait. A
-phone loads the page with 16 requests, so the burst serves eight phones behind one address."""
+phone loads the page with 16 requests, so eight phones behind one address can load it at once."""
 
 HANDSHAKES = Rate(30.0, 100.0)
 """Limit on the rate of TLS handshakes of one network. Handshakes beyond it wait. A browser needs
 six."""
 
 HOLD_S = 0.5
-"""Time for which a request beyond a rate waits, s. A refusal costs the server as much as an answer,
-so a client that sends requests without end must wait for either."""
+"""Time for which a request beyond a rate limit waits, s, whether it is then answered or refused. A
+refusal costs the server as much time as an answer."""
 
 MESSAGES = Rate(200.0, 400.0)
 """Limit on messages per WebSocket. The burst allowance covers the messages that a client sends when
 its network returns."""
 
 COMMANDS = Rate(60.0, 120.0)
-"""Limit on the commands of one token, or of one local WebSocket. A finger on the stick sends 20 a
-second. The daemon accepts 1000 a second from this server. Without the limit, 24 WebSockets that
-sent 180 commands a second each made the daemon drop half of a driver's commands."""
+"""Limit on the rate of commands of one token, or of one WebSocket from the robot itself. The stick
+on the page sends 20 a second. The daemon accepts 1000 a second from this server. Without the limit,
+24 WebSockets that sent 180 commands a second each made the daemon drop half of the commands of a
+client that drove."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
-"""Limit on the stops of one token to robots that may not exist: no page shows them, and they have
-never answered a stop from this server. Stops to any other robot have no limit."""
+"""Limit on the rate of stops from one token to robots that may not exist, because no page shows
+them and they have never answered a stop from this server. Stops to other robots have no such
+limit."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens: from one network (see `callers.network_of`), and in all."""
@@ -105,10 +110,10 @@ def sockets_for(files: int) -> int:
 class Sockets(Generic[C]):
     """The open TCP connections. When all places are taken, a new connection displaces an old one.
 
-    1. The network with the most connections without a valid token loses its oldest such connection,
-       so a flood from a few networks displaces its own connections.
+    1. The network with the most connections without a valid token loses the oldest of these. So a
+       flood from a few networks displaces its own connections.
     2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest one, unless it has only as many as one browser needs.
+       oldest one. But it keeps `SOCKETS_OF_BROWSER`: then the new connection is refused instead.
     """
 
     def __init__(self, most: int) -> None:
@@ -118,16 +123,16 @@ class Sockets(Generic[C]):
         self._networks: dict[C, str] = {}
         """The network of each connection."""
         self._known: dict[C, str] = {}
-        """The token of each connection that counts under a token."""
+        """The token of each connection that is counted under a token (see `SOCKETS_OF_TOKEN`)."""
         self._shown: dict[C, str] = {}
-        """The last valid token of each connection, even if it does not count under that token."""
+        """The last valid token of each connection, even beyond the limit `SOCKETS_OF_TOKEN`."""
         self._tokens: Counter[str] = Counter()
 
     def enter(self, network: str, one: C) -> C | None:
-        """Give the new connection `one` a place.
+        """Give the new connection `one` a place; return the connection to close in exchange.
 
-        Return the connection to close in exchange, or None if a place was free. If no connection
-        may be displaced, return `one` itself, which then has no place.
+        Return None if a place was free. If no old connection may be closed, return `one` itself,
+        which then has no place. `network` is the client's network.
         """
         own = self._strangers.get(network, {})
         gone = None
@@ -141,9 +146,9 @@ class Sockets(Generic[C]):
         return gone
 
     def displaced(self) -> C | None:
-        """Remove the connection that has to be closed first, and return it.
+        """Remove and return the connection to close when all places are taken.
 
-        Return None if no connection may be displaced.
+        Return None if no connection may be closed.
         """
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
@@ -157,9 +162,10 @@ class Sockets(Generic[C]):
         return gone
 
     def prove(self, one: C, token: str) -> None:
-        """Record that a connection has shown a valid token; "" stands for the robot itself.
+        """Record that the connection `one` has shown a valid token.
 
-        A later token replaces an earlier one, because a browser may get another token.
+        `token` is "" for a client on the robot itself, which needs none. A later token replaces an
+        earlier one, because a browser may get another token.
         """
         network, before = self._networks.get(one), self._known.get(one)
         if network is None:
@@ -175,7 +181,6 @@ class Sockets(Generic[C]):
         self._tokens[token] += 1
 
     def leave(self, one: C) -> None:
-        """Release the place of a connection, if it has one."""
         network = self._networks.pop(one, None)
         self._shown.pop(one, None)
         if network is None:
@@ -187,9 +192,9 @@ class Sockets(Generic[C]):
         self._fewer(token)
 
     def ended(self, valid: Collection[str]) -> list[C]:
-        """Return the connections whose token is not in `valid`.
+        """Return the connections whose last token is not in `valid`.
 
-        Connections from the robot itself have no token and are not returned.
+        Connections without a token are not returned.
         """
         return [one for one, token in self._shown.items() if token and token not in valid]
 
@@ -209,7 +214,10 @@ class Sockets(Generic[C]):
 
 
 class Seats:
-    """Limits on WebSocket connections. Local ones (without a token) have a limit of their own."""
+    """Counts and limits the open WebSockets.
+
+    Those from the robot itself, which need no token, have a limit of their own.
+    """
 
     def __init__(self) -> None:
         self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
@@ -218,14 +226,14 @@ class Seats:
         self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
 
     def missing(self, address: str, token: str) -> str:
-        """Return the reason and the remedy if a connection is refused, or "" if there is room."""
+        """Return "" if there is room for a WebSocket, else why it is refused and what to do."""
         for places, name, full in self._places(address, token):
             if not places.room(name):
                 return full
         return ""
 
     def enter(self, address: str, token: str) -> str:
-        """Acquire a place for a connection; return "" or the reason for a refusal."""
+        """Acquire a place for a WebSocket; return "", or the reason if it is refused."""
         if full := self.missing(address, token):
             return full
         for places, name, _ in self._places(address, token):
@@ -233,12 +241,11 @@ class Seats:
         return ""
 
     def leave(self, address: str, token: str) -> None:
-        """Release the place of a connection."""
         for places, name, _ in self._places(address, token):
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return each limit for a connection, the name that is counted, and the refusal text."""
+        """Return each limit for a WebSocket, the counted name, and the refusal text."""
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
@@ -259,15 +266,16 @@ class Seats:
 
 
 class Shares:
-    """Shared resources with a limit in all and a limit per holder.
+    """Limits how many resources are in use, in total and by each holder.
 
-    A resource that several holders share counts once against the limit in all.
+    A resource that several holders use counts once in the total. The server uses this class for
+    subscriptions to keys of other robots, whose holders are the clients' tokens.
     """
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one
         self._held: defaultdict[Hashable, Counter[str]] = defaultdict(Counter)
-        """Per resource, the number of times that each holder has acquired it."""
+        """For each resource, the number of times that each holder has acquired it."""
 
     def enter(self, holder: str, thing: Hashable) -> bool:
         """Acquire a resource for a holder; return False if the limits forbid it.

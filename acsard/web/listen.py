@@ -13,7 +13,7 @@ from acsard.host.own_identity import own_addresses
 from acsard.web.callers import is_loopback
 
 TRIES = 20
-"""Number of ports that are tried, starting with the requested one."""
+"""Number of ports that are tried, one after another, starting with the requested one."""
 
 EVERYWHERE_4, EVERYWHERE_6 = "0.0.0.0", "::"
 """Wildcard addresses: all IPv4 addresses of this machine, and all its IPv4 and IPv6 addresses."""
@@ -93,12 +93,15 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
 
 
 def opened_by(one: Listen, tls: str) -> list[str]:
-    """Return the URLs that open this address; for HTTPS, those of an invitation."""
+    """Return the URLs with which a browser opens the page at this address, the best one first."""
     return invitations([one], tls) if one.secure else [one.url]
 
 
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
-    """Raise a `MendableError` if an HTTPS address has no usable certificate."""
+    """Raise a `MendableError` if there is an HTTPS address but no usable certificate.
+
+    `tls` is the directory of the certificate, "" without one.
+    """
     away = [one for one in listen if one.secure]
     if away and not tls:
         raise CertificateError(
@@ -110,7 +113,7 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
-    """Open a socket at each address. If its port is taken and `next_port` is true, try later ports.
+    """Open a socket at each address. If a port is taken and `next_port` is true, try later ports.
 
     Raises `InUseError` if no port is free.
     """

@@ -1,6 +1,6 @@
-"""The counters of the page's server, for its log and for `/metrics`.
+"""The counters of the page's server, for its log and for the path `/metrics`.
 
-`/metrics` adds the robot's figures, and uses the Prometheus text format 0.0.4.
+`/metrics` also returns figures of the robot. It uses the Prometheus text format 0.0.4.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ def text(
 ) -> str:
     """Return all metrics in the text format of Prometheus.
 
-    Robot metrics come from `state`, the robot's last state. They are included only if `heard` is
-    true, which means that messages from the daemon arrive. `viewers` is the number of WebSockets.
-    `counts` and `refused` come from `Counts`.
+    `state` is the last state of the robot, and `version` the version of its daemon. The metrics of
+    the robot are left out unless `heard` is true, which means that messages from the daemon arrive.
+    `viewers` is the number of WebSockets. `counts` and `refused` are the results of the methods
+    `all` and `refused` of `Counts`.
     """
     lines: list[str] = []
 
@@ -129,15 +130,15 @@ def _escaped(word: str) -> str:
 
 
 NAMED = 5
-"""Number of origins that one log line names, starting with the most frequent."""
+"""Maximum number of clients that a log line about refusals names, the most frequent ones first."""
 
 KNOWN = 1000
-"""Maximum number of origins that are counted separately between two log lines. The bound holds even
-if a client uses many addresses."""
+"""Maximum number of clients whose refusals are counted separately between two log lines. The bound
+is needed because one client may use many addresses."""
 
 
 class Counts:
-    """Thread-safe counters by name."""
+    """Thread-safe counters of the server's actions by name, and of its refusals by reason."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -145,21 +146,21 @@ class Counts:
         self._refused: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
         self._origins: Counter[str] = Counter()
-        """Refusals since the last log line, by origin."""
+        """Refusals since the last log line, by the address and name of the client."""
 
     def add(self, name: str, more: int = 1) -> None:
         with self._lock:
             self._counts[name] += more
 
     def refuse(self, reason: Reason, origin: str = "") -> None:
-        """Count a refusal; `origin` is its source, or "" if it is unknown."""
+        """Count a refusal; `origin` is the client's address and name, or "" if it is unknown."""
         with self._lock:
             self._refused[reason] += 1
             if origin and (origin in self._origins or len(self._origins) < KNOWN):
                 self._origins[origin] += 1
 
     def all(self) -> dict[str, int]:
-        """Return the counters since the start."""
+        """Return the numbers of the server's actions since its start, by name."""
         with self._lock:
             return dict(self._counts)
 

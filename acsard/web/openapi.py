@@ -26,10 +26,10 @@ Refs = dict[Any, Described]
 """Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of the schemas of all messages that the WebSocket accepts, and of all that it sends."""
+"""Names of two schemas: any message to the WebSocket's server, and any message from it."""
 
 VALUE = "Value."
-"""Prefix of the schema name of a key's message."""
+"""Prefix of the names of the schemas for the messages of subscribed keys."""
 
 GUIDED = "Guided"
 
@@ -44,10 +44,10 @@ LINES = (
     json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
     json_prompt.Found, json_prompt.Result,
 )  # fmt: skip
-"""Types of the content of the field `guide` in a message to the client."""
+"""Types of the field `guide`, which reports a running check or calibration to the client."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
-"""Type of each key that can be subscribed to."""
+"""Message type of each key to which a client can subscribe, by key."""
 
 
 def _ref(name: str) -> Described:
@@ -55,7 +55,6 @@ def _ref(name: str) -> Described:
 
 
 def _raw(schema: Described) -> Any:
-    """Return the type of a field that holds encoded JSON with this schema."""
     return Annotated[msgspec.Raw, Meta(extra_json_schema=schema)]
 
 
@@ -82,7 +81,7 @@ ERRORS = {
     "429": "Too many requests, or too many wrong tokens.",
     "default": "Any other failure.",
 }
-"""Errors of every path, by HTTP status. The body of the answer gives the reason in words."""
+"""Descriptions of the errors that every path may return, by HTTP status."""
 
 
 def document(version: str, routes: Sequence[Route]) -> Described:
@@ -117,7 +116,6 @@ def document(version: str, routes: Sequence[Route]) -> Described:
 
 
 def _operation(row: Route, refs: Refs) -> Described:
-    """Return the OpenAPI operation of one row; `refs` contains references for its bodies."""
     errors = {status: Body(what, Problem) for status, what in ERRORS.items()}
     answers = {str(status): body for status, body in row.gives.items()} | errors
     told: Described = {
@@ -153,16 +151,16 @@ def _schema(kind: Any, refs: Refs) -> Described:
 
 
 def _needed(kind: type | str) -> bool:
-    """Return whether a body of this type has a field without a default."""
     if isinstance(kind, str):
         return bool(SCHEMAS[kind].get("required"))
     return any(field.required for field in msgspec.structs.fields(kind))
 
 
 def _messages() -> Described:
-    """Return the schemas of the bus's messages, and of each nested type under the name `Type.Part`.
+    """Return the schemas of the bus's messages, and of their nested types as `Type.Part`.
 
-    Most readers of OpenAPI documents cannot resolve a schema with `$defs` of its own.
+    The nested types are separate schemas, because most readers of OpenAPI documents cannot resolve
+    a schema that contains `$defs`.
     """
     found: Described = {}
     for name, schema in SCHEMAS.items():
@@ -174,9 +172,9 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return a schema whose `$defs` references point to the document's components instead.
+    """Return a JSON schema in which references to `$defs` refer to the document's schemas instead.
 
-    `before` is the prefix of the names of these components.
+    `before` is the prefix of the names of these schemas.
     """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
@@ -204,9 +202,9 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    """Return the schemas of all WebSocket messages in either direction, and of `Guided`.
+    """Return the schemas `ToRobot` and `FromRobot` of all WebSocket messages, and `Guided`.
 
-    Each message has a field that no other one has, so the alternatives need no tag.
+    Each message has a field that no other message has, so a reader can tell them apart.
     """
     guided = msgspec.defstruct(
         GUIDED,

@@ -30,9 +30,9 @@ POLICY = (
     "'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-"""Content security policy of a report. Without `allow-same-origin` the report has an opaque origin.
-The report's own policy names the allowed scripts by their hashes, and the browser enforces both
-policies."""
+"""Content security policy of a report. Because it does not contain `allow-same-origin`, the report
+has an opaque origin. The report contains a policy too, which names the allowed scripts by their
+hashes. The browser enforces both policies."""
 
 NICE = 19
 
@@ -41,16 +41,16 @@ DRAW_S = 600.0
 minutes on a small computer."""
 
 ALONE_NS = 60 * NS_PER_S
-"""The drawing of a report is given up if no client has asked for its progress for this long."""
+"""Time without a request for its progress, ns, after which the drawing of a report is cancelled."""
 
 KEEP_NS = 900 * NS_PER_S
-"""A finished report is dropped if no client has opened it or asked for it for this long."""
+"""Time, ns, after which a finished report is dropped if no client has asked for it."""
 
 BYTES = 32 << 20
 """Maximum size of a report, bytes; a typical one has 5 to 8 MB."""
 
 MEMORY = 256 << 20
-"""Limit of the child's data memory, bytes."""
+"""Limit of the data memory of the child process that draws a report, bytes."""
 
 TOO_LONG = (
     f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
@@ -76,7 +76,7 @@ class Recording(Struct, frozen=True):
 
 
 class BlackBox:
-    """The recordings of the page's robot.
+    """The recordings that the daemon of the page's robot has written.
 
     Every method raises `TroubleError` if the recordings are not available.
     """
@@ -137,7 +137,7 @@ def rows(directory: Path) -> list[Recording]:
 
 
 def _files(directory: Path) -> list[Path]:
-    """Return the paths of the recordings; none if the recorder has not made the directory yet."""
+    """Return the paths of the recordings; none if the directory does not exist yet."""
     try:
         return listed(directory)
     except FileNotFoundError:
@@ -200,7 +200,7 @@ class _Drawing:
         """The report, compressed by gzip; empty until the report is finished."""
         self.failed = ""
         self.told = False
-        """True once a client has been informed that the drawing ended."""
+        """True once a client has received the result of the drawing."""
 
     @property
     def ended(self) -> bool:
@@ -212,13 +212,13 @@ class Reports:
 
     The child runs `acsard recording report` at the lowest priority. Its time, memory and output are
     bounded. It is killed when this server ends or no client asks for the report any more. The
-    finished report is kept compressed in memory until another one is drawn, or until no client has
-    asked for it for `KEEP_NS`; no file is written.
+    finished report stays in memory, compressed, until another one is drawn or no client has asked
+    for it for `KEEP_NS`. No file is written.
 
-    A report shows text of unknown origin (names, sentences), which may be malicious. There are
-    three defences. The report escapes the text. Its own policy allows exactly two scripts and loads
-    nothing. `POLICY` gives the report an opaque origin, so a script in it could reach neither the
-    cookie nor the interface of the robot's page.
+    A recording may contain text of strangers, so a report could contain a malicious script. There
+    are three defences. The report escapes the text. The policy in the report allows exactly two
+    scripts and loads nothing. `POLICY` gives the report an opaque origin, so a script in the report
+    could use neither the cookie nor the interface of the robot's page.
     """
 
     def __init__(self, command: Sequence[str] = ()) -> None:
@@ -248,9 +248,9 @@ class Reports:
         return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """Return the finished report of a recording, compressed by gzip, or None.
+        """Return the finished report of a recording, compressed by gzip, or None if there is none.
 
-        `name` is the recording's file name. The call keeps the report for another `KEEP_NS`.
+        `name` is the recording's file name. The report is kept for `KEEP_NS` after the last call.
         """
         one = self._one
         if one is None or one.path.name != name or not one.packed:
@@ -259,9 +259,9 @@ class Reports:
         return one.packed
 
     def tidy(self) -> None:
-        """Give up a drawing that no client waits for, and drop an old report.
+        """Cancel a drawing that no client waits for, and drop an old report.
 
-        The server calls this regularly.
+        The server calls this method once a second.
         """
         one = self._one
         if one is None:
@@ -271,7 +271,7 @@ class Reports:
             self.end()
 
     def end(self) -> None:
-        """Cancel the drawing and drop the report."""
+        """Cancel the drawing of a report, or drop the finished report."""
         if self._work is not None:
             self._work.cancel()
         self._one = self._work = None
@@ -287,7 +287,6 @@ class Reports:
             one.failed = str(error)
 
     async def _drawn(self, one: _Drawing) -> bytes:
-        """Run the child and return the report. Raises `_FailedError` with the child's message."""
         command, limits = [*self._command, str(one.path)], Limits(NICE, MEMORY)
         async with running(command, limits, stdout=PIPE, stderr=PIPE) as child:
             listening = asyncio.create_task(_listened(child, one))
@@ -311,9 +310,9 @@ class _FailedError(Exception):
 
 
 def _why(said: str) -> str:
-    """Return why the child failed, according to its error output `said`.
+    """Return the reason why the child failed, from its error output `said`.
 
-    From a traceback, use only the last line. For a `MemoryError`, return `TOO_MUCH`.
+    The reason in a traceback is its last line, or `TOO_MUCH` for a `MemoryError`.
     """
     last = said.rpartition("\n")[2]
     if last.startswith("MemoryError"):
@@ -332,9 +331,9 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Read the child's error output until it ends, and return its explanation of a failure.
+    """Read the child's error output to its end, and return the lines that explain a failure.
 
-    A line of digits is the progress in percent, which sets `one.percent`.
+    A line of digits is the progress of the drawing in percent. It is stored in `one.percent`.
     """
     assert child.stderr is not None
     said = ""

@@ -33,21 +33,21 @@ AGAIN_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Intervals of the queries for the daemon's version and limits, s: after an answered query, and
-after an unanswered one."""
+"""Intervals of the queries for the daemon's version and settings, s: after a query that was
+answered, and after one that was not."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
-"""Limits of a driven path: maximum age of a point, s; maximum number of points; minimum distance
-between two points, m."""
+"""Limits of the path that the page draws: maximum age of a point, s; maximum number of points;
+minimum distance between two points, m."""
 
 T = TypeVar("T")
 
 Connect = Callable[[], Client]
-"""Opens the connection to the daemon or raises `UnreachableError`; it blocks."""
+"""Function that connects to the daemon, or raises `UnreachableError`. It blocks."""
 
 
 class About(Struct, frozen=True):
-    """Facts that the daemon reports about itself."""
+    """Facts about the daemon and its robot, from its keys `info` and `config`."""
 
     version: str
     simulated: bool
@@ -63,20 +63,20 @@ class About(Struct, frozen=True):
 
 
 def _path() -> Track:
-    # The last argument is a distance, 1 m. No robot drives so far between two states, so a larger
-    # step means that the pose was set.
+    # The last argument is a distance, 1 m. No robot drives this far between two states, so after a
+    # larger step, the pose must have been set, and the path restarts.
     return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
 
 
 class _Asking:
-    """The client of a `Watch` on the event loop. A query runs in a thread, because it may block."""
+    """A client for a `Watch` on the event loop. Queries run in threads, because they may block."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key unless the last query is still under way; `take` is called with the reply."""
+        """Query a key unless the last query is under way; `take` is called with each reply."""
         if self._asked is None or self._asked.done():
             self._asked = asyncio.create_task(self._ask(name, take))
 
@@ -86,22 +86,22 @@ class _Asking:
 
 
 class Robots:
-    """Keeps the connection to the daemon, and the data that a newly opened page needs at once."""
+    """The connection to the daemon of the page's robot, and the data for a newly opened page."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Prepare the connection, which `connect` opens.
+        """Store the arguments; `run` opens the connection with `connect`.
 
-        `about` gives the facts from the local configuration. It is used until the daemon answers.
+        `about` has the facts of the local configuration, which are used until the daemon answers.
         """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
-        """Common name of this server's certificate, under which the viewers' commands are sent; ""
-        without TLS."""
+        """Common name of the certificate with which this server connects to the daemon; "" without
+        TLS. It is part of the public names of all viewers."""
         self.about = about
         self.client: Client | None = None
         self.streams = Streams()
         self.gone = f"no daemon answers at {address.endpoint} yet"
-        """Reason why the robot is not reachable, in words; "" while it is."""
+        """Reason why the robot is not reachable, in words; "" while it is reachable."""
         self._connect, self._counts = connect, counts
         self._paths = {"path": _path(), "truth": _path()}
         self._minute = Minute()
@@ -110,7 +110,10 @@ class Robots:
         self._watch: Watch | None = None
 
     async def run(self) -> None:
-        """Follow the robot until cancelled. Raises a `MendableError` that a retry cannot fix."""
+        """Connect to the daemon, and follow the robot until the task is cancelled.
+
+        Raises a `MendableError` if the connection cannot be opened, and trying again cannot help.
+        """
         client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
 
@@ -128,7 +131,7 @@ class Robots:
         return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:
-        """Query the daemon's facts again because they may have changed."""
+        """Query the facts in `about` soon again, because they may have changed."""
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
@@ -200,7 +203,7 @@ class Robots:
             self._minute.add(now_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """Return the commanded twist if a viewer follows it here and it is recent, else None."""
+        """Return the last twist on `cmd_vel_out`; None if it is too old or no viewer follows it."""
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
         # A commanded twist that is older than this is not plotted.
@@ -236,7 +239,7 @@ class Robots:
                 pass
 
     async def _ask(self) -> bool:
-        """Query the daemon's facts; return whether it answered."""
+        """Query the facts in `about`; return whether the daemon answered."""
         client = self.client
         assert client is not None
         try:

@@ -1,8 +1,8 @@
 """The rows of the table of routes: the meaning, the role, the input and the output of each path.
 
-This module is pure. `app.ROUTES` is the table. Dispatch, admission, the request rate, the answers
-404 and 405 and the OpenAPI document use it, so a path that is not in the table does not exist. The
-rows of the robot's keys and services are made here from the bus's own tables.
+This module is pure. `app.ROUTES` is the table. The router, the admission of requests, the rate
+limits and the OpenAPI document use it, so a path that is not in the table does not exist. This
+module makes the rows of the robot's keys and services from the tables in `keys_and_roles.py`.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from acsard.host.rate_limits import Rate
 from acsard.web.limits import REQUESTS, STOPS
 
 Handler = Callable[[Any, Any], Awaitable[Any]]
-"""Takes the page and the request, and returns the response."""
+"""Function that takes the page and the request, and returns the response."""
 
 RECORDINGS: Role = "operator"
-"""The least role that may fetch recordings and have them drawn."""
+"""The least role that may fetch recordings, and reports of recordings."""
 
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
-"""Patterns of path parameters. Any other parameter matches any text without a slash."""
+"""Regular expressions of path parameters. Any other parameter matches any text without a slash."""
 
 _PARAMETER = re.compile(r"{(\w+)}")
 
@@ -58,14 +58,14 @@ class Body(Struct, frozen=True):
 
 
 class Route(Struct, frozen=True):
-    """One row: a method on a path."""
+    """One row of the table of routes: an HTTP method on a path."""
 
     method: Literal["GET", "POST"]
     """GET includes HEAD."""
     path: str
     """The path as OpenAPI writes it: `{name}` is a parameter."""
     least: Role | None
-    """Least role that may use the row; None opens it to everybody, without a token."""
+    """Least role that may use the path; None opens it to every client, without a token."""
     handler: Handler
     summary: str = ""
     """Description for the OpenAPI document; "" leaves the row out of it."""
@@ -74,15 +74,16 @@ class Route(Struct, frozen=True):
     forms: tuple[str, ...] = (JSON,)
     """Media types of the request's body."""
     gives: Mapping[int, Body] = {}
-    """The answers by HTTP status. Every error is a `Problem`."""
+    """The body of the answer for each HTTP status. The body of an error that is not listed is a
+    `Problem`."""
     rate: Rate = REQUESTS
-    """Limit on the requests per token, shared by all rows that have this rate."""
+    """Limit on the requests of one token. All rows with the same rate share one limit."""
     waits: bool = False
-    """True makes a request beyond the rate wait instead of refusing it.
+    """True if a request beyond the rate waits; False if it is refused.
 
-    A stop must always go through: it is sent at once, and its answer waits. A page that reconnects
-    must not be kept out by another program that uses the same token elsewhere. So, if this is true,
-    the rate applies to each token in each network separately.
+    A POST, such as a stop, is carried out at once, and its answer waits. If this is true, each
+    token has a limit of its own in each network. So a program cannot keep out a page that uses the
+    same token in another network.
     """
 
     @property
@@ -92,7 +93,7 @@ class Route(Struct, frozen=True):
 
     @property
     def pattern(self) -> str:
-        """The path with the pattern of each parameter, for the router."""
+        """The path in the form of the router, with a regular expression for each parameter."""
         patterns = {name: PARAMETERS.get(name, "[^{}/]+") for name in self.parameters}
         return _PARAMETER.sub(lambda found: f"{{{found[1]}:{patterns[found[1]]}}}", self.path)
 
@@ -104,7 +105,7 @@ def asked(topic: Topic) -> bool:
 
 
 def values(handler: Handler) -> Iterator[Route]:
-    """Yield the row of each key whose last value a program may query."""
+    """Yield a route `GET /api/<key>` for each key whose last value a program may query."""
     for topic in filter(asked, TOPICS):
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
         gives = {200: Body("The last value.", topic.type if topic.type in SCHEMAS else "")}
@@ -112,7 +113,7 @@ def values(handler: Handler) -> Iterator[Route]:
 
 
 def services(handler: Handler) -> Iterator[Route]:
-    """Yield the row of each service."""
+    """Yield a route `POST /api/srv/<name>` for each service of the robot."""
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():
         # The daemon decodes the payload, so a refusal contains the daemon's message.

@@ -1,4 +1,4 @@
-"""The page's server from start to shutdown: addresses, connection, background tasks."""
+"""Runs the page's server from start to shutdown, with its sockets, certificate and tasks."""
 
 from __future__ import annotations
 
@@ -38,11 +38,12 @@ from acsard.web.viewer import Parts
 TIDY_S, TELL_S = 1.0, 1.0
 
 FIELD_BYTES, FIELDS = 8190, 64
-"""Maximum size of the request line and of a header, bytes, and maximum number of headers. A browser
-sends the cookies of all ports of the host in one header, so a lower limit could lock it out."""
+"""Maximum size of the request line and of a header, bytes; maximum number of headers. A browser
+sends the cookies for all ports of a host in one header, so a lower limit could lock out the
+browser."""
 
 LEAVE_S = 0.3
-"""Time limit at shutdown for the zero commands of viewers that were driving, s."""
+"""Time, s, that the server has at its shutdown to send last zeros for the viewers that drive."""
 
 
 class Wanted(Struct, frozen=True):
@@ -58,8 +59,8 @@ class Wanted(Struct, frozen=True):
     file: str = ""
     """Configuration file named on the command line, or ""."""
     supervised: bool = False
-    """Whether the daemon started the server. It then uses a later port if the requested one is
-    taken, and ends when its standard input closes."""
+    """True if the daemon started the server. The server then uses a later port if the requested one
+    is taken, and ends when its standard input closes."""
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
@@ -139,7 +140,6 @@ async def _tidy(page: Page) -> None:
 
 
 async def _tell(counts: Counts, log: Log) -> None:
-    """Log the refusals, at most one line a second."""
     while True:
         await asyncio.sleep(TELL_S)
         if (news := counts.news()) is not None:
@@ -147,7 +147,7 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent, and set `leaving` when the parent closes the input."""
+    """Send signs of life to the parent; set `leaving` when the parent closes our standard input."""
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def look() -> None:
@@ -164,7 +164,6 @@ async def _held(leaving: asyncio.Event) -> None:
 
 
 def _connected(address: Address) -> Client:
-    """Return a client that is connected to the daemon. The call blocks."""
     session = client_session(address.endpoint, address.tls)
     return Client(session, address.robot_id, PROGRAM, address.tls, address.endpoint)
 
@@ -188,10 +187,10 @@ def _about(wanted: Wanted) -> About:
 
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
-    """Return the TLS context and the names of this machine, apart from its loopback names.
+    """Return the TLS context, and the host names by which other machines reach this one.
 
-    Without an HTTPS address, return None and an empty set. Raises a `MendableError` if a
-    certificate is missing.
+    Without an HTTPS address, return None and an empty set. Raises a `MendableError` if the
+    certificate is missing or cannot be used.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()
@@ -203,12 +202,11 @@ def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
 
 
 def _load(context: ssl.SSLContext, directory: str) -> None:
-    """Use the certificate in this directory for the next connections."""
     context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
 
 
 def _names(directory: str) -> set[str]:
-    """Return the names of this machine and of the certificate, apart from the loopback names."""
+    """Return this machine's names and those in its certificate, without loopback names."""
     names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
     return {one for one in names if one != "localhost" and not is_loopback(one)}
 

@@ -1,10 +1,10 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
-Each message is one JSON object. An incoming message, a frame, contains exactly one of the fields in
-`KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none or two of these
-fields, or with an unknown field, is refused as a whole. An outgoing message is identified by its
-first field. Messages of subscribed keys are built in socket_sender.py instead, because their values
-are already JSON.
+Each message is one JSON object. An incoming message is called a frame. It contains exactly one of
+the fields in `KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none or
+two of these fields, or with an unknown field, is refused as a whole. An outgoing message is
+identified by its first field. The messages with the values of subscribed keys are not here:
+socket_sender.py builds them, because their values are already JSON.
 """
 
 from __future__ import annotations
@@ -21,24 +21,28 @@ from acsard.core.values import AcsardError, Role
 from acsard.web.last_minute import Plotted
 
 MAX_BYTES = 65536
-"""Maximum size of one message; a command has about a hundred bytes."""
+"""Maximum size of a message from a client, bytes. A command has about a hundred."""
 
 MAX_RATE, USUAL_RATE = 50.0, 10.0
-"""Maximum and default rate of one key, messages per second."""
+"""Maximum and default rate at which the messages of a subscribed key are sent, per second."""
 
 LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
-"""Largest stamp in ms since 1970: the signature's limit in ns, less one day. The margin is needed
-because the zero command after a release carries a later stamp than the last command."""
+"""Largest stamp that a command may have, ms since 1970: one day before the largest one that the
+daemon accepts. The zero that the server sends when a client ends has a later stamp than the last
+command, and must still be accepted."""
 
 PROGRAM = "app"
-"""Command source of a command that names none. The page in the browser names `teleop` instead."""
+"""Command source of a command that names no source. The page in the browser names `teleop`."""
 
 Short = Annotated[str, Meta(max_length=80)]
 Device = Annotated[str, Meta(max_length=200)]
 
 
 class FrameError(AcsardError):
-    """A message is not a valid frame. `about` is the kind it was meant to have, or "message"."""
+    """A message of a client is not valid.
+
+    `about` is the kind that the message was meant to have, or "message" if that is unclear.
+    """
 
     def __init__(self, about: str, text: str) -> None:
         super().__init__(text)
@@ -46,14 +50,14 @@ class FrameError(AcsardError):
 
 
 class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of all frames; it rejects unknown fields."""
+    """Base class of the messages that a client sends. Unknown fields are not allowed."""
 
     least: ClassVar[Role] = "viewer"
-    """Least role that may send the frame. The role that a call needs depends on the service."""
+    """Least role that may send the message. A call needs the role of its service in addition."""
 
     @property
     def kind(self) -> str:
-        """The field that identifies the frame, always the first one."""
+        """Name of the field that identifies this kind of message. It is the first field."""
         return self.__struct_fields__[0]
 
 
@@ -146,7 +150,7 @@ class Press(_Frame, frozen=True):
 Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
 
 KINDS: dict[str, type[Frame]] = {kind.__struct_fields__[0]: kind for kind in get_args(Frame)}
-"""Maps each field that identifies a kind of frame to the type of the frame."""
+"""Maps the name of the field that identifies a message of a client to the type of the message."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
@@ -155,7 +159,7 @@ _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
 
 
 def decode(text: str) -> Frame:
-    """Return the frame in a JSON text. Raises `FrameError`."""
+    """Decode a message of a client from JSON. Raises `FrameError` if it is not valid."""
     about = "message"
     try:
         meant = [name for name in _heads.decode(text) if name in KINDS]
@@ -170,7 +174,6 @@ def decode(text: str) -> Frame:
 
 
 def _require(frame: Frame) -> None:
-    """Raise `FrameError` for numbers that are out of range."""
     # JSON has no NaN, and msgspec refuses a number that is too large to be finite.
     if isinstance(frame, Command) and not 0.0 < frame.stamp < LATEST_STAMP_MS:
         raise FrameError("cmd", "stamp must be the time of the sender's clock in ms since 1970")
@@ -178,7 +181,7 @@ def _require(frame: Frame) -> None:
         raise FrameError("subscribe", f"rate must be above 0 and at most {MAX_RATE:g} a second")
 
 
-# From the robot.
+# The messages that the server sends.
 
 Point = tuple[float, float]
 
@@ -197,14 +200,14 @@ class Greeting(Struct, frozen=True):
     version: str
     role: Role
     sender: str
-    """Public name of this viewer. It is the value of `state.sender` while this viewer drives."""
+    """Public name of the receiving client: the value of `state.sender` while this client drives."""
     limits: Limits
     simulated: bool
     state_rate: float
     """Rate of the key `state`, Hz."""
     barred: Mapping[str, str]
-    """The actions that this viewer's role does not allow, each with the reason: services, and
-    "drive", "recordings" and "begin"."""
+    """The actions that the client's role does not allow, each with the reason in words. An action
+    is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
     camera: bool
     """Whether `GET /api/camera` has pictures."""
 
@@ -220,7 +223,7 @@ class DrivenPath(Struct, frozen=True):
 
     path: Sequence[Point]
     truth: Sequence[Point]
-    """True path, published by a simulator only."""
+    """True path of a simulated robot; empty for a real one."""
 
 
 class LastMinute(Struct, frozen=True):
@@ -242,7 +245,7 @@ class Row(Struct, frozen=True):
 
     robot: str
     mode: str | None
-    """Mode as in `state`; "gone" after the daemon announced its end, None while the robot is
+    """Mode as in `state`. It is "gone" after the daemon has ended, and None while the robot is
     silent."""
     reason: str
     speed: float | None

@@ -1,8 +1,7 @@
 """The outgoing side of one WebSocket: its subscribed keys, and the messages that it sends.
 
-The newest value of each key is sent when it is due, and answers are sent at once.
-
-While the client has not read earlier data, values are skipped; they are never queued.
+The newest value of each key is sent when it is due, and answers are sent at once. While the client
+has not read earlier data, values are skipped and not queued.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import KEYS, UNREADY, Stream
 
 REPORTS = Rate(1.0)
-"""Limit on the rate at which refusals are reported to the client, per kind of message and reason.
-All refusals are counted."""
+"""Limit on the rate at which a client is told that its messages are refused, for each kind of
+message and each reason. All refusals are counted."""
 
 
 class Following:
-    """A subscribed key with its period and next due time."""
+    """A key to which the client has subscribed, and the time at which its next value is due."""
 
     def __init__(self, robot: str, name: str, own: str, period: float) -> None:
-        """Prepare the constant part of the key's messages.
+        """Prepare the constant part of the messages for the key `name` of a robot.
 
-        `own` is the id of the page's own robot. Messages of that robot carry no id. `period` is the
+        `own` is the id of the page's own robot, whose messages contain no id. `period` is the
         shortest interval between two messages, s.
         """
         self.robot, self.name, self.period = robot, name, period
@@ -51,12 +50,12 @@ class Following:
 
 
 class Outgoing:
-    """The outgoing side of one WebSocket."""
+    """Sends the messages and the values of subscribed keys to the client of one WebSocket."""
 
     def __init__(
         self, socket: web.WebSocketResponse, request: web.Request, counts: Counts, origin: str
     ) -> None:
-        """Store the connection; `origin` identifies the client in the log."""
+        """Store the connection; `origin` is the client's address and name for the log."""
         self._socket, self._transport, self._counts = socket, request.transport, counts
         self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
@@ -75,23 +74,23 @@ class Outgoing:
         self._news.set()
 
     def wake(self) -> None:
-        """Wake `pump`, because there is a new message or subscription."""
         self._news.set()
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refusal, and report it at most once a second for each kind and reason.
+        """Count a refused message, and tell the client why it was refused.
 
-        `what` is the kind of the refused message.
+        `what` is the kind of the message. The client is told at most once a second for each kind
+        and reason.
         """
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
             self.say(Refused(what, text))
 
     async def pump(self, look_around: Callable[[float], float]) -> None:
-        """Send until cancelled or until the connection closes.
+        """Send messages until the task is cancelled or the connection closes.
 
-        `look_around(now)` is called in each round, and returns the time of its next call. Both
-        times are s on the event loop's clock.
+        `look_around(now)` is called in each round, and returns the time at which it must be called
+        again. `now` and the result are in s on the event loop's clock.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -132,10 +131,10 @@ class Outgoing:
             self._transport.abort()
 
     def pong(self, data: bytes) -> None:
-        """Answer the newest ping, which carried `data`. Earlier unanswered pings get no answer.
+        """Queue the answer to the newest ping, which carried `data`, and drop earlier answers.
 
-        The protocol allows this. It keeps the pings of a client that does not read from filling the
-        memory.
+        The protocol allows a server to answer only the newest ping. So a client that sends pings
+        and does not read cannot fill the memory.
         """
         self._pong = data
         self._news.set()
@@ -152,9 +151,9 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send the value of a key if it is due and new.
+        """Send the value of a key if it is due and new; return when the next value is due.
 
-        Return the time at which the next value is due, s on the event loop's clock.
+        Times are s on the event loop's clock.
         """
         stream = one.stream
         if stream is None:
@@ -184,10 +183,10 @@ the processor time that driving needs."""
 
 
 class Keys:
-    """The subscriptions of one viewer.
+    """The keys of robots to which the client of one WebSocket subscribes.
 
-    `start` runs a coroutine in the background. `holder` is the name under which subscriptions to
-    other robots count against the shared limit.
+    `start` runs a coroutine in the background. `holder` is the client's token or name, under which
+    its subscriptions to other robots are counted.
     """
 
     def __init__(
@@ -200,7 +199,7 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key, or change its rate. After a refusal, the viewer gets the reason."""
+        """Subscribe to a key, or change its rate. The client is told the reason of a refusal."""
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)
@@ -246,7 +245,6 @@ class Keys:
             self._leave(one)
 
     def leave_all(self) -> None:
-        """End all subscriptions."""
         followed, self._out.following = self._out.following, {}
         for one in followed.values():
             self._leave(one)
@@ -274,10 +272,7 @@ class Keys:
         self._out.wake()
 
     async def _found(self, one: Following) -> Stream | None:
-        """Return the stream of a key.
-
-        Return None after a delay if the bus is not ready; the caller retries.
-        """
+        """Return the stream of a key, or None after a delay if the bus is not ready yet."""
         client = self._robots.client
         if client is None:
             await asyncio.sleep(0.2)

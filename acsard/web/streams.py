@@ -1,8 +1,8 @@
-"""The newest message of a key, as JSON, shared by all viewers.
+"""The newest message of a key, as JSON, shared by all viewers of the page.
 
-Zenoh's thread only stores the message. The first viewer whose message is due converts it to JSON,
-once for all viewers. The subscription is to the native key (msgpack), so it costs the daemon one
-more reader and no JSON encoding.
+Zenoh's thread only stores the message. It is converted to JSON once for all viewers, when the first
+of them needs it. The server subscribes to the key in msgpack, so the daemon need not encode the
+message as JSON.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. The last state of another robot is not queried, because a router's
-storage would answer with it even if that robot has been off for a week."""
+"""Key of a robot's state. This server does not query the last state of another robot, because the
+storage of a router would answer even if that robot has been off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
-"""Errors of a stuck bus or a closed session; a later attempt may succeed."""
+"""Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
 
 
 class Stream:
@@ -62,12 +62,11 @@ class Stream:
         return self._newest[2]
 
     def take(self, sample: zenoh.Sample) -> None:
-        """Store a published message."""
         with self._taking:
             self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
-        """Store the answer to a query, unless a published (newer) message has arrived."""
+        """Store the answer to a query, unless a published message, which is newer, has arrived."""
         with self._taking:
             if not self._newest[0]:
                 self._newest = (1, sample, clock.mono_ns())
@@ -86,19 +85,23 @@ class Stream:
 
 
 class Streams:
-    """The streams with at least one user. A subscription ends when its last user leaves."""
+    """The subscribed keys of robots, shared by their users, the viewers of the page.
+
+    A subscription ends when its last user leaves.
+    """
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
         self._ending: set[asyncio.Task[None]] = set()
         self.shares = Shares(STREAMS, STREAMS_OF_ONE)
-        """The holders of streams of other robots. The caller acquires a share before `follow`, and
-        releases it when it ends the subscription."""
+        """Limits the subscriptions to keys of other robots. The caller of `follow` acquires a share
+        before the call, and releases it when it ends the subscription."""
 
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """Return the subscribed stream of a robot's key, and add a user to the stream.
+        """Subscribe to a key of a robot if no other user has, and return the stream of messages.
 
-        Raises an error of `UNREADY` if the bus is not ready.
+        The caller is a user of the stream until it calls `leave`. Raises an error of `UNREADY` if
+        the bus is not ready.
         """
         name = robot, key
         stream = self._streams.get(name)
@@ -115,13 +118,13 @@ class Streams:
         return stream
 
     def followed(self, robot: str, key: str) -> Stream | None:
-        """Return the stream of a robot's key if it has a user, otherwise None."""
+        """Return the stream of a robot's key, or None if the stream has no user."""
         return self._streams.get((robot, key))
 
     def leave(self, robot: str, key: str) -> None:
-        """Remove a user from a stream; without users, the subscription ends in the background.
+        """Remove a user from a stream. If it was the last one, the subscription ends.
 
-        The call does not wait, so a user whose task is ending can still release its stream.
+        It ends in the background, so a user whose task is being cancelled can still call this.
         """
         stream = self._streams.get((robot, key))
         if stream is None:

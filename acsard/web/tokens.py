@@ -49,27 +49,29 @@ class Token(Struct, frozen=True):
 
 
 class Vault:
-    """The tokens in a file that only its owner may read. The file is read again when it changes.
+    """The access tokens of one robot, in a file that only its owner may read.
 
-    All robots of one user share the file, and each vault sees the tokens of its own robot only.
+    The file is read again when it changes. All robots of one user share the file, and this class
+    leaves out the tokens of the other robots.
     """
 
     def __init__(self, directory: Path, robot: str) -> None:
         """Use the token file in `directory` for the robot with this id."""
         self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
-        """Change stamp of the file, and its tokens. They are one value, because several threads
-        replace it."""
+        """Modification time, ns, and inode number of the file when it was read, and its tokens.
+        They are one value, because several threads replace it."""
 
     def known(self, text: str) -> Who | None:
-        """Return the owner of the token `text`, or None if it is not valid. Do not read the disk.
+        """Return the owner of the token `text`, or None if the token is not valid.
 
-        The answer depends on the last read of the file. The server reads it once a second.
+        This method does not read the disk. It uses the tokens of the last read of the file, and the
+        server reads the file once a second.
         """
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the seconds until the token with this digest expires, 0 if it is unknown."""
+        """Return the seconds until the token with this digest expires, 0 if there is none."""
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
@@ -101,7 +103,7 @@ class Vault:
         return frozenset(one.digest for one in self.all() if one.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE) -> str:
-        """Return a warning that the service on this machine reads another token file, or ""."""
+        """Return a warning if the service on this machine reads another token file, else ""."""
         if self.path.parent == service or not os.path.lexists(service):
             return ""
         return (
@@ -162,7 +164,6 @@ class Vault:
             ) from None
 
     def _kept(self) -> list[Token]:
-        """Return the tokens in the file, none if it does not exist; raises `UsageError`."""
         try:
             return msgspec.json.decode(self.path.read_bytes(), type=list[Token])
         except FileNotFoundError:

@@ -1,8 +1,8 @@
-"""Serves one WebSocket of a page or a program, which sends commands as a sender of its own.
+"""Serves one WebSocket of a page or a program. To the daemon, each WebSocket is one sender.
 
 Incoming messages are handled at once and never wait for outgoing ones, so a client that does not
-read can still drive and stop. Outgoing values are the newest ones at the requested rate; they are
-skipped while the client has not read earlier data.
+read can still drive and stop. Outgoing values are the newest ones at the requested rate. While the
+client has not read earlier data, values are skipped.
 """
 
 from __future__ import annotations
@@ -58,21 +58,22 @@ ACTIONS: dict[str, Role] = {
 """The least role for each action for which the page shows a control."""
 
 HEARTBEAT_S = 10.0
-"""Ping interval, s. The connection ends if a ping is not answered within half of it."""
+"""Interval of the pings, s. The connection ends if a ping is not answered within half of it."""
 
 CALLS_AT_ONCE = 8
 
 FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
-"""Key of the fleet's rows, their interval, s, and the delay of the first report, s. Without the
-delay, the first report would be empty, because no robot has been found yet."""
+"""Name of the key on which a client follows all robots; interval of the lists of robots, s; delay
+of the first list, s. Without the delay, the first list would be empty, because no robot has been
+found yet."""
 
 
 class ViewerCommands:
     """Puts the newest velocity command of each viewer on the bus.
 
     A command is sent once, with the stamp of its sender, or it is dropped. The server repeats no
-    command and creates none, except one zero command for a sender that was driving and
-    disconnected. `client` returns the connection to the bus, or None while it is lost.
+    command and creates none, except one zero for a viewer that was driving and has disconnected.
+    `client` returns the connection to the bus, or None before it is open.
     """
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
@@ -80,16 +81,16 @@ class ViewerCommands:
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
         """Queue of commands, with the thread that sends them. The server must exit if this thread
-        has died, because no viewer can drive then, and no zero command is sent."""
+        has died, because then it sends neither the commands of viewers nor their last zeros."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
     ) -> bool:
         """Queue a command, in place of an older one of the same commander that still waits.
 
-        `owner` is the token or the local viewer whose commands are counted, and `source` is the
-        command source. Return False, and queue nothing, if the owner exceeds `COMMANDS`. A zero
-        after a speed is queued nevertheless.
+        `owner` is the name under which the rate limit `COMMANDS` counts: a token, or a viewer on
+        the robot itself. Return False, and queue nothing, if the owner exceeds the limit. A zero
+        that ends a drive is queued all the same.
         """
         now_ns = clock.mono_ns()
         ends = wish.twist == REST and commander.drives(now_ns)
@@ -128,7 +129,7 @@ class Parts:
 
 
 class Viewer:
-    """One connected client; it lives as long as its connection."""
+    """One client that is connected by a WebSocket: a page in a browser, or a program."""
 
     def __init__(
         self,
@@ -145,8 +146,8 @@ class Viewer:
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
-        """Public name of this viewer, the value of `state.sender` while this viewer drives. The
-        secret part of the sender's id is never sent to the client."""
+        """Public name of this client: the value of `state.sender` while this client drives. It
+        does not reveal the sender id, which the server keeps secret."""
         self._socket = socket
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
@@ -171,7 +172,7 @@ class Viewer:
             async for message in self._socket:
                 self._take(message)
         finally:
-            # Stop the robot first: a viewer that was driving has disconnected.
+            # Stop the robot first, because this viewer may have been driving.
             self._release()
             self._guide.leave(self)
             pump.cancel()
@@ -282,10 +283,7 @@ class Viewer:
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        """Send a zero command from each source under which the robot may still follow this viewer.
-
-        No further commands are sent for this viewer.
-        """
+        """Send a last zero from each command source that may still drive for this viewer."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
             self._commands.outbox.release(commander, timeouts.get(source, LONGEST_S))
@@ -305,7 +303,7 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message beyond a limit. Answer a call, because a program waits for an answer."""
+        """Refuse a message beyond a limit. A call gets an answer, because its program waits."""
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
             self._out.say(socket_messages.Answer(frame.id, False, text))
@@ -360,9 +358,10 @@ class Viewer:
         self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Report changes of the robot's reachability and facts, and the rows of the fleet.
+        """Tell the client if the robot has become unreachable or the facts about it have changed.
 
-        Return the time of the next call. This time and `now` are s on the event loop's clock.
+        Also send the list of all robots when it is due. Return the time of the next call. That time
+        and `now` are in s on the event loop's clock.
         """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone

@@ -229,7 +229,7 @@ class Finger:
         self.browser.push(0, 90)
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
 def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
     """The browser sends the wanted speed 20 times a second, and a release at once."""
     fast = dict.fromkeys(("linear_acceleration", "linear_deceleration"), 100.0)

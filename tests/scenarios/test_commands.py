@@ -202,7 +202,7 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     world.run(0.2)
     client = Speaker(world, "signed", ahead=-3600.0)
     client.hold(0.0, 0.2)
-    assert world.state.reason.startswith("app is new: it drives once its delays")
+    assert world.state.reason.startswith("app is new: the robot follows it when its")
     assert "app is new" in {s.name: s.waits_for for s in world.state.sources}["app"]
     assert world.state.counters["commands_of_new_senders"] == 4
     # Every sender begins like this: nothing is refused, and no warning is logged.
@@ -239,7 +239,7 @@ def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(wor
     # a person may hold the robot by these zeros, so no other client drives past them
     assert world.state.linear == 0.0
     assert world.state.reason == (
-        "driving: held by ros2_control, which sends only zeros for over 10 s; nav sends "
+        "driving: held by ros2_control, which has sent only zeros for over 10 s; nav sends "
         "speeds and must wait"
     )
     (told,) = [event.text for event in world.events if event.name == "commands_without_effect"]
@@ -257,7 +257,7 @@ def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way
     Speaker(world, way).hold(0.5, 5.0, hz=10.0)
     assert world.state.x == 0.0
     assert "send a zero first: app must send a zero" in world.state.reason
-    assert "`ros2 topic pub` of a speed never sends one" in world.state.reason
+    assert "`ros2 topic pub` of a speed never sends a zero" in world.state.reason
     (told,) = [event for event in world.events if event.name == "commands_without_effect"]
     assert told.text == f"app: {world.state.reason}"
 
@@ -441,7 +441,10 @@ def test_of_two_on_the_same_key_the_first_is_obeyed_alone_and_the_second_is_repo
         world.run(0.025)
         assert world.odom.twist.twist.linear.x >= 0.0
     assert world.state.linear == pytest.approx(0.4, abs=0.03)
-    assert waits_for(world) == "1 more of its senders: wait until the first one is silent"
+    assert (
+        waits_for(world)
+        == "1 more of this source's senders must wait until the first one is silent"
+    )
     for _ in range(40):
         second.send(-0.4)
         world.run(0.05)

@@ -203,10 +203,10 @@ def test_without_its_gyro_the_heading_is_good_by_the_track_that_it_taught() -> N
     print(f"the gyro is silent: by the configured track {plain.error:.0%} of {plain.all:.1f} rad, "
           f"by the learned one {asked.error:.1%}; {asked.world.state.effective_track}")  # fmt: skip
     assert asked.error < 0.1 * plain.error
-    assert " in use, configured 1.000" in asked.world.state.effective_track
-    assert plain.world.state.effective_track.endswith("(only shown), configured 1.000 in use")
+    assert " (in use), configured 1.000" in asked.world.state.effective_track
+    assert plain.world.state.effective_track.endswith("(only shown), configured 1.000 (in use)")
     (told,) = [event for event in asked.world.events if event.name == "learned_track"]
-    assert told.text.endswith(" in use, configured 1.000")
+    assert told.text.endswith(" (in use), configured 1.000")
     assert not [event for event in plain.world.events if event.name == "learned_track"]
 
 
@@ -231,7 +231,7 @@ def test_what_was_learned_is_replayed_to_the_last_bit() -> None:
     tape = Tape()
     made = world(learned_track=True, recorder=tape)
     wandering(made, 13, seconds=25.0)
-    assert " in use, configured" in made.state.effective_track
+    assert " (in use), configured" in made.state.effective_track
     made.gyro_dead = True
     made.drive(0.3, 0.8, 1.0)
     tape.cut = True

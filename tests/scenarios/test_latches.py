@@ -214,7 +214,7 @@ def test_a_fault_does_not_overwrite_a_stop(world: World) -> None:
     reply = call(world, "clear", "ann", world.state.latch)
     assert (reply.success, reply.message) == (
         True,
-        f"fault cleared; still stopped by {JOE} (native): call srv/clear again",
+        f"fault cleared, but the robot is still stopped by {JOE} (native): call srv/clear again",
     )
     assert world.state.mode == "stopped"
     world.drive(0.5, seconds=1.0)

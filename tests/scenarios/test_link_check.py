@@ -109,7 +109,7 @@ def test_an_mcu_without_samples_is_driven_checked_and_the_log_says_what_is_missi
         world.drive(0.5, seconds=1.0)
         assert check_of(world) == "checked"
         assert not any(b"S*" in line for line in moving(world.lines()))
-        assert "sends no counts" in texts(world, "link_check")[-1]
+        assert "does not send encoder counts" in texts(world, "link_check")[-1]
     assert world.state.mode == "driving"
 
 

@@ -189,7 +189,7 @@ def test_the_cause_of_a_late_period_is_in_the_line_that_follows() -> None:
     world.stall(0.05)
     world.run(1.1)
     number, cause = told(world, "missed_periods")
-    assert number.text == "4 x missed: 4 in a row"
+    assert number.text == "4 x missed: 4 control periods in a row"
     assert cause.text.startswith("late: by 0.04 s, because other programs used the processor for")
 
 

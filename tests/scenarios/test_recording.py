@@ -67,7 +67,7 @@ def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(afte
     assert late.outputs is not None
     moving = replace(late.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
     guard.left(b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
-    assert "ramp to rest is over" in guard.check(moving)[1]
+    assert "ramp to zero has ended" in guard.check(moving)[1]
 
 
 @pytest.mark.slow

@@ -185,7 +185,7 @@ def test_state_and_diagnostics_say_that_a_stop_would_be_lost() -> None:
     host.world.run(1.5)
     assert host.world.state.latch_file_error == ""
     assert row(host.world, "latch file").level == 0
-    host.file.trouble = "a stop cannot be kept over a restart: FILE: No space left on device"
+    host.file.trouble = "a stop would not survive a restart: FILE: No space left on device"
     host.world.run(1.5)
     assert host.world.state.latch_file_error == host.file.trouble
     assert row(host.world, "latch file").level == 1
@@ -194,7 +194,7 @@ def test_state_and_diagnostics_say_that_a_stop_would_be_lost() -> None:
 
 def test_an_event_of_the_latch_file_reaches_the_log() -> None:
     host = Host(random.Random(11))
-    event = Event("latch_file", "a stop cannot be kept over a restart: FILE: full", "warning")
+    event = Event("latch_file", "a stop would not survive a restart: FILE: full", "warning")
     host.file.told.append(event)
     host.world.run(0.1)
     assert event in host.world.events
@@ -303,13 +303,13 @@ def test_the_answer_of_a_stop_says_that_it_cannot_be_kept() -> None:
     host = Host(random.Random(13))
     host.world.run(0.5)
     host.file.slow = True
-    host.file.trouble = "a stop cannot be kept over a restart: FILE: No space left on device"
+    host.file.trouble = "a stop would not survive a restart: FILE: No space left on device"
     assert not host.world.ask("srv/stop")
     host.world.run(0.25)
     ((reply,),) = host.world.bus.replies.values()
     assert host.file.trouble in reply.payload.decode()
     host.file.slow = False
-    assert "cannot be kept" not in host.world.call("stop").message
+    assert "would not survive" not in host.world.call("stop").message
 
 
 @pytest.mark.parametrize("hangs", [False, True])

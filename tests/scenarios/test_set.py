@@ -57,7 +57,7 @@ def slopes(lines: list[tuple[float, float]]) -> list[float]:
 def test_a_daemon_without_a_file_keeps_nothing_and_sets_nothing(world: World) -> None:
     wishes = {"settings": {"limits.linear_speed": 0.4}, "keep": True}
     reply = world.call("set", msgspec.json.encode(wishes))
-    told = "nothing is set: this daemon has no configuration file"
+    told = "nothing is set: this daemon has no configuration file; leave out `keep`"
     assert (reply.success, reply.message) == (False, told)
     assert config(world).limits.linear_speed == Config().limits.linear_speed
     assert world.call("set", msgspec.json.encode(wishes | {"keep": False})).success
@@ -293,7 +293,7 @@ def test_a_robot_that_does_not_brake_is_stopped_by_the_guard_whatever_is_set_mea
     while world.state.mode != "fault" and world.now_ns - began_ns < 10 * NS_PER_S:
         assert sets(world, limits__linear_speed=0.9 + world.now_ns % 7 / 100).success
         world.run(0.02)
-    assert "the longest ramp to rest is over" in world.state.reason
+    assert "the longest ramp to zero has ended" in world.state.reason
     assert (world.now_ns - began_ns) / NS_PER_S < 0.7  # 0.34 s of ramp and 0.3 s
     still_ns = world.now_ns
     world.run(60.0)

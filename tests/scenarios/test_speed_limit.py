@@ -111,10 +111,10 @@ def test_no_line_is_faster_than_the_limit_when_an_operator_sets_more(world: Worl
     speeds = fastest(world)
     reply = sets(world, limits__linear_speed=1.5)
     assert reply.success
-    assert "limits.linear_speed = 1.5 once the limit of 0.3 m/s ends" in reply.message
+    assert "limits.linear_speed = 1.5 will apply when the limit of 0.3 m/s ends" in reply.message
     world.hold(1.0, seconds=1.0)
     assert max(speeds) <= 0.3 + 1e-9
-    assert "; 1.5 m/s without it" in world.state.speed_limit
+    assert "; 1.5 m/s when this limit ends" in world.state.speed_limit
 
 
 @each(

@@ -21,9 +21,14 @@ REWORDED: tuple[tuple[str, str], ...] = (
         r"arrive more than \1 s too late: the network delays them",
     ),
     ("; if this goes on, check the network, then restart the sender", ""),
+    (
+        "it drives once its delays have been steady for",
+        "the robot follows it when its commands have arrived with steady delays for",
+    ),
     ("nothing but zeros", "only zeros"),
+    ("which sends only zeros", "which has sent only zeros"),
     ("is kept waiting", "must wait"),
-    (r"sends none: (.*) has tools that", r"never sends one; \1 lists tools that"),
+    (r"sends none: (.*) has tools that", r"never sends a zero; \1 lists tools that"),
     ("has the higher priority: until", "has priority: wait until"),
     (
         "of the same priority, came first: until",
@@ -32,7 +37,7 @@ REWORDED: tuple[tuple[str, str], ...] = (
     (", has the same priority", " has the same priority"),
     (
         "more of its senders: the first until it is",
-        "more of its senders: wait until the first one is",
+        "more of this source's senders must wait until the first one is",
     ),
     (r"\(told (.*), saw ", r"(commanded \1, measured "),
     (
@@ -43,15 +48,37 @@ REWORDED: tuple[tuple[str, str], ...] = (
         "look at the motor's leads, its encoder's A and B, and",
         "check the motor's leads, the A and B lines of its encoder, and",
     ),
+    (
+        "the motor driver or its encoder is at fault",
+        "check the motor driver and the encoder",
+    ),
+    ("reports one and the same speed", "reports a speed that never changes"),
+    (
+        r"(\w+) from (\S+) to (\S+) rad/s is over",
+        r"\1 jumps from \2 to \3 rad/s, which is over",
+    ),
+    ("impossible feedback: ", "the board reports impossible speeds: "),
+    (r"impossible speeds: (\w+) (-?\d)", r"impossible speeds: \1 at \2"),
+    ("release it there", "release it at the robot"),
+    ("mend it, or switch", "repair the driver, or switch"),
+    (
+        "no motion leads away, so the robot stands until the release",
+        "no straight motion leads away from the pressed bumpers, so the robot stands until they "
+        "are released",
+    ),
+    (": only straight", ": the robot drives only straight"),
     ("stopped at the start, because", "stopped when the daemon started, because"),
+    ("a stop cannot be kept over a restart", "a stop would not survive a restart"),
+    ("it is of another version", "another version wrote it"),
     (
         r"what else runs here\? \(`top`; as a service it goes first\)",
-        "which other program uses the processor? "
-        "(`top` shows it; as a service acsard has priority)",
+        "`top` shows which other program uses the processor; if acsard runs as the service, it "
+        "has priority",
     ),
     ("and this daemon reads", "but this daemon reads"),
+    ("and heard nothing of the", "so it received nothing from the"),
     ("heard nothing of the", "received nothing from the"),
-    ("and heard too little for a link", "and received too little for a link"),
+    ("and heard too little for a link", "so it received too little for a link"),
     (
         "sends nothing: its driver accepts no bytes; replug the adapter",
         "sends nothing, because its driver accepts no bytes: "
@@ -59,32 +86,40 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ),
     (
         "come damaged; asking it for the check again",
-        "arrive damaged; the daemon asks it for the check again",
+        "arrive damaged, so the daemon asks it for the checksum again; check cable and ground",
     ),
     ("nothing at all heard", "nothing was received"),
     (
         "is it powered, is this its port and mcu.baud_rate its own, are TX and RX crossed",
-        "has the board power, is this its port, does mcu.baud_rate fit, are TX and RX swapped",
+        "does the board have power, is this its port, is mcu.baud_rate right, are TX and RX "
+        "swapped",
     ),
+    (
+        r"does the line from this computer \(TX\) reach the board's RX",
+        "is TX of this computer connected to RX of the board",
+    ),
+    ("^the microcontroller: ", "no link to the microcontroller: "),
     (
         "does it cut its lines short, or leave out their ends",
         "does the board cut its lines short, or omit the line ends",
     ),
     (
         "what disturbs the cable, or prints on it too",
-        "does something disturb the cable, or print on it too",
+        "is there noise on the cable, or does another program write to it too",
     ),
-    ("is mcu.baud_rate the board's own", "does mcu.baud_rate fit the board"),
-    ("look at cable, ground and baud rate", "check cable, ground and baud rate"),
+    ("is mcu.baud_rate the board's own", "is mcu.baud_rate the rate of the board"),
+    ("look at cable, ground and baud rate", "check the cable, the ground and the baud rate;"),
     (
         "if its lines are further apart than ours, say so by mcu.reply_period",
-        "if the board sends its lines less often than the daemon, set mcu.reply_period",
+        "if the board sends its lines less often than the daemon, set mcu.reply_period;",
     ),
     ("`acsard mcu check` looks closer", "`acsard mcu check` finds out more"),
     (
         "bytes heard but no line end, the last `",
         "bytes received but no line end; the last bytes are `",
     ),
+    ("good, the last `", "good, the last one is `"),
+    ("good, the last other `", "good, the last bad one is `"),
     (r"\b1 bytes received", "1 byte received"),
     ("lines heard, ", "lines received, "),
     (r"\b1 lines received", "1 line received"),
@@ -107,16 +142,17 @@ REWORDED: tuple[tuple[str, str], ...] = (
     (
         "answered with a check before and now does not: its replies are damaged on the way "
         r"\(look at cable and baud rate\), or it has other firmware \(then replug it\)",
-        "answered with a check before and now answers without: either its replies are damaged "
-        "(check cable and baud rate), or it runs other firmware "
+        "answered with a checksum before and now answers without one: either its replies are "
+        "damaged (check cable and baud rate), or it runs other firmware "
         "(then unplug it and plug it in again)",
     ),
     (
         'answers without a check, and mcu.link_check = "require" drives only with one: give it '
         "firmware that has it, or write mcu",
-        'answers without a check, but mcu.link_check = "require" lets the robot drive '
-        "only with one: install firmware that has the check, or write mcu",
+        'answers without a checksum, but mcu.link_check = "require" lets the robot drive '
+        "only with one: install firmware that supports the checksum, or write mcu",
     ),
+    ("serial lines being asked for", "serial lines not checked yet"),
 )
 """Words of reasons that mean the same: the old ones as a regular expression, and the new ones."""
 

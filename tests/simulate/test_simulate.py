@@ -223,7 +223,7 @@ def test_echoes_that_contradict_the_lines_of_a_stalled_adapter_are_the_cause_of_
     witness.step(NS // 2, "driving", "driving: commanded by app")
     witness.troubles = dict.fromkeys(troubles, NS)
     with pytest.raises(BrokenError, match="without a cause") if finding else nullcontext():
-        witness.step(NS, "fault", "impossible feedback: front_right is too fast")
+        witness.step(NS, "fault", "the board reports impossible speeds: front_right is too fast")
 
 
 def test_a_pressed_input_is_a_stop_until_its_release_and_a_clear_behind_that() -> None:
@@ -717,7 +717,7 @@ def test_a_clear_without_a_number_must_wait_behind_a_start_and_behind_the_clear_
         witness.new_life(5 * NS)
     else:
         witness.fault_ns = 3 * NS
-        witness.cleared(5 * NS, None, "fault cleared; still stopped by ann", "ann")
+        witness.cleared(5 * NS, None, "fault cleared, but the robot is still stopped by ann", "ann")
     promise = "a clear releases no later stop"
     with pytest.raises(BrokenError, match=promise) if finding else nullcontext():
         witness.cleared(int(at_s * NS), None, CLEARED, "ann")
@@ -983,7 +983,7 @@ def test_the_judge_of_the_log_counts_its_lines_and_wants_each_mode_there(
     ("words", "kind"),
     [
         ("send a zero first: app must send a zero before it can drive", ("neutral", "app")),
-        ("app is new: it drives once its delays have been steady for 0.25 s", ("proof", "app")),
+        ("app is new: the robot follows it when its commands have arrived", ("proof", "app")),
         ("commands of nav arrive more than 0.5 s too late: the network", ("late", "nav")),
         ("teleop has the same priority and came first: wait", ("priority", "teleop")),
         ("waiting for a command: no source has sent one", ("command", "")),

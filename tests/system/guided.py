@@ -73,7 +73,7 @@ class Guided:
         """Answer which wheel each motor turns, all of them forward."""
         for wheel in wheels:
             await self.answer(await self.asks("which wheel"), wheel)
-            await self.answer(await self.asks("how did it turn"), "forward")
+            await self.answer(await self.asks("which way did the wheel turn"), "forward")
 
 
 @asynccontextmanager

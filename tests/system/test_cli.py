@@ -220,10 +220,13 @@ def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
     [
         (
             ["echo", "state", "--short", "--id", "acsra"],
-            "there is no robot acsra, but there is acsar",
+            "there is no robot acsra. The robots here are acsar",
         ),
-        (["hz", "odom", "--id", "acsra"], "there is no robot acsra, but there is acsar"),
-        (["echo", "imu", "--csv", "--id", "acsra"], "there is no robot acsra, but there is acsar"),
+        (["hz", "odom", "--id", "acsra"], "there is no robot acsra. The robots here are acsar"),
+        (
+            ["echo", "imu", "--csv", "--id", "acsra"],
+            "there is no robot acsra. The robots here are acsar",
+        ),
         (["echo", "cmd/nobody"], "robot acsar is there, but no program sends on cmd/nobody now"),
     ],
 )

@@ -192,7 +192,7 @@ def test_what_can_be_no_place_of_a_daemon_is_a_sentence(
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"), [("mute", "nothing was received"), ("lost_replies", "were answered")]
+    ("fault", "words"), [("mute", "nothing was received"), ("lost_replies", "answered only")]
 )
 def test_a_poor_board_behind_a_daemon_is_named(tmp_path: Path, fault: str, words: str) -> None:
     with Program(acsard("sim", "--fault", fault), tmp_path) as sim:

@@ -107,7 +107,7 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
         assert len(robot.daemon.events("gateway_open")) == 1
         (own / KEY).write_bytes(new)
         robot.daemon.gateway_opens(times=3)  # the second line says that it opens again
-        assert "opens again" in robot.daemon.events("gateway_open")[1]["text"]
+        assert "restarts with its new certificate" in robot.daemon.events("gateway_open")[1]["text"]
         assert robot.lets_in()
         after_ns = peer_ends_ns(robot.tls, str(own))
         assert before_ns is not None

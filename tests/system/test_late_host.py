@@ -34,7 +34,7 @@ TIMES = 8
         ("memory", "of the daemon's memory had to be read from the disk"),
         pytest.param(
             "quota",
-            "the daemon's processor time was used up for",
+            "the daemon's processor quota was used up for",
             marks=pytest.mark.skipif(
                 not (CGROUP.parent / "cpu.cfs_quota_us").exists(),
                 reason="needs cgroups of version 1",

@@ -412,7 +412,7 @@ def test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do(tmp_path: Pa
             for words in (("fleet", "--once"), ("call", "stop"), ("get", "info")):
                 ended = viewer.tool(*words, *by)
                 assert ended.code == 69
-                assert "over TLS you must name the robots" in ended.err
+                assert "Over TLS, name the robots" in ended.err
             stopped = viewer.tool("call", "stop", *by, who=f"{ONE},{TWO}")
             assert f"{ONE}: stopped" in stopped.out
             assert f"{TWO}: NO ANSWER" in stopped.out

@@ -78,7 +78,9 @@ def answer_all(terminal: Terminal, wheels: tuple[str, ...], ways: str, within: f
     answer(terminal, 'then type "lifted"', "lifted", 1, within)
     for n, (wheel, way) in enumerate(zip(wheels, ways, strict=True), 1):
         answer(terminal, "which wheel did", wheel, n, within)
-        answer(terminal, "how did it turn", {"f": "forward", "b": "back"}[way], n, within)
+        answer(
+            terminal, "which way did the wheel turn", {"f": "forward", "b": "back"}[way], n, within
+        )
 
 
 def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path) -> None:

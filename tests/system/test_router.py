@@ -81,7 +81,7 @@ def test_it_opens_again_with_a_new_certificate(where: Path) -> None:
         before_ns = peer_ends_ns(endpoint, str(where / ITS_NAME))
         Authority.load(where, lambda: "").issue(where / ITS_NAME, ITS_NAME, ["127.0.0.1"], 0.5)
         listens(router, 3)
-        assert "opens again with its new certificate" in router.stderr
+        assert "restarts with its new certificate" in router.stderr
         after_ns = peer_ends_ns(endpoint, str(where / ITS_NAME))
         assert before_ns is not None
         assert after_ns is not None
@@ -104,7 +104,7 @@ def test_it_stays_open_if_zenoh_refuses_a_new_certificate(where: Path) -> None:
         assert peer_ends_ns(endpoint, str(client)) == before_ns
         assert "restarted" not in router.stderr
         authority.issue(own, ITS_NAME, ["127.0.0.1"], 0.5)
-        until(lambda: "opens again with its new certificate" in router.stderr, 10.0, "it opens")
+        until(lambda: "restarts with its new certificate" in router.stderr, 10.0, "it opens")
 
 
 def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None
         listens(router)
         tables: Tables = {"robot": {"id": "robot1"}, "bus": bus}
         with Daemon(where, config=tables, endpoint=plain), Bus(plain, robot_id="robot1") as client:
-            told = f"ends in 1 days (that of the router {endpoint})"
+            told = f"ends in 1 days (certificate of the router {endpoint})"
             until(lambda: client.state()["certificate_expiry"] == told, 10.0, told)
 
 

@@ -31,6 +31,8 @@ from tests.system.viewer import Viewer
 pytestmark = pytest.mark.network
 
 
+VIEWER_MAY = "this role may read data and stop the robot, but not drive it"
+
 SILENCE = "your certificate, unlisted, may be missing from every role"
 """The last part of the message for a silence that may have any cause."""
 
@@ -79,7 +81,7 @@ def test_without_a_certificate_one_is_what_the_machine_is(robot: Robot) -> None:
 def test_the_verb_says_role_certificate_and_what_that_may(robot: Robot) -> None:
     ended = robot.tool("viewer", "whoami")
     assert (ended.code, ended.err) == (0, "")
-    assert "your certificate viewer is viewer: it may follow and stop, not drive" in ended.out
+    assert f"your certificate viewer has the role viewer: {VIEWER_MAY}" in ended.out
     assert re.search(r"^sender \S+/\d+/", ended.out, re.M)
     found = json.loads(robot.tool("operator", "whoami", "--json").out)
     assert (found["role"], found["certificate"]) == ("operator", "operator")
@@ -128,7 +130,7 @@ def test_who_means_all_robots_by_a_certificate_of_no_list_is_told_how_to_find_ou
 ) -> None:
     ended = robot.tool("unlisted", "call", "stop", "--id", "*")
     assert (ended.code, ended.out) == (69, "")
-    assert "`acsard whoami --id robot1` shows the role" in ended.err
+    assert "`acsard whoami --id robot1` shows its role" in ended.err
 
 
 @pytest.mark.slow
@@ -201,7 +203,7 @@ def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
 
 
 def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
-    may = "your certificate viewer is viewer: it may follow and stop, not drive"
+    may = f"your certificate viewer has the role viewer: {VIEWER_MAY}"
     port = int(free_endpoint().rpartition(":")[2])
     words = ["foxglove", "--drive", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
     where = robot.daemon.config.parent
@@ -233,7 +235,9 @@ def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
 def test_a_drive_of_a_viewer_raises_what_his_certificate_may(robot: Robot) -> None:
     with (
         connect(robot.tls, tls=robot.own("viewer")) as client,
-        pytest.raises(NotPermittedError, match=r"certificate viewer is viewer: .* not drive"),
+        pytest.raises(
+            NotPermittedError, match=r"certificate viewer has the role viewer: .* not drive"
+        ),
     ):
         client.drive(0.3, seconds=1.0)
 
@@ -248,14 +252,14 @@ async def _drive(robot: Robot) -> None:
 def test_an_async_drive_of_a_viewer_raises_the_same(robot: Robot) -> None:
     import asyncio
 
-    with pytest.raises(NotPermittedError, match="is viewer"):
+    with pytest.raises(NotPermittedError, match="has the role viewer"):
         asyncio.run(_drive(robot))
 
 
 @pytest.mark.parametrize(
     ("who", "code", "told"),
     [
-        ("viewer", 77, "your certificate viewer is viewer: it may follow and stop, not drive"),
+        ("viewer", 77, f"your certificate viewer has the role viewer: {VIEWER_MAY}"),
         pytest.param(
             "unlisted",
             69,
@@ -288,8 +292,8 @@ def test_what_a_viewer_may_not_ask_is_reported_with_the_role_it_takes(
 ) -> None:
     ended = robot.tool("viewer", *words)
     assert (ended.code, ended.out) == (77, "")
-    assert "certificate viewer is viewer" in ended.err
-    assert f"for a certificate that is {least}" in ended.err
+    assert "certificate viewer has the role viewer" in ended.err
+    assert f"needs at least the role {least}" in ended.err
 
 
 def test_an_operator_drives_over_tls_and_stands_where_it_says(robot: Robot) -> None:

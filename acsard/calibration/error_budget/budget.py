@@ -1,13 +1,12 @@
-"""The error budget of a drive: the size of the odometry error that each single cause makes.
+"""Computes the error budget of a drive: the odometry error that each single cause makes.
 
 The errors of one cause are propagated alone through the error model of the odometry
 (`core/motion/uncertainty.py`). The recorded drive is repeated until the robot has driven 100 m,
 which gives the position error. It is also repeated until the robot has turned by 360 deg to one
 side, which gives the heading error.
 
-From the feedback lines, this module measures the errors of time, quantisation, gaps and
-contradicting wheels, and the gyro noise that the odometry assumes, for each step of the drive. All
-other errors are those that `[odometry]` declares.
+The feedback lines show the errors of time, quantisation, gaps and contradicting wheels, and the
+gyro noise that the odometry assumes. All other errors are those that `[odometry]` declares.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from acsard.core.values import REST, PoseCovariance
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""The source of an error's size: the feedback lines, the settings of `[odometry]`, or none."""
+"""The source of an error's size: feedback lines, the settings of `[odometry]`, or none."""
 
 METRES = 100.0
 """Distance after which the position error is given, m."""
@@ -41,13 +40,13 @@ LEAST_M, LEAST_RAD = 0.2, 0.2
 """Minimum distance (m) and minimum turn (rad) of a drive from which errors can be extrapolated."""
 
 LEAST_LINES = 20
-"""Minimum number of feedback lines of a drive."""
+"""Minimum number of feedback lines. With fewer, the robot is treated as standing still."""
 
 STEP_S = 0.1
-"""Minimum length of a step of the drive, s."""
+"""Minimum length of the steps into which a drive is divided, s."""
 
 MOST_STEPS = 20_000
-"""Maximum number of steps until 100 m are driven. The steps of a slow drive are longer."""
+"""Maximum number of steps in 100 m of driving. If the robot drove slowly, steps are longer."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
@@ -196,7 +195,7 @@ def budget(received: Received, config: Config, metres: float = METRES) -> Budget
 
 
 def _standing(received: Received, config: Config, model: _Model) -> Budget:
-    """Return the budget of a robot that stands still. It follows from the settings alone."""
+    """Return the budget of a robot that stands still, whose errors follow from the settings."""
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
@@ -282,8 +281,8 @@ class _Model:
         Args:
             cause: the name of the cause.
             basis: the source of the size of the errors. If it is "unknown", the errors are None.
-            ahead: the steps that are repeated until the distance is driven.
-            left: the steps to the left that are repeated until a whole turn is made.
+            ahead: the steps that are repeated for the position error.
+            left: the steps, with all turns to the left, that are repeated for the heading error.
             only: the settings without the errors of other causes.
             counts: encoder counts per wheel turn; 0 if the encoders are not the cause.
             scale: relative standard deviation of the gyro's scale; 0 if the gyro is not the cause.

@@ -27,19 +27,19 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.host.errors import ReplyError
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
-"""Keys to subscribe to."""
+"""Keys of the messages that an error budget needs."""
 
 MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 SHARE_COARSE = 0.1
-"""Fraction of feedback lines with marks of coarse encoders, above which the report says so."""
+"""Fraction of feedback lines with speeds of coarse encoders, above which the report says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
-"""Limits for the daemon's feedback lines that this program did not receive.
+"""Number and fraction of the daemon's feedback lines that this program may fail to receive.
 
-They are a number and a fraction, and the larger one applies. A few lines are always missing,
-because the counters and the messages do not start and stop at the same moment.
+The larger limit applies. A few lines are always missing, because the counters and the messages do
+not start and stop at the same moment.
 """
 
 SAMPLED = "checked with samples"
@@ -63,7 +63,7 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
 
 
 def _await_line(robot: Client, lines: Subscription) -> None:
-    """Wait for the first message on `lines`. From then on, the daemon publishes all of `KEYS`."""
+    """Wait for the first feedback line. From then on, the daemon publishes all of `KEYS`."""
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
@@ -72,7 +72,6 @@ def _await_line(robot: Client, lines: Subscription) -> None:
 
 
 def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> None:
-    """Pass all messages of the next `seconds` s to `feed`."""
     decoders = {key: decoder(key) for key in queues}
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -128,7 +127,7 @@ class Feed:
         )
 
     def _coarse(self, last: RobotState) -> bool:
-        """Return whether many feedback lines have marks of coarse encoders with unknown counts.
+        """Return whether many feedback lines have speeds of coarse encoders of unknown counts.
 
         `last` is the present state of the daemon.
         """

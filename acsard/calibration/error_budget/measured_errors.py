@@ -9,17 +9,17 @@ its time on the grid is the error of the stamp.
 
 Rounding is an error because a feedback line carries wheel speeds with two decimals. Independent
 rounding errors have a standard deviation of q / sqrt(12), where q is the quantization step. A wheel
-at a constant speed repeats the same error, so a run of n equal values is one error of n times this
-size. If a wheel passes through a value while it becomes faster or slower, the run is different: the
-errors of its first and second half cancel.
+at a constant speed repeats the same error, so n equal values in a row are one error of n times this
+size. If a wheel passes through a value while it becomes faster or slower, the errors in the first
+and in the second half of the equal values cancel.
 
 Some firmware counts encoder edges in each period and reports multiples of the speed of one count.
 If it misses an edge in one period, it counts that edge in the next period. Therefore only the
 rounding of the reported multiple to two decimals adds up, and this rounding error is known.
 
-`Driving` divides a drive into steps, each with the errors of one cause. An error that is
-independent from step to step is given as a variance. An error that has the same sign in each step
-adds up; it is given as motion that the pose missed, like the motion in a gap.
+`Driving` divides a drive into steps, each with the errors of one cause. Errors that are independent
+from step to step are given as variances. Errors that have the same sign in each step add up, so
+they are given as motion that the pose missed, like the motion in a gap.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ from acsard.core.values import Twist, WheelSpeeds
 Counts = npt.NDArray[np.int64]
 
 AHEAD = 30
-"""Number of consecutive lines of which at least one is not delayed.
+"""Number of consecutive feedback lines of which at least one is not delayed.
 
-At 100 Hz it is the number of lines in 0.3 s, the longest time for which a host stalls.
+At 100 Hz they take 0.3 s, the longest time for which a host does not run the daemon.
 """
 
 MISSING = 0.6
-"""Increase of the smallest delay among neighbouring lines, in periods, that shows a lost line."""
+"""Increase of the smallest delay among `AHEAD` lines, in periods, that shows a lost line."""
 
 FOLLOWED = 0.05
-"""Fraction of each smaller change of the delay by which the grid is corrected.
+"""Fraction of each change of the delay by which the expected delay follows, if no line was lost.
 
-The correction is needed because the period is at first known only to about 1 %.
+The expected delay must follow because the period is at first known only to about 1 %.
 """
 
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
-"""Criterion for lines that arrive one by one, not in bursts.
+"""Criterion for feedback lines that arrive one by one, not in bursts.
 
-More than the fraction `CLUSTERED` of the intervals must differ from the median interval by less
-than the fraction `ALIKE_TIMES` of it.
+More than the fraction `CLUSTERED` of the intervals between lines must be alike: they differ from
+the median interval by less than the fraction `ALIKE_TIMES` of it.
 """
 
 
 class LineTimes(Struct, frozen=True):
-    """Estimates of the delay of each feedback line and of the lines that were lost."""
+    """Estimates for each feedback line: its delay, and the number of lines lost before it."""
 
     late: Floats
     """Delay of each line minus the median delay, s."""
@@ -125,10 +125,10 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 
 
 def _missing(at: Floats) -> Counts:
-    """Return the number of lines that were lost before each line.
+    """Return for each line the number of lines that were lost just before it.
 
-    `at` contains the stamp of each line in periods, counted from the first line or from the
-    daemon's first line.
+    `at` contains the time of each line, as a number of periods since an origin. Any origin gives
+    the same result.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -147,20 +147,19 @@ def _missing(at: Floats) -> Counts:
 
 
 BLOCK_S = 0.5
-"""Time within which errors of stamps are correlated, s. It exceeds the longest stall of a host."""
+"""Time within which errors of line stamps are correlated, s. A host never stalls for so long."""
 
 LEAST_LINES, ALIKE = 20, 0.99
-"""Limits for the fit of the gyro's noise.
+"""Limits for the fit that separates the gyro's noise, which grows with time, from its scale error.
 
-`LEAST_LINES` is the minimum number of lines while the robot moves. If the cosine between the
-columns of turn and time is above `ALIKE`, the fit cannot separate both.
+`LEAST_LINES` is the minimum number of feedback lines while the robot moves. If the cosine between
+turn and time is above `ALIKE`, the fit cannot separate both.
 """
 
 LATEST_S = 0.1
-"""Limit, s, that separates the errors of stamps from gaps.
+"""Largest delay of a feedback line, s, that counts as an error of its stamp.
 
-A stamp with a larger delay is not used as an error of a stamp. An interval of at least this length
-in which the pose did not move counts as a gap.
+An interval of at least this length in which the pose did not move counts as a gap.
 """
 
 Wheels = tuple[float, float, float, float]
@@ -223,7 +222,7 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 
     `sent` contains the times of the daemon's own lines, s. `whole` is true if this program received
     every feedback line that the daemon received. If it is false, a missing line may have been lost
-    between the daemon and this program, so it is not treated as a gap that the odometry filled.
+    after the daemon, so it does not count as a gap that the odometry filled.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -248,13 +247,12 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 
 
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
-    """Return the growth of the heading's variance with time from each line to the next, rad2.
+    """Return the growth of the heading's variance with time, from each line to the next, rad2.
 
-    It is 0 for lines in which the wheels do not turn. The variance of the heading also contains the
-    scale error of the gyro, S^2 A^2. S is the relative standard deviation of the scale, and A is
-    the turn since the pose was set. A line with the turn dA adds 2 S^2 A dA, which is subtracted
-    here. The turn before the first line is unknown, so a least-squares fit estimates it together
-    with the rate of growth. The result is None if the fit cannot separate turn and time.
+    It is 0 while the wheels do not turn, and None if a least-squares fit cannot separate it from
+    the other part of the variance. That part is S^2 A^2, where S is the relative standard deviation
+    of the gyro's scale and A the turn since the pose was set. A line with the turn dA adds
+    2 S^2 A dA to it. A is unknown at the first line, so the fit estimates A as well.
     """
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
@@ -275,8 +273,8 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
     """Return the errors of the motion due to wrong stamps, rows of (m, rad).
 
     A wrong stamp changes the interval dt of a line, and thus the distance, which is speed times dt.
-    Summation by parts turns the sum of these errors into terms of one line each: minus the delay of
-    the line times the change of the speed after it.
+    Summation by parts gives each line its own term: minus the delay of the line times the change of
+    the speed after it.
     """
     speeds = np.array([(one.linear, one.angular) for one in twists])
     near = np.abs(found.late) <= LATEST_S
@@ -327,7 +325,7 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""Minimum fraction of feedback lines in which the speeds of two wheels are equal.
+"""Minimum fraction of feedback lines in which two wheels report equal speeds.
 
 The rounding errors of two such wheels are taken to be the same.
 """
@@ -337,17 +335,17 @@ LEAST_VALUES = 3
 
 
 class Rounding(Struct, frozen=True):
-    """Rounding errors. Rows are feedback lines, columns are wheels in `values.WHEELS` order."""
+    """Rounding errors of wheel speeds: a row for each feedback line, columns as `values.WHEELS`."""
 
     variance: Floats
     """Variance of the angle that a wheel rolled from line to line, rad2.
 
-    The entries are independent.
+    The errors of different lines are independent.
     """
     offset: Floats
     """Known error of the angle that a wheel rolled from line to line, rad."""
     alike: Floats
-    """Shape (4, 4): 1 for a pair of wheels with the same errors, otherwise 0."""
+    """Pairs of wheels with the same errors: 1 for such a pair, otherwise 0; shape (4, 4)."""
     quantum: float
     """Quantization step, rad/s."""
     count: float
@@ -355,10 +353,10 @@ class Rounding(Struct, frozen=True):
 
 
 def rounding(speeds: Floats, period: float) -> Rounding:
-    """Estimate the rounding errors of wheel speeds, rad/s.
+    """Estimate the errors that the rounding of wheel speeds causes.
 
-    `speeds` contains a row for each feedback line, which covers `period` s, and a column for each
-    wheel.
+    `speeds` contains the speeds, rad/s: a row for each feedback line, a column for each wheel. A
+    line covers `period` s.
     """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
@@ -373,11 +371,11 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """Return the variance of each run of equal speeds of a wheel, as a multiple of q^2 / 12.
+    """Return the variances of the rounding errors of a wheel, as multiples of q^2 / 12.
 
-    q is the quantization step. The variance is in the row of the run's last value, and the other
-    rows are 0. It is the square of the number of values, or 1 if the wheel passed through the value
-    while it became faster or slower.
+    `values` contains the speeds of the wheel, and q is the quantization step. A sequence of n equal
+    speeds has the variance n^2 at its last speed, and 0 at the others. If the wheel passed through
+    this speed while it became faster or slower, the variance is 1.
     """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
@@ -401,7 +399,7 @@ def _quantum(speeds: Floats) -> float:
 
 
 class Steps(Struct, frozen=True):
-    """The steps of a drive with the errors of one cause."""
+    """A drive, divided into short steps, with the errors that one cause makes in each step."""
 
     rows: Floats
     """One row for each step, with nine columns:
@@ -416,7 +414,7 @@ class Steps(Struct, frozen=True):
     """Whether a gyro measured the turns. Otherwise the wheels did."""
 
     def to_the_left(self) -> Steps:
-        """Return the steps with all turns to the left, and their missed turns reversed as well."""
+        """Return the steps, with those to the right mirrored so that all turns are to the left."""
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
         return Steps(rows, self.by_gyro)
@@ -448,11 +446,11 @@ class Driving:
         return self._motion.yaw_variance is not None
 
     def turned_by_gyro(self) -> Steps:
-        """Return the steps with the gyro noise that the odometry assumes."""
+        """Return the steps with the noise that the odometry assumes for the gyro."""
         return self._steps(gyro=self._motion.yaw_variance)
 
     def late(self) -> Steps:
-        """Return the steps with the errors of wrong stamps, correlated within `BLOCK_S`."""
+        """Return the steps with the errors that wrong stamps of feedback lines cause."""
         late = self._motion.late
         starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
         squares = np.zeros_like(late)
@@ -460,11 +458,11 @@ class Driving:
         return self._steps(squares)
 
     def missed(self) -> Steps:
-        """Return the steps with the errors of gaps."""
+        """Return the steps with the errors of times without feedback lines."""
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return the steps with the rounding errors of lines, not the encoders' resolution."""
+        """Return the steps with the errors that the two decimals of reported speeds cause."""
         found = self._rounding
         if found.count:
             return self._steps(missed=self._of_wheels(found.offset[1:]))
@@ -477,8 +475,8 @@ class Driving:
     def contradicted(self) -> Steps:
         """Return the steps with the errors of wheels that contradict each other.
 
-        If the front and the rear wheel of a side differ and one of them is right, the mean of both
-        is wrong by half of the difference.
+        If the front and the rear wheel of a side differ, one of them is assumed to be right. Then
+        the mean of both is wrong by half of the difference.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
@@ -486,7 +484,7 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the missed motion for wheel angles that are wrong by `off`, rad.
+        """Return the motion that the pose missed because wheel angles are wrong by `off`, rad.
 
         The rows are (m, rad, m2, rad2). The error `off` is known, so the variances are 0.
         """

@@ -29,26 +29,25 @@ STRAYS = 0.005
 """Fraction of the speeds that need not be multiples of the step, because of damaged lines."""
 
 BY_CHANCE = 1e-5
-"""Highest probability that chance has produced an accepted step."""
+"""Highest probability of an accepted step to be the result of chance."""
 
 STEEP = 1.0
-"""Step, rad/s, from which no test against chance is needed.
+"""Smallest step, rad/s, that is accepted without a test against chance.
 
-Only an encoder makes the speed of a wheel alternate this much from line to line.
+Only a coarse encoder makes the speed of a wheel jump this much from line to line.
 """
 
 
 def quantization_step(speeds: Floats) -> float:
     """Return the quantization step of these speeds, or 0 if they have none; all in rad/s.
 
-    Args:
-        speeds: At least three different speeds above 0 in rising order, shape (n,).
+    `speeds` contains at least three different speeds above 0 in rising order, shape (n,).
     """
     spare = max(1, int(STRAYS * len(speeds)))
     # The largest speed, apart from the few that need not be multiples of the step.
     anchor = float(speeds[-1 - spare])
     for part in range(1, int(anchor / FINEST) + 1):
-        # The anchor is rounded too, so each multiple is off in proportion to its size.
+        # The anchor is rounded as well, so each multiple is wrong in proportion to its size.
         if _strays(speeds, anchor / part, ROUNDING / anchor) <= spare:
             step = _fitted(speeds, anchor / part, spare, part)
             if step:
@@ -78,7 +77,7 @@ def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
     if not squares:
         return 0.0
     step, deviation = float(whole @ speeds[near]) / squares, DEVIATION / math.sqrt(squares)
-    # A multiple of the step is off by the step's error times the factor of the multiple.
+    # A multiple j of the step is wrong by j times the error of the step.
     if step < FINEST or _strays(speeds, step, 4 * deviation / step) > spare:
         return 0.0
     by_chance = tries * (FINEST / step) ** (len(np.unique(whole)) - 1)

@@ -4,9 +4,9 @@ A method of calibration consists of questions to ask first and legs to drive in 
 contains the table of the methods, and `runner.py` leads a person through one of them. The command
 line and the page import this module to name the methods, so it does not load numpy.
 
-The robot stays within its limits and on a floor of 3 m x 3 m. The angle that it turns for a command
-is not known before the calibration. The plan must therefore work for an effective track of 1 to 2.5
-times the wheel separation. Each drive stays on the floor because it has one of these forms:
+The robot stays within its limits and on a floor of 3 m x 3 m. Before the calibration it is unknown
+how far the robot turns for a command. The plan must therefore work for an effective track of 1 to
+2.5 times the wheel separation. Each drive stays on the floor because it has one of these forms:
 
 - It goes there and back.
 - It follows a line that a person set the robot on.
@@ -42,7 +42,7 @@ SIMULATED = (
     "position, or gyro if [odometry] gyro is on, with its distance left empty. tape, wall and "
     "umbmark are for a real robot.",
 )
-"""The method to use first on the simulator, and the reason."""
+"""The method of calibration to use first on the simulator, and the reason."""
 
 
 class GuideError(AcsardError):
@@ -59,7 +59,7 @@ class DisturbedError(GuideError):
 
 
 class Move(Struct, frozen=True):
-    """A command, and the time for which the tool keeps sending this command."""
+    """A command, and the time for which the tool keeps sending it. Zero speeds make a pause."""
 
     seconds: float
     """Time for which the tool sends the command, s."""
@@ -88,13 +88,13 @@ class Mean(Struct, frozen=True):
 
     quantity: Quantity
     answers: tuple[str, ...]
-    """Names of the answers."""
+    """Names of the person's answers."""
     deviation: float
     """Standard deviation of the measurement, m or rad."""
     plus: float = 0.0
-    """Constant to add, m or rad, for example whole turns, which the person does not measure."""
+    """Constant to add, m or rad, for example the whole turns that the person does not measure."""
     over: tuple[str, ...] = ()
-    """Names of the legs whose motion the measurement covers. () means only the leg itself."""
+    """Names of the legs whose motion the person measured. () means only the last leg."""
 
 
 class Slant(Struct, frozen=True):
@@ -102,27 +102,27 @@ class Slant(Struct, frozen=True):
 
     quantity: Quantity
     near: str
-    """Name of the answer for the point that a turn to the left moves towards the line."""
+    """Name of the answer with the distance of the point that a left turn moves towards the line."""
     far: str
-    """Name of the answer for the point that a turn to the left moves away from the line."""
+    """Name of the answer with the distance of the other point from the line."""
     apart: str
-    """Name of the answer for the distance between both points, asked before the first leg."""
+    """Name of the answer, asked before the first leg, with the distance between both points."""
     since: str = ""
-    """Name of the leg after which the robot's angle to the line was measured last.
+    """Name of the earlier leg after which the person measured the robot's angle to the line.
 
-    "" means that a person placed the robot parallel to the line before this leg.
+    "" means that the robot was parallel to the line when the measured motion began.
     """
     plus: float = 0.0
     """Whole and half turns to add, rad, because the angle to the line does not show them."""
     over: tuple[str, ...] = ()
-    """Names of the legs whose motion the measurement covers. () means only the leg itself."""
+    """Names of the legs whose motion the person measured. () means only the last leg."""
 
 
 Measure = Mean | Slant
 
 
 class Leg(Struct, frozen=True):
-    """A series of moves. A person starts it with Enter and can stop it at any time with any key."""
+    """A series of moves that a person starts with Enter and can stop at any time with any key."""
 
     name: str
     words: str
@@ -135,7 +135,7 @@ class Leg(Struct, frozen=True):
     by_key: bool = False
     """Whether the person ends the last move with a key. Its duration is then a timeout."""
     placed: bool = False
-    """Whether a person places the robot before this leg. Measurements then start at this leg."""
+    """Whether a person places the robot before this leg, so that readings begin at a known pose."""
 
     @property
     def seconds(self) -> float:
@@ -149,15 +149,15 @@ MOST_S = 90.0
 """Longest driving time of all legs of a method together, s. The tests check each method."""
 
 USUAL_SPEED = 0.3
-"""Speed straight ahead, m/s, if the limits allow it."""
+"""Usual speed straight ahead in a guided drive, m/s. Lower limits make it slower."""
 
 FASTEST_WHEEL = 0.5
 """Largest rolling speed of the wheels in a turn, m/s."""
 
 REACH = 0.75
-"""Distance from the robot's middle to its outermost point, in wheel separations.
+"""Assumed distance from the robot's middle to its outermost point, in wheel separations.
 
-Half a wheel radius is added to this distance.
+Half a wheel radius is added to it.
 """
 
 EDGE = 0.1
@@ -190,7 +190,7 @@ class Setup(Struct, frozen=True):
     reach: float
     """Distance from the robot's middle to its outermost point, m."""
     turning: float
-    """Largest turn rate that the limits allow, rad/s."""
+    """Largest angular command that the limits allow, rad/s."""
     wheel: float
     """Largest rolling speed of the wheels in a turn, m/s."""
     odometry: OdometryConfig = OdometryConfig()
@@ -242,9 +242,9 @@ class Setup(Struct, frozen=True):
         return Move(seconds, 0.0, math.copysign(command, angle))
 
     def command(self, rate: float) -> float:
-        """Return the angular command for the turn rate `rate` without skidding, both in rad/s.
+        """Return the angular command, rad/s, that turns a robot without skidding at `rate`, rad/s.
 
-        The command is within the limits.
+        The command is reduced to the limits.
         """
         per_command = self.rate_per_command
         most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * per_command)
@@ -254,8 +254,8 @@ class Setup(Struct, frozen=True):
     def rate_per_command(self) -> float:
         """Turn rate without skidding, rad/s, for an angular command of 1 rad/s.
 
-        The daemon computes the wheel speeds of a command with the configured multipliers. The turn
-        rate follows from these wheel speeds, the radius and the separation, without multipliers.
+        The daemon computes the wheel speeds of a command with the configured multipliers. Without
+        skidding, the robot turns as these speeds, wheel radius and separation alone predict.
         """
         bare = replace(
             self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
@@ -275,8 +275,8 @@ measurement shows that ratio, so the legs up to this measurement are the same fo
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is computed.
 
-The largest ratio alone is not enough: with a smaller ratio, more whole turns fit into the time
-allowed, so the drive can take longer.
+The largest ratio alone is not enough: with a smaller one, a leg may have one more full turn and
+take longer.
 """
 
 

@@ -1,8 +1,9 @@
-"""Drives one leg: decides the commands from the daemon's messages and from key presses.
+"""Decides the commands of one leg from the daemon's messages and from key presses.
 
-The driver goes through the phases of `Phase`. It commands zero until the daemon accepts its
-commands, then each move of the leg for its duration, then zero until the wheels stand still. An
-unexpected condition halts the leg for good. `LegDriver.halted` then contains the reason.
+A leg is one drive of a guided calibration. The driver goes through the phases of `Phase`. It
+commands zero until the daemon accepts its commands, then each move of the leg for its duration,
+then zero until the wheels stand still. An unexpected condition halts the leg for good.
+`LegDriver.halted` then contains the reason.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from acsard.core.values import REST, Twist, WheelSpeeds
 HELD_UP = "this computer was too busy for the calibration: end the other programs on it"
 
 OBEYED_S = 1.5
-"""Time allowed for the robot to follow a changed command, s. It includes the ramp."""
+"""Time allowed for the robot to follow a changed command, including the ramp, s."""
 
 DEVIATES_S = 1.0
 """Time for which the robot may deviate from the command before the leg is halted, s."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""Allowed deviation from the command: m/s or rad/s, plus a fraction of the command."""
+"""Allowed deviation of the wheels, m/s and rad/s, and the fraction of the command added to it."""
 
 STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
@@ -35,7 +36,7 @@ STILL = 0.02
 STANDING_S, STANDS_S = 0.5, 6.0
 """Limits for the end of a leg, s.
 
-The leg is done when the wheels have stood still for `STANDING_S`. If this takes longer than
+The leg is done when the wheels have stood still for `STANDING_S`. If that has not happened within
 `STANDS_S`, the leg is halted.
 """
 
@@ -54,7 +55,7 @@ class Phase(StrEnum):
 
 
 class LegDriver:
-    """A leg while it is driven. Every `now` is in s of the same monotonic clock."""
+    """Decides the commands of one leg. Every `now` is in s of the same monotonic clock."""
 
     def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
         """Start a leg. The daemon identifies the commands of this leg by `source` and `sender`."""
@@ -76,7 +77,7 @@ class LegDriver:
         self._waits = "no state of the daemon has arrived"
         """The reason why the daemon does not accept the commands yet, or ""."""
         self._starved = f"no command of source {source} has arrived for {OPENING_S:g} s"
-        """Objection if this computer is too busy to send commands."""
+        """Objection if the daemon receives no commands because this computer is too busy."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -94,11 +95,11 @@ class LegDriver:
         return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
 
     def key(self, pressed: str, now: float) -> None:
-        """Handle a key press.
+        """Handle a key press, which halts the leg except in two cases.
 
-        If the leg has `by_key` set, a key ends its last move, and further keys are ignored while
-        the wheels come to rest. At any other time a key halts the leg. Enter is ignored in phase
-        OPENING, because the person who started the leg with Enter may still hold the key.
+        If the person ends the leg with a key (`Leg.by_key`), a key ends its last move, and further
+        keys are ignored while the wheels come to rest. Enter is ignored in phase OPENING, because
+        the person who started the leg with Enter may still hold the key.
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
@@ -112,7 +113,6 @@ class LegDriver:
             self._halt(PRESSED)
 
     def state(self, state: RobotState, now: float) -> None:
-        """Handle a `state` message of the daemon."""
         self._received = now
         why = self._objection(state)
         if state.mode in (*NEVER, "waiting"):
@@ -140,9 +140,9 @@ class LegDriver:
     def step(self, now: float) -> Twist:
         """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
-        # After a pause of this process, it is unknown whether the daemon was silent. During the
-        # pause the robot has braked, and the time of the move may have run out. The next move would
-        # then begin at the wrong place.
+        # During a pause of this process the robot has braked, and the time of the move may have run
+        # out. The next move would then begin at the wrong place. The pause also hides whether the
+        # daemon was silent.
         if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
             self._halt(HELD_UP, disturbed=True)
         elif now - self._received > QUIET_S:
@@ -196,7 +196,7 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if an objection lasts for `DEVIATES_S`.
+        """Halt the leg if an objection to its continuation lasts for `DEVIATES_S`.
 
         A shorter objection is tolerated: if this computer is busy for a moment, it sends its
         commands late, and the robot only slows down.

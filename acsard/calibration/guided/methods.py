@@ -36,28 +36,28 @@ BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of the distance between the marks and the end of a square, m.
+"""Standard deviation of the robot's distance from its marks after a square, m.
 
-It includes the error with which the person placed the robot beside the marks.
+It includes the error with which the person made the marks beside the robot.
 """
 
 FIRST_TURN = 1.2
-"""Turn rate that the first turn would have without skidding, rad/s."""
+"""Turn rate that the first turn on the spot would have without skidding, rad/s."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time that a turn takes with the widest track.
+"""Timeout of the first turn, as a multiple of the time for a circle with the widest track.
 
-If it expires, the person has missed the moment at which the circle was complete.
+If the timeout expires, the person has missed the moment at which the circle was complete.
 """
 
 MOST_SPIN_S = 24.0
-"""Longest time for several turns on the spot, s."""
+"""Longest time of a leg with several full turns on the spot, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
 """Pauses between moves. In `STOP` the robot comes to rest; in `SETTLE` it also stops shaking."""
 
 ROUND = "once round"
-"""Name of the leg of the first turn, which a person ends with a key."""
+"""Name of the leg that turns once on the spot. A person ends this leg with a key."""
 
 FROM_MARK = Ask(
     "How far is that wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
@@ -109,7 +109,7 @@ TO_LINE = (
     Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
 )
 LINE = "front", "rear", "wheelbase"
-"""Values of `near`, `far` and `apart` of a `Slant`, for a line on the robot's left."""
+"""Values of `Slant.near`, `Slant.far` and `Slant.apart` for a line on the robot's left."""
 
 
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -159,10 +159,10 @@ GAP_M = 0.2
 """Distance from the wall at which the robot stops when it returns, m."""
 
 OUT_M = 0.9
-"""Distance that the robot drives before the turns on the spot, m."""
+"""Distance that the robot drives away from the wall before several turns on the spot, m."""
 
 HALF_RATE, ROUND_RATE = 0.8, 1.2
-"""True turn rates for half turns and for whole turns, rad/s."""
+"""True turn rates of half turns and of whole turns in the method "wall", rad/s."""
 
 SQUARE = (
     "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
@@ -242,11 +242,11 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
 # The method "umbmark": squares in both directions, and marks on the floor.
 
 CORNER_RATE = 0.9
-"""True turn rate at the corners, rad/s."""
+"""True turn rate at the corners of the square in the method "umbmark", rad/s."""
 
 
 def side_of_square(setup: Setup) -> float:
-    """Return the length of the square's side, m: 1.2 m, or less if the robot is large."""
+    """Return the side of the square in the method "umbmark": 1.2 m, or less for a large robot."""
     return min(1.2, ROOM - 2 * (setup.from_edge + 2 * EDGE))
 
 
@@ -314,14 +314,14 @@ FAST, SLOW, CURVE = 1.5, 0.75, 0.8
 """Rates that fast turns, slow turns and curves would have without skidding, rad/s."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
-"""Sizes of the moves of "gyro" and "positions".
+"""Sizes of the moves of the methods "gyro" and "positions".
 
-They are the duration of a turn for a gyro (s), the length of a curve (m), and the angle of a turn
-for positions (rad), as it would be without skidding.
+They are the duration of a turn in "gyro" (s), the length of a curve (m), and the angle of a turn
+in "positions" (rad), as it would be without skidding.
 """
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Pairs of turn rates, rad/s: that of a turn on the spot, and that of the curve after it.
+"""Turn rates, rad/s, of the turns on the spot in "positions" and of the curve after each turn.
 
 The robot would have these rates without skidding.
 """
@@ -333,7 +333,7 @@ STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
 """
 
 STRAIGHT = "straight"
-"""Name of the leg whose length the person measures by tape."""
+"""Name of the leg that drives straight ahead, whose length the person measures by tape."""
 
 
 def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:

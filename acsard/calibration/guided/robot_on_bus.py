@@ -1,10 +1,10 @@
 """Connects a guided drive to the robot: sends the commands of a leg, and records the messages.
 
 `leg_driver.py` decides which command to send. `Recorder` keeps the samples of a leg in the same
-form as a log. Each sender stamps its messages with its own clock, or not at all, and the clocks
-need not agree. The stamps of a key therefore show only the intervals between its samples. The
-recorder assumes that the sample of a key with the smallest delay from stamp to arrival arrived
-without delay. The fit finds the delays that remain.
+form as a log. The programs that send the messages stamp them with their own clocks, which may
+differ, or not at all. The stamps on a key therefore show only the intervals between its messages.
+The recorder assumes that the message with the smallest delay from stamp to arrival arrived without
+delay. The fit finds the delays that remain.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from acsard.terminal.prompt import Prompt
 SOURCE = "app"
 
 LOOK_S = 0.005
-"""Period in which keys and messages are polled, s. A key press takes effect within it."""
+"""Period of polling the keyboard and the message queues, s. A key press takes effect within it."""
 
 SHOWN_S = 0.2
 """Period in which the progress of a leg is shown, s."""
@@ -44,7 +44,7 @@ SHOWN_S = 0.2
 RETURNS_S = 3.0
 """Time within which a silent daemon must send its state again, s.
 
-If it does, its computer was only too busy to run it, and the leg can be repeated.
+If it does, the robot's computer was only too busy to run it, and the leg can be repeated.
 """
 
 POSITIONS = (Odometry, PoseStamped)
@@ -58,7 +58,7 @@ Take = Callable[[Any, float], object]
 
 
 class Sensor:
-    """A subscription to one key. The first of `types` that fits decodes its messages."""
+    """A subscription to one key. Its messages are decoded as the first of `types` that fits."""
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
@@ -110,7 +110,7 @@ class Sensor:
 STREAMS = {
     "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
-"""Columns of the log by the name of their source."""
+"""Columns of a log that the messages of each kind fill."""
 
 
 class Sample(Struct, frozen=True):
@@ -121,7 +121,7 @@ class Sample(Struct, frozen=True):
     made: float | None
     """Stamp of the sender's clock, s; None if the message has no stamp."""
     values: tuple[float, ...]
-    """Values of the columns that `STREAMS` lists for the source."""
+    """Values of the columns that `STREAMS` lists for this kind of message."""
 
 
 class Recorder:
@@ -142,7 +142,6 @@ class Recorder:
         return max(map(abs, speeds.values()))
 
     def gyro(self, message: Imu, came: float) -> None:
-        """Add the turn rate of a gyro."""
         self._add("gyro", message.header.stamp, came, (message.angular_velocity.z,))
 
     def place(self, message: PoseStamped | Odometry, came: float) -> None:
@@ -177,7 +176,8 @@ class Recorder:
 def times(samples: Sequence[Sample]) -> Floats:
     """Return the times of samples on this computer's clock, s.
 
-    If a sample has no stamp, they are the times of arrival.
+    If any sample has no stamp, the times of arrival are used. Otherwise they follow from the stamps
+    (`on_arrival_clock`).
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
@@ -185,7 +185,7 @@ def times(samples: Sequence[Sample]) -> Floats:
 
 
 class RobotOnBus:
-    """The robot of a guided drive. It drives one leg at a time while its sensors are recorded."""
+    """Drives the robot one leg at a time, and records its sensors meanwhile."""
 
     def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
         self._client, self._prompt = client, prompt

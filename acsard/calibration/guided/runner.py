@@ -39,13 +39,13 @@ There the floor has no limits, and no person has to set the robot back.
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
-    """Return the index of the leg from which the drive goes on after a disturbance.
+    """Return the index of the leg with which a guided drive goes on after a disturbed leg.
 
-    A sensor measures each leg alone, so it needs only the disturbed leg again. Tape readings after
-    one placement of the robot belong together, so the drive goes back to the leg for which the
-    person placed the robot. There is one exception: if the turn of a leg is measured from the
-    robot's angle after an earlier leg, that leg is repeated alone, and the person measures the
-    angle again.
+    If a sensor measures, only the disturbed leg is driven again. A tape shows where the robot is
+    relative to the place in which the person put it. The drive therefore goes back to the last leg
+    before which the person placed the robot. Exception: if only an angle after an earlier leg is
+    needed (`angle_before`), the person measures that angle again, and only the disturbed leg is
+    driven again.
 
     Args:
         legs: the legs of the method.
@@ -58,10 +58,10 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 
 
 def angle_before(leg: Leg) -> str:
-    """Return the name of the earlier leg whose final angle is the start of this leg's turn.
+    """Return the name of the earlier leg after which a person measured the robot's angle for `leg`.
 
-    The person measured the robot's angle after that earlier leg. The name is "" if the measurements
-    of `leg` need no such angle, or if they cover several legs.
+    The turn of `leg` is the change since that angle. The name is "" if the measurements of `leg`
+    need no earlier angle, or if they cover several legs.
     """
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")
@@ -70,7 +70,7 @@ def angle_before(leg: Leg) -> str:
 def guide(
     name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run], *, simulated: bool = False
 ) -> Calibration:
-    """Lead a person through a method of calibration, and return the result.
+    """Lead a person through the legs of a method of calibration, and return the result.
 
     A disturbed leg is repeated after the person has set the robot back.
 

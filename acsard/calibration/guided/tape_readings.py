@@ -44,10 +44,10 @@ SKIDDING_LENGTH = 0.002
 """Standard deviation of a distance due to skidding, as a fraction of the distance."""
 
 UNKNOWN = 1.0
-"""Prior standard deviation of the mean radius, as a fraction."""
+"""Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Weight of the assumed skidding (`SKIDDING`, `SKIDDING_LENGTH`), as a number of readings."""
+"""Number of readings whose scatter weighs as much as the assumed skidding."""
 
 MOST_STEPS = 50
 SMALL = 1e-9
@@ -57,7 +57,6 @@ WORST_CONDITION = 1e8
 """Largest condition number at which the readings determine the parameters."""
 
 ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
-"""Parameters that are fitted."""
 
 PRECISE = 0.2
 """Limit for the turn reading that gives the starting parameters.
@@ -67,7 +66,7 @@ Its standard deviation must be below this fraction of the turn.
 
 
 class Reading(Struct, frozen=True, dict=True):
-    """A measurement, in rad or m, of the robot's motion over one or more rides."""
+    """A measurement by tape, in rad or m, of the robot's motion over one or more recorded legs."""
 
     rides: tuple[Run, ...]
     """The recorded legs that the measurement covers, in order."""
@@ -78,17 +77,17 @@ class Reading(Struct, frozen=True, dict=True):
 
     @cached_property
     def steps(self) -> WheelSteps:
-        """The wheel steps of all rides, as if they were one ride."""
+        """The motion of the wheels in all legs, as if they were one leg."""
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return the measured minus the predicted value, for an `angle` without whole turns."""
+        """Return the measured minus the predicted value, without whole turns for an `angle`."""
         off = self.value - prediction
         return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
 
 class Predicted(Struct, frozen=True):
-    """The value, in rad or m, that a reading has if the robot moves as its wheels roll."""
+    """The value of a reading, in rad or m, that the rolling of the wheels predicts."""
 
     value: float
     derivatives: Floats
@@ -112,7 +111,7 @@ class TapeFit(Struct, frozen=True):
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
-    """Return the wheel steps of several rides as if they were one ride."""
+    """Return the motion of the wheels in several recorded legs as if they were one leg."""
     parts = [wheel_steps(ride) for ride in rides]
     ends = np.cumsum([0.0] + [float(part.t[-1]) for part in parts])
     later = [part.t[1:] + end for part, end in zip(parts, ends, strict=False)]
@@ -122,7 +121,7 @@ def joined(rides: Sequence[Run]) -> WheelSteps:
 
 
 def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Floats) -> Predicted:
-    """Return the value of a reading that the wheels and these parameters predict."""
+    """Return the value of a reading of `quantity` that the wheels and these parameters predict."""
     driven = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
     derivatives = np.zeros(COUNT)
@@ -240,7 +239,7 @@ def _held_out_residual(
 
 
 READ_M = 0.002
-"""Standard deviation of a measured distance, and of a robot's place on a line, set by hand, m."""
+"""Standard deviation of a distance by tape, and of a robot that a person set on a line, m."""
 
 CREDIBLE = 0.85, 3.0
 """Range of credible ratios of effective track to wheel separation.
@@ -256,7 +255,7 @@ The leg is "" for the questions before the first leg.
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
-    """Return the measurement that a person took after the leg `leg`, from their answers.
+    """Return the reading that `measure` defines, from a person's answers after the leg `leg`.
 
     `rides` maps the name of each leg to its recording. Raises `RefusedError` if the answers are
     impossible.
@@ -278,9 +277,9 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 
 
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
-    """Compute the ratio of effective track to wheel separation from a `turned` reading.
+    """Return about the ratio of effective track to wheel separation, from a `turned` reading.
 
-    The ratio is an approximation for the next legs. Raises `GuideError` if it is not credible.
+    The next legs are planned with it. Raises `GuideError` if the ratio is not credible.
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
@@ -321,10 +320,10 @@ ADVICE = (
 )
 
 TURNED, STRAIGHT = np.pi, 0.5
-"""Limits for the kind of a drive, rad.
+"""Limits for the turn of a drive, rad.
 
-A drive that turned by more than `TURNED` is a turn. A drive that turned by less than `STRAIGHT` is
-straight. The heading error of a drive in between is not reported.
+Above `TURNED`, the drive's heading error is reported as that of a turn. Below `STRAIGHT`, it is
+reported as that of a straight drive. Between the limits, it is not reported.
 """
 
 

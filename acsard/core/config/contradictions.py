@@ -28,9 +28,10 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
-"""Shortest time, in control periods, after which encoder counts may wrap at the highest speed.
+"""Shortest allowed time, in control periods, until the encoder counts become ambiguous.
 
-With two periods, one lost feedback line does no harm.
+They do so when a wheel turns by half the range of the counts between two feedback lines: the turn
+then looks like one in the other direction. With two periods, one lost line does no harm.
 """
 
 MOST_VOLTS = 99.99
@@ -38,7 +39,7 @@ MOST_VOLTS = 99.99
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a sentence about each setting that is allowed but may surprise."""
+    """Return a sentence about each setting that is allowed but has a surprising effect."""
     found = []
     count = config.mcu.line_bytes
     use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
@@ -46,8 +47,8 @@ def warnings(config: Config) -> list[str]:
         comfortable = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE)
         found.append(
             f"control.rate = {config.rate_hz:g} takes {use:.0%} of the wire at "
-            f"{config.mcu.baud_rate} baud, so newer lines will supersede waiting ones; "
-            f"{comfortable} Hz is comfortable"
+            f"{config.mcu.baud_rate} baud, so the daemon will replace some lines by newer ones "
+            f"before they are sent; write {comfortable} or less"
         )
     found += _count_warnings(config)
     drive, limits = config.drive, config.limits
@@ -55,8 +56,8 @@ def warnings(config: Config) -> list[str]:
     if needed > limits.wheel_speed:
         found.append(
             f"limits.linear_speed = {limits.linear_speed:g} m/s needs wheels at {needed:.1f} "
-            f"rad/s, but limits.wheel_speed = {limits.wheel_speed:g}: the robot will not reach "
-            "that speed"
+            f"rad/s, but limits.wheel_speed = {limits.wheel_speed:g}, so the robot will stay "
+            "slower; raise limits.wheel_speed or lower limits.linear_speed"
         )
     if config.safety.estop == "off":
         found.append(
@@ -71,9 +72,9 @@ def warnings(config: Config) -> list[str]:
     if required and use + status_use > 1.0:
         left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
         found.append(
-            f"{required}: status lines take {status_use:.0%} of the wire at "
-            f"{config.mcu.baud_rate} baud, and replies at control.rate = {config.rate_hz:g} do not "
-            f"fit beside them; {left} Hz is comfortable"
+            f"{required} needs status lines, which take {status_use:.0%} of the wire at "
+            f"{config.mcu.baud_rate} baud. The replies at control.rate = {config.rate_hz:g} do "
+            f"not fit beside them; write control.rate = {left} or less"
         )
     if config.bus.insecure:
         found.append("bus.insecure = true: every program that reaches the bus can drive this robot")
@@ -105,7 +106,8 @@ def _count_warnings(config: Config) -> list[str]:
     if mcu.simulated and mcu.encoder_counts != config.sim.encoder_counts:
         return [
             f"mcu.encoder_counts = {mcu.encoder_counts}, but the simulated robot's encoders have "
-            f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong"
+            f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong; "
+            "write the same number in both"
         ]
     return []
 
@@ -125,8 +127,9 @@ def _wire_problems(config: Config) -> list[str]:
     bauds = [b for b in (19200, 38400, 57600, 115200) if wire_use(rate, b, count) <= 1.0]
     faster = f"mcu.baud_rate = {bauds[0]} or more, or " if bauds else ""
     return [
-        f"control.rate = {rate:g}: {count} B at {mcu.baud_rate} baud = {ms:.1f} ms per line, "
-        f'at most {most} Hz, {good} Hz at 80 %; write {faster}control.rate = {good} or "auto"'
+        f"control.rate = {rate:g}: a line of {count} B at {mcu.baud_rate} baud takes {ms:.1f} ms, "
+        f"so at most {most} Hz is possible, and {good} Hz uses 80 % of the wire; write "
+        f'{faster}control.rate = {good} or "auto"'
         f"{_shorter_lines(mcu, rate)}"
     ]
 
@@ -152,11 +155,11 @@ def _count_problems(config: Config) -> list[str]:
         return []
     return [
         f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = "
-        f"{config.feedback.wheel_speed:g} rad/s the counts could wrap in "
-        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, but they must last {LEAST_WRAP_PERIODS} "
+        f"{config.feedback.wheel_speed:g} rad/s a wheel's counter could wrap round within "
+        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, which is less than {LEAST_WRAP_PERIODS} "
         f"control periods ({lasts * 1000:.0f} ms); write "
-        f"{int(FIELD / 2 / fastest / lasts)} at most (count fewer edges), a "
-        "lower feedback.wheel_speed, or 0"
+        f"mcu.encoder_counts = {int(FIELD / 2 / fastest / lasts)} or less and let the firmware "
+        "count fewer edges, or lower feedback.wheel_speed, or write mcu.encoder_counts = 0"
     ]
 
 
@@ -211,8 +214,8 @@ def _battery_problems(config: Config) -> list[str]:
     for name, below in rows:
         if below + battery.hysteresis > most:
             found.append(
-                f"{name} = {below:g}: with battery.hysteresis = {battery.hysteresis:g} this level "
-                f"would end above {most:g}, which no board reports; write lower values"
+                f"{name} = {below:g}: with battery.hysteresis = {battery.hysteresis:g} the level "
+                f"would end only above {most:g}, which no board reports; lower one of the two"
             )
     return found
 
@@ -222,7 +225,9 @@ def _repeated(noun: str, names: dict[str, str]) -> list[str]:
     found = []
     for key, name in names.items():
         if name in first:
-            found.append(f"{key} = {show(name)}: {first[name]} is the same {noun}; write another")
+            found.append(
+                f"{key} = {show(name)}: {first[name]} already has this {noun}; write another"
+            )
         first.setdefault(name, key)
     return found
 
@@ -261,8 +266,8 @@ def _reachability_problems(config: Config) -> list[str]:
         found.append('bus.listen = []: no client could connect; write ["tcp/127.0.0.1:7448"]')
     if bus.outside and not bus.plain:
         found.append(
-            f"bus.listen = {show(list(bus.listen))}: clients that connect by TLS reach the "
-            'daemon through an address on this machine; add "tcp/127.0.0.1:7448"'
+            f"bus.listen = {show(list(bus.listen))}: the TLS gateway reaches the daemon through "
+            'a tcp address on this machine, and none is listed; add "tcp/127.0.0.1:7448"'
         )
     return found
 
@@ -285,10 +290,10 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
                 )
         elif not _is_loopback(host) and not bus.insecure:
             found.append(
-                f"{where}: leaves this machine, but it has no encryption and no access control; "
-                "use 127.0.0.1 (a laptop connects through an SSH tunnel), use "
-                'certificates (`acsard tls init`, then "tls/…"), or accept that anyone there '
-                "can drive the robot: bus.insecure = true"
+                f"{where}: this endpoint is on the network, without encryption or access "
+                "control; use 127.0.0.1 (a laptop connects through an SSH tunnel), use "
+                'certificates (`acsard tls init`, then "tls/…"), or accept that anyone on the '
+                "network can drive the robot: bus.insecure = true"
             )
     return found
 
@@ -363,5 +368,5 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""The rules. Each is a separate function, so that an invalid key skips only the rules that read
-it."""
+"""The rules. A rule that reads a key without a valid value is skipped. So each rule is a separate
+function that reads few keys."""

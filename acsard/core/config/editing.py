@@ -82,11 +82,10 @@ def _adjusted(array: object, value: object) -> bool:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert the new keys of all tables that the text writes as dotted keys.
+    """Insert new settings into tables that the text writes as dotted keys, like `mcu.port = ...`.
 
-    An example of a dotted key is `mcu.port = ...`. The new keys are dotted keys as well. This
-    function inserts them, because tomlkit would insert a table header in the middle of the dotted
-    keys.
+    The inserted settings are dotted keys too. tomlkit would insert a table header in the middle of
+    the dotted keys.
 
     Returns:
         The text with the inserted keys, and the settings that were not inserted.

@@ -1,8 +1,8 @@
-"""Changes settings while the daemon runs: the table of these settings, and the check of a change.
+"""Lists the settings that may change while the daemon runs, and checks such a change.
 
-A change must satisfy the same rules as the file, and is applied completely or not at all. The parts
-of the robot have a method `use`, with which they adopt the new settings. All settings that are not
-in the table take effect only at the next start of the daemon.
+A change must satisfy the same rules as the file, and is applied completely or not at all. The
+caller passes the new configuration to the method `use` of each part of the robot. A setting that is
+not in the table `LIVE` takes effect only at the next start of the daemon.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WHEN: dict[When, str] = {
 - raised: the setting may be raised at any time, but lowered only while the robot stands. With a
   lower deceleration, a driving robot could not stop in time.
 - rest: the setting may change only while the robot stands. A lower `limits.wheel_speed` would cut
-  the speed at once, and new timeouts make the robot forget the program that commands it.
+  the speed at once. After a change in `commands`, each sender must send a zero before it drives.
 """
 
 
@@ -50,17 +50,17 @@ LIVE: dict[str, Live] = {
     "limits.angular_acceleration": Live("always", "acceleration of a turn"),
     "limits.linear_deceleration": Live("raised", "deceleration, also when commands end"),
     "limits.angular_deceleration": Live("raised", "deceleration of a turn, also when commands end"),
-    "limits.linear_stop_deceleration": Live("raised", "deceleration of a stop or a fault"),
+    "limits.linear_stop_deceleration": Live("raised", "deceleration after a stop or a fault"),
     "limits.angular_stop_deceleration": Live(
-        "raised", "deceleration of a turn by a stop or a fault"
+        "raised", "deceleration of a turn after a stop or a fault"
     ),
     "limits.linear_jerk": Live("always", "how fast the acceleration may grow"),
     "limits.angular_jerk": Live("always", "how fast the acceleration of a turn may grow"),
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
     "commands.neutral_pause": Live(
-        "rest", "time without a speed that must follow a zero of a shared sender identity"
+        "rest", "pause after a zero before a sender identity that several programs share may drive"
     ),
-    "commands.sources.*.timeout": Live("rest", "silence after which the source is stale"),
+    "commands.sources.*.timeout": Live("rest", "silence after which the source stops driving"),
     "odometry.covariance": Live(
         "always", '"model" computes the covariances, "constant" publishes the configured diagonals'
     ),
@@ -71,9 +71,9 @@ LIVE: dict[str, Live] = {
     "odometry.twist_covariance_diagonal": Live(
         "always", "x y z roll pitch yaw: uncertainty of the axes without a sensor"
     ),
-    "odometry.distance_variance_per_metre": Live("always", "error of the distance, m2 per m"),
-    "odometry.yaw_variance_per_metre": Live("always", "error of the heading, rad2 per m"),
-    "odometry.yaw_variance_per_radian": Live("always", "error of the heading, rad2 per rad"),
+    "odometry.distance_variance_per_metre": Live("always", "variance of the distance, m2 per m"),
+    "odometry.yaw_variance_per_metre": Live("always", "variance of the heading, rad2 per m"),
+    "odometry.yaw_variance_per_radian": Live("always", "variance of the heading, rad2 per rad"),
     "rates.odom": Live("always", "how often odom and tf are published"),
     "rates.wheel_states": Live("always", "how often wheel_states are published"),
     "rates.cmd_vel_out": Live("always", "how often cmd_vel_out is published"),
@@ -83,7 +83,7 @@ LIVE: dict[str, Live] = {
 }
 """The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`.
 
-The name of a source stands in place of its index, and "*" stands for every source.
+The keys of a command source contain its name instead of its index. Here "*" stands for each name.
 """
 
 SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
@@ -115,7 +115,7 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 class Difference(Struct, frozen=True):
-    """The value of a key that is in force, and its value in the configuration file."""
+    """The value of a setting in force, and its different value in the configuration file."""
 
     its: object
     """Value in force."""
@@ -123,7 +123,7 @@ class Difference(Struct, frozen=True):
     """Value in the file."""
 
     def words(self, key: str) -> str:
-        """Return both values in words."""
+        """Return a text with the setting's key and both values."""
         # If only one configuration has a command source, the other has no value for its keys.
         its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
         return f"{key} = {its}, not {ours}"

@@ -59,7 +59,8 @@ def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, lis
                 events += more
             except ConfigError as error:
                 text = (
-                    f"{key} = {value} was lowered before the restart, and is dropped now: {error}"
+                    f"{key} was lowered to {value} before the restart. The value of the "
+                    f"configuration file applies now, because the lowered one is refused: {error}"
                 )
                 events.append(Event("set", text, "warning"))
         return config, events
@@ -69,7 +70,7 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
     if not wishes:
         return config, []
     made, news = changed(config, wishes, at_rest=True)
-    return made, [Event("set", f"{news}: lowered before the restart", "warning")]
+    return made, [Event("set", f"{news}: lowered before the restart, still in force", "warning")]
 
 
 def _rank(name: str, value: float) -> float:

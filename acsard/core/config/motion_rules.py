@@ -1,7 +1,7 @@
 """Finds contradictions between settings of motion.
 
-The robot must stop soon enough, and motion that the limits allow must not be taken for a fault. The
-other rules are in `contradictions.py`.
+The settings must let the robot stop soon enough, and motion that the limits allow must not look
+like a fault. The other rules are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> lis
         value, least = getattr(config.limits, name), _rounded_up(speed / most_s)
         if name != softer and value < normal:
             found.append(
-                f"limits.{name} = {value:g}: lower than {softer}; a stop must not brake more "
-                f"softly than a timeout: write {max(normal, least):.10g} or more"
+                f"limits.{name} = {value:g}: lower than limits.{softer}; a stop must brake at "
+                f"least as hard as the end of the commands: write {max(normal, least):.10g} or more"
             )
         elif value < least:
             found.append(
@@ -93,13 +93,13 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
     if not 0.0 < jerk < LEAST_JERK:
         return []
     return [
-        f"limits.{name} = {jerk:g}: the robot would take minutes to start; write "
-        f"{LEAST_JERK:g} or more, or 0 for no limit"
+        f"limits.{name} = {jerk:g}: the robot would gain speed far too slowly; "
+        f"write {LEAST_JERK:g} or more, or 0 for no limit"
     ]
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Find a feedback limit that the feedback of allowed commands would exceed."""
+    """Find a `feedback.wheel_speed` that a wheel would exceed with commands that are allowed."""
     most = config.feedback.wheel_speed
     needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
     if most >= needed:
@@ -151,5 +151,5 @@ RULES: tuple[Rule, ...] = (
 
 
 def problems(config: Config) -> list[str]:
-    """Return the contradictions, one line each."""
+    """Return the contradictions between the settings of motion, one line each."""
     return mistakes(RULES, config)

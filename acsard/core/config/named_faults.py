@@ -23,7 +23,7 @@ FAULTS = (
     "late_watchdog", "watchdog_fed_by_bad_lines", "lost_replies", "lost_commands", "bit_errors",
     "free_running", "ftdi", "estop", "bumpers",
 )  # fmt: skip
-"""Faults without arguments."""
+"""Names of the simulator's faults without arguments."""
 
 ARGUMENTS = {
     "stuck_encoder": "m", "frozen_encoder": "m", "dead_motor": "m", "reversed_motor": "m",
@@ -34,7 +34,7 @@ ARGUMENTS = {
     "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
     "battery": "nn",
 }  # fmt: skip
-"""Faults with arguments, each with the kinds of its arguments.
+"""Names of the simulator's faults with arguments, each with the kinds of its arguments.
 
 `m` is a motor, written as a to d and stored as 0 to 3. `n` is a number.
 """
@@ -54,11 +54,11 @@ MOST = 1e6
 """Largest absolute value of a number in an argument, so that sums do not overflow."""
 
 SHORTEST_S = 0.001
-"""Shortest stall, s. A shorter one has no visible effect."""
+"""Shortest duration of the fault `stalls`, s. A shorter one has no visible effect."""
 
 
 class NamedFault(Struct, frozen=True):
-    """A fault with its arguments. A motor is a number from 0 to 3."""
+    """A fault of the simulator with its arguments. A motor is a number from 0 to 3."""
 
     name: str
     values: tuple[int | float, ...] = ()
@@ -99,23 +99,26 @@ def named(text: str) -> NamedFault:
         )
     if name in INPUTS and not min(fault.values) >= 0:
         raise ValueError(
-            "give the seconds from the start until it begins, then its seconds (0: it stays)"
+            "give the seconds from the start to the fault, then its duration in s (0: no end)"
         )
     if name == "battery" and not (0 <= fault.values[0] <= 100 and fault.values[1] > 0):
         raise ValueError(
-            "give the charge at the start, 0 to 100 %, then the minutes that a full one lasts"
+            "give the battery's charge at the start, 0 to 100 %, then the minutes that a full "
+            "battery lasts"
         )
     if name == "wrong_baud" and fault.values[0] not in get_args(Baud):
-        raise ValueError(f"the rate must be one of {', '.join(map(str, get_args(Baud)))}")
+        raise ValueError(f"the baud rate must be one of {', '.join(map(str, get_args(Baud)))}")
     return fault
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a warning if the simulator has faults, which look like faults of the robot."""
+    """Return a warning if `sim.faults` names faults, because they look like real ones."""
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []
-    return [f"sim.faults = {show(faults)}: the simulator has these faults on purpose; [] ends them"]
+    return [
+        f"sim.faults = {show(faults)}: the simulator has these faults on purpose; write [] for none"
+    ]
 
 
 def _problems(config: Config) -> list[str]:
@@ -136,7 +139,7 @@ RULES: tuple[Rule, ...] = (_problems,)
 
 
 def _all() -> str:
-    return f"there are {', '.join((*FAULTS, *forms()))}"
+    return f"the known faults are {', '.join((*FAULTS, *forms()))}"
 
 
 def _form(name: str, kinds: str) -> str:

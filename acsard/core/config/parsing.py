@@ -16,7 +16,7 @@ from acsard.core.config.validation import build_partly
 from acsard.core.values import AcsardError
 
 MAX_BYTES = 65536
-"""Largest size of a configuration, bytes. The reference file has about a quarter of this size."""
+"""Largest size of a configuration, bytes. The reference file has about a third of this size."""
 
 
 class ConfigError(AcsardError):
@@ -43,7 +43,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
-            [f"not TOML: {error}; write texts in quotes, and true or false without"]
+            [f"not TOML: {error}; write texts in quotes, but true and false without quotes"]
         ) from None
     # Python limits the length of numbers and the depth of nesting.
     except (ValueError, RecursionError):

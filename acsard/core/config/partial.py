@@ -1,4 +1,4 @@
-"""Runs the rules on a configuration in which some keys have no valid value.
+"""Runs the rules between keys on a configuration in which some keys have no valid value.
 
 A rule that reads such a key is skipped, because its result would be meaningless. All other rules
 run, so that a user sees every mistake at once.
@@ -17,7 +17,7 @@ Rule = Callable[[Config], Iterable[str]]
 
 
 class InvalidKeyError(AcsardError):
-    """A rule has read a key that has no valid value."""
+    """Raised when a rule reads a key that does not have a valid value."""
 
 
 def view_without(config: Config, invalid: Set[str]) -> Config:

@@ -17,7 +17,7 @@ Name = Annotated[
     str,
     Meta(
         pattern=r"^[A-Za-z0-9_-]{1,32}\Z",
-        extra={"unit": "1 to 32 of A-Z a-z 0-9 _ -", "example": "app"},
+        extra={"unit": "1 to 32 characters of A-Z a-z 0-9 _ -", "example": "app"},
     ),
 ]
 Frame = Annotated[
@@ -37,7 +37,7 @@ Text = Annotated[
 CommonName = Annotated[
     str,
     Meta(
-        # The name becomes a part of keys, and `state` shows it.
+        # The name becomes a part of keys on the bus, and the message `state` shows it.
         pattern=r"^(?!@)[\w .:@+-]{1,64}\Z",
         extra={
             "unit": "a common name of letters, digits, spaces and _.:@+-",
@@ -162,7 +162,7 @@ class McuConfig(Struct, frozen=True):
 
     @property
     def line_bytes(self) -> int:
-        """Length of the longest line that the daemon or the board may send, bytes."""
+        """Length of the longest serial line that the daemon or the board may send, bytes."""
         return line_bytes(self.trailing_comma, self.link_check != "off", self.wants_samples)
 
 
@@ -330,12 +330,12 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """Endpoints at which the daemon itself listens; empty for a Zenoh client."""
+        """Endpoints without TLS, at which the daemon itself listens; empty for a Zenoh client."""
         return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Endpoints at which the TLS gateway listens for the network; empty for a Zenoh client."""
+        """Endpoints with TLS, at which the TLS gateway listens; empty for a Zenoh client."""
         return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
 
     @property
@@ -433,7 +433,7 @@ class Config(Struct, frozen=True):
 
     @property
     def rate_hz(self) -> float:
-        """Control rate, Hz. "auto" means the highest comfortable rate, but at most 100 Hz."""
+        """Control rate, Hz. "auto" means 80 % use of the wire, but at most 100 Hz."""
         if self.control.rate != "auto":
             return float(self.control.rate)
         mcu = self.mcu

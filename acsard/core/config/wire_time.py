@@ -16,7 +16,8 @@ CHECK_BYTES = 8
 SAMPLE_BYTES = 21
 """Length of `@` and the five sample fields of a reply, bytes.
 
-A command that requests these fields is one letter longer.
+The fields are the board's clock and its four encoder counts. A command that requests them is one
+letter longer.
 """
 
 STATUS_BYTES = 28
@@ -27,7 +28,10 @@ STATUS_HZ = 10
 """Rate at which a board sends status lines, Hz."""
 
 FIELD = 65536
-"""Number of values of a sample field, which has four hexadecimal digits. FFFF wraps to 0."""
+"""Number of values that a sample field (an encoder count or the board's clock) can have.
+
+The field has four hexadecimal digits, and FFFF wraps to 0.
+"""
 
 COMFORTABLE_USE = 0.8
 """Largest comfortable use of the wire, as a share of its capacity.
@@ -43,7 +47,9 @@ def wire_ns(count: int, baud_rate: int) -> int:
 
 
 def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
-    """Return the length of the longest line, bytes: a command or a reply, each on its own wire.
+    """Return the length of a command or a reply, bytes: that of the longer one.
+
+    Each direction has its own wire, so only the longer line limits the rate.
 
     Args:
         trailing_comma: whether commands end with a comma.

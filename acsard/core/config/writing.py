@@ -27,7 +27,7 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
 
 
 def excerpt(keys: Mapping[str, object]) -> list[str]:
-    """Return settings by their dotted keys as lines of TOML, with a header for each table."""
+    """Return settings, which are given by dotted key, as lines of TOML with a header per table."""
     lines: list[str] = []
     table = ""
     for key, value in sorted(keys.items(), key=lambda item: item[0].count(".")):

@@ -58,10 +58,11 @@ class Bus(Protocol):
         """Published topics that have a subscriber."""
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` queries.
+        """Return the input since the last call, with about `queries` queries.
 
-        There may be one more query if all of these are service calls and a slow query waits. The
-        other queries wait for the next call.
+        The service calls come first, at most `queries` of them. Then comes one slow query (ROS
+        parameters or a `set`), even beyond the limit. Other queries fill the rest, or wait for the
+        next call.
         """
 
     def publish(self, key: str, message: Message) -> None:
@@ -89,7 +90,7 @@ class GatewayFollower:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Add the events that are new in a report to `counters`. Ignore an invalid report.
+        """Add the gateway's events since its last report to `counters`. Ignore an invalid report.
 
         Returns:
             Wall-clock time at which the TLS certificate expires, ns, or None if it is unknown.

@@ -44,9 +44,9 @@ from acsard.core.values import NS_PER_S, REST, Command, Pose, Request, Verb, Whe
 from acsard.core.values import Twist as BodyTwist
 
 BOUND_NS = 60 * NS_PER_S
-"""Silence after which a sender may use another certificate, ns.
+"""Time without commands after which a sender id may be used with another certificate, ns.
 
-It must be able to do so, because a program with a fixed id may move from the robot to a laptop.
+For example, a program with a fixed id may move from the robot to a laptop.
 """
 
 MAX_BOUND = 1024
@@ -72,10 +72,10 @@ class Bindings:
         """
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Return the other certificate to which `sender` is bound, or None if there is none.
+        """Return the certificate to which `sender` is bound if it is not `certificate`, else None.
 
-        If there is none, bind the sender to `certificate`. `now_ns` is the monotonic time of the
-        command.
+        If the result is None, `sender` is bound to `certificate` from now on. `now_ns` is the
+        monotonic time of the command.
         """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
@@ -113,7 +113,10 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's timestamp by the wall clock, ns, if the sender or a router set it."""
     sender: str
-    """The id of the sender's Zenoh session; "" if that session did not stamp the sample."""
+    """The id of the Zenoh session that stamped the sample, usually the sender's own.
+
+    It is "" if only the daemon's session did so, or, on a native key, a connected router.
+    """
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
@@ -167,11 +170,13 @@ class Receiver:
         """
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
-            raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
+            raise DecodeError(
+                "wildcard", f"a command needs an exact key such as cmd/app, not {arrival.key}"
+            )
         if not arrival.put:
             raise DecodeError("not_a_put", "a DELETE is not a command: send a PUT")
         if len(arrival.payload) > MAX_COMMAND_BYTES:
-            raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+            raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a command")
         identity = identify(arrival)
         stamp_ns, clock = identity.stamp_ns, identity.sender
         if kind == "cmd":
@@ -189,8 +194,7 @@ class Receiver:
                 where = f"certificate {bound}" if bound else "the robot's own machine"
                 raise DecodeError(
                     "other_certificate",
-                    f"its sender id was first seen under {where}: give each program its own "
-                    "sender id",
+                    f"this sender id first came from {where}: give each program its own sender id",
                 )
         ours = arrival.received_ns
         return Command(
@@ -215,7 +219,8 @@ class Receiver:
         if not isinstance(got.twist, UnsetType):
             if not (isinstance(linear, UnsetType) and isinstance(angular, UnsetType)):
                 raise DecodeError(
-                    "wrong_shape", "vectors inside and outside `twist`: send one twist"
+                    "wrong_shape",
+                    "the message has vectors inside and outside `twist`: send only one of the two",
                 )
             linear, angular = got.twist.linear, got.twist.angular
             header = None if isinstance(got.header, UnsetType) else got.header
@@ -224,7 +229,7 @@ class Receiver:
                 "wrong_shape", "`header` without `twist`: put both vectors into `twist`"
             )
         if isinstance(linear, UnsetType) or isinstance(angular, UnsetType):
-            raise DecodeError("wrong_shape", "needs both `linear` and `angular`")
+            raise DecodeError("wrong_shape", "the message needs both `linear` and `angular`")
         axes = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
         if not all(map(math.isfinite, axes)):
             raise DecodeError("not_finite", "NaN or infinity in the twist")
@@ -236,7 +241,8 @@ class Receiver:
         named, count = [got.name.count(joint) for joint in self._joints], len(got.name)
         if named != [1] * 4 or len(got.velocity) != count:
             raise DecodeError(
-                "wrong_wheels", f"needs one velocity for each of {', '.join(self._joints)}"
+                "wrong_wheels",
+                f"the message needs one velocity for each of {', '.join(self._joints)}",
             )
         places = [got.name.index(joint) for joint in self._joints]
         # Ignore the values of other joints, for example those of an arm.
@@ -248,7 +254,7 @@ class Receiver:
             raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
         twist = self._kinematics.twist(WheelSpeeds(*velocity))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
-            raise DecodeError("not_finite", "wheel speeds too large to compute a twist")
+            raise DecodeError("not_finite", "the wheel speeds are too large to compute a twist")
         return twist, got.header, twist == REST and any(velocity)
 
     @staticmethod
@@ -268,7 +274,7 @@ class Receiver:
         if verb not in _payloads or (SERVICES[verb].optional and not payload):
             return request
         if len(payload) > MAX_COMMAND_BYTES:
-            raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
+            raise DecodeError("too_big", f"the payload has over {MAX_COMMAND_BYTES} bytes")
         match _payloads[verb].decode(encoding, payload):
             case Settings(settings):
                 return replace(request, settings=settings)
@@ -276,7 +282,9 @@ class Receiver:
                 return replace(request, latch=latch)
             case SetPose(x, y, yaw):
                 if not all(map(math.isfinite, (x, y, yaw))) or max(abs(x), abs(y)) > 1e6:
-                    raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
+                    raise DecodeError(
+                        "not_finite", "x and y must be within 1000 km, and yaw must be finite"
+                    )
                 return replace(request, pose=Pose(x, y, yaw))
         return request
 
@@ -303,7 +311,10 @@ class Identity(Struct, frozen=True):
 # keys carry commands.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return the kind, the source and the certificate in a command's key, "" for a missing part."""
+    """Return the kind, the source and the certificate in a command's key, "" for a missing part.
+
+    The parts of `cmd/app` are "cmd", "app" and "".
+    """
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
     return kind, source, certificate
@@ -389,8 +400,8 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
 
     It is the public name of the sender id in the attachment, with the transport in brackets. The
     name is only a claim of the program, because Zenoh does not say on which connection a query
-    arrived. The digits of the public name stay the same while the program keeps its secret. A call
-    over rmw_zenoh is named by the GID of the client. A call through a bridge has no name.
+    arrived. The digits in a public name are the same as long as the program has the same sender id.
+    A call over rmw_zenoh is named by the GID of the client. A call through a bridge has no name.
 
     Args:
         via: the tree of keys on which the call arrived.

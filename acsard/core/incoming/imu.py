@@ -92,7 +92,8 @@ class GyroFollower:
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
             raise DecodeError(
                 "second_sender",
-                f"{who[:MOST_WHO]} also sends, but the daemon follows {self._followed}",
+                f"{who[:MOST_WHO]} also sends gyro samples: end it, or end the sender in use, "
+                f"{self._followed}",
             )
         before, self._followed, self._heard_ns = self._followed, who, now_ns
         return other and before != ""
@@ -106,7 +107,7 @@ def reading(arrival: Arrival) -> GyroSample:
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
-        raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+        raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for an Imu")
     got: Imu | _Reading
     if detect(arrival.encoding, arrival.payload) == "cdr":
         got = decode_cdr(Imu, arrival.payload)
@@ -118,12 +119,16 @@ def reading(arrival: Arrival) -> GyroSample:
         raise DecodeError("not_finite", "NaN or infinity in the angular velocity")
     # sensor_msgs/Imu marks an absent measurement by -1 in the first variance.
     if variances[0] == -1.0:
-        raise DecodeError("no_rate", "this IMU measures no angular velocity")
+        raise DecodeError("no_rate", "this IMU does not measure the angular velocity")
     if variances[8] < 0.0:
-        raise DecodeError("wrong_shape", f"a variance of {variances[8]:g}")
+        raise DecodeError(
+            "wrong_shape", f"the variance of the turn rate is below zero: {variances[8]:g}"
+        )
     if max(map(abs, numbers[:3])) > MAX_RATE or variances[8] > MAX_RATE**2:
         raise DecodeError(
-            "out_of_range", f"over {MAX_RATE:g} rad/s, or a variance above its square: send rad/s"
+            "out_of_range",
+            f"the turn rate is over {MAX_RATE:g} rad/s, or its variance is over the square of "
+            "that: send rad/s",
         )
     stamp_ns = got.header.stamp.to_ns()
     return GyroSample(arrival.arrived_ns, stamp_ns if stamp_ns > 0 else None, rate.z, variances[8])

@@ -74,7 +74,7 @@ class Query(Struct, frozen=True):
     ticket: int
     """The number with which replies name the query."""
     topic: str
-    """The key of the row that the query matches in the topic table."""
+    """The key in the topic table that the query matches."""
     asked: str
     """The key expression of the query, without `acsard/<id>/` if it begins with exactly that."""
     fmt: str
@@ -117,7 +117,7 @@ class _Waiting(Struct, frozen=True):
 
 
 class Queries:
-    """Answers queries with constant values and with the present messages."""
+    """Answers queries with constants and the newest messages, and passes on service calls."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
@@ -141,7 +141,7 @@ class Queries:
     ) -> list[Reply] | Request:
         """Return the replies to a query, or the `Request` of a service call.
 
-        The list is empty if the query is not for this daemon. Raises `DecodeError` for a ROS
+        The list is empty if the daemon has no value for the query. Raises `DecodeError` for a ROS
         request that cannot be served; `refused` builds the reply to such a request.
 
         Args:
@@ -191,7 +191,7 @@ class Queries:
             self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, True)
             return Request(verb, query.ticket, asked_ns=query.arrived_ns, by=by)
         if len(query.payload) > MAX_REQUEST_BYTES:
-            raise DecodeError("too_big", f"over {MAX_REQUEST_BYTES} bytes")
+            raise DecodeError("too_big", f"the request has over {MAX_REQUEST_BYTES} bytes")
         try:
             service = query.topic.removeprefix(PARAMETERS)
             if service in SETTING:
@@ -259,7 +259,7 @@ class Queries:
 
 
 def includes(expression: str, key: str) -> bool:
-    """Return whether a Zenoh key expression includes a key, in time linear in both."""
+    """Return whether a Zenoh key expression includes a key, without slow backtracking."""
     chunks = key.split("/")
     reached = {0}
     for part in expression.split("/"):

@@ -8,7 +8,7 @@ A speed limit never raises a speed. The robot's `limits.linear_speed` is the low
 The robot itself does not know speed limits. This module turns a message into a request like that of
 a client's `set`. While a limit is in force, a client's `set` is checked against the settings
 without the limit, because they apply again when the limit is lifted. The robot then gets the
-client's value or the limit, whichever is lower. So no control step exceeds either of them.
+client's value or the limit, whichever is lower. So each control step keeps to both values.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def decode_limit(arrival: Arrival, configured: float) -> Limit:
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
-        raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+        raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a speed limit")
     got: SpeedLimit | _Payload
     if detect(arrival.encoding, arrival.payload) == "cdr":
         got = decode_cdr(SpeedLimit, arrival.payload)
@@ -79,7 +79,7 @@ def decode_limit(arrival: Arrival, configured: float) -> Limit:
         got = _decoder.decode(arrival.encoding, arrival.payload)
     value = got.speed_limit
     if not math.isfinite(value):
-        raise DecodeError("not_finite", "NaN or infinity; 0.0 lifts the limit")
+        raise DecodeError("not_finite", "the speed limit is NaN or infinity; send 0.0 to lift it")
     if value < 0.0 or (got.percentage and value > 100.0):
         unit = " %" if got.percentage else " m/s"
         most = " to 100 %" if got.percentage else " m/s or more"
@@ -134,7 +134,9 @@ class SpeedLimiter:
         if not self.lowers:
             return ""
         setting = self._settings.limits.linear_speed
-        return f"{self._limit.speed:.3g} m/s by {self._limit.by}; {setting:g} m/s without it"
+        return (
+            f"{self._limit.speed:.3g} m/s by {self._limit.by}; {setting:g} m/s when this limit ends"
+        )
 
     def receive(self, arrival: Arrival, configured: float, refusals: list[Refusal]) -> None:
         """Store the limit in a message for the next step. Add invalid messages to `refusals`.
@@ -238,4 +240,4 @@ class SpeedLimiter:
     @property
     def _until(self) -> str:
         limit = self._limit
-        return f"once the limit of {limit.speed:.3g} m/s ends ({limit.by})"
+        return f"will apply when the limit of {limit.speed:.3g} m/s ends ({limit.by})"

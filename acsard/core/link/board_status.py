@@ -3,11 +3,11 @@
     !status estop=ok bumpers=..X. driver=ok volts=24.31 amps=-1.20 charge=87% temp=41.5*HHHH
 
 Every field is optional. The fields may come in any order, and each at most once. The board sends
-the line in addition to its replies, never instead of one. So the line says nothing about the speeds
-and does not count as a reply. Decoding is strict: one invalid field makes the whole line invalid.
-The format of the values makes damage detectable:
+the line in addition to its replies, never instead of one. The line contains no wheel speeds and
+does not count as a reply. One invalid field makes the whole line invalid. The format of the values
+makes damage detectable:
 
-- The two words of an input, such as `pressed` and `ok`, differ in many bits. So a few flipped bits
+- The two words of an input, such as `pressed` and `ok`, differ in many bits, so a few flipped bits
   cannot turn one word into the other.
 - Each number has a fixed number of decimals or ends with `%`, so a truncated number is refused.
 
@@ -44,7 +44,7 @@ _FORMS = {
     b"charge": re.compile(rb"(?:100|[0-9]{1,2})%"),
     b"temp": re.compile(rb"-?[0-9]{1,3}\.[0-9]"),
 }
-"""The pattern that the value of each field must match."""
+"""The pattern that the value of each field of a status line must match, by the field's name."""
 
 
 class BoardStatus(Struct, frozen=True):
@@ -67,7 +67,10 @@ class BoardStatus(Struct, frozen=True):
 
 
 def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
-    """Return `status`, updated with the fields of `newer` that are not None."""
+    """Return a copy of `status` in which the fields of `newer` replace the old ones.
+
+    A field that is None in `newer` keeps its old value.
+    """
     pairs = zip(astuple(status), astuple(newer), strict=True)
     return BoardStatus(*[old if new is None else new for old, new in pairs])
 

@@ -1,10 +1,11 @@
 """Encodes four wheel speeds as one line of the board's plain protocol, and decodes such a line.
 
 An example is `ap12.50,bn08.75,cp15.00,dn10.25`. Each value consists of a motor letter, `p`
-(positive) or `n` (negative) for the direction, and a speed in rad/s. Encoding is exact to the byte.
-Decoding is lenient about form: it accepts spaces after commas, a trailing comma, one or two integer
-digits, and one to three decimals. It is strict about meaning: one invalid value makes the whole
-line invalid. Only this module maps motor letters and signs to wheels.
+(positive) or `n` (negative) for the direction, and a speed in rad/s. The encoder writes exactly
+this form, with a trailing comma if the configuration asks for one. The decoder also accepts spaces
+after commas, a trailing comma, one or two integer digits, and one to three decimals. One invalid
+value makes the whole line invalid. In the daemon, only this module maps motor letters and signs to
+wheels. The simulator has its own code for this.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """The error for an invalid line. `reason` is the name of the counter for such lines."""
+    """The error for an invalid line. `reason` is the name of the counter of such lines."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)
@@ -51,8 +52,8 @@ class FrameError(AcsardError):
 class Codec:
     """An encoder and decoder of lines for one wiring of the motors.
 
-    `wheels` names the motor of each wheel and its direction. With `trailing_comma`, encoded lines
-    end with a comma.
+    `wheels` gives the motor letter and the direction of each wheel. With `trailing_comma`, encoded
+    lines end with a comma.
     """
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
@@ -123,9 +124,9 @@ class Codec:
 # A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
 def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    """Return the four values of a line as pairs such as `(b"ap", 12.5)`, None if it is malformed.
+    """Return the four values of a line, or None if the line is malformed.
 
-    A pair consists of the motor letter with the direction, and of the absolute speed, rad/s.
+    A value is a pair such as `(b"ap", 12.5)`: motor letter with direction, absolute speed in rad/s.
     """
     match = _LINE.fullmatch(line)
     if match is None:

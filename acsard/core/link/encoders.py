@@ -2,9 +2,9 @@
 
 The counts are cumulative, so a lost line loses no distance. The board sends the time of its own
 clock with the counts, so the time between two readings does not depend on when the host read the
-lines. Counts and milliseconds are modulo 65536. A difference is therefore used only if it cannot
-have wrapped and if the motors can have turned that far. Otherwise the caller computes the angle as
-speed times time. The module also detects a probable restart of the board.
+lines. Counts and milliseconds are modulo 65536. A difference of counts is used only if the count
+cannot have wrapped, and if the motors can have turned that far. Otherwise the caller computes the
+angle as speed times time. The module also detects a probable restart of the board.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Number of counts by which a wheel may exceed the counts at its highest speed.
+"""Number of counts between two readings by which a wheel may exceed those at its highest speed.
 
 This covers one count at each end of the interval, and play in the gears.
 """
@@ -30,11 +30,11 @@ ROUNDING_MS = 2
 """Largest error of the time between two readings, ms. The board sends its clock in whole ms."""
 
 LATEST_MS = 1000.0
-"""Largest delay of a line that is tracked, ms. A longer delay is clamped to this value, because the
-session restarts after such a gap anyway."""
+"""Largest delay of a line that `Encoders` distinguishes, ms. A longer delay counts as this value,
+because the session restarts after such a gap anyway."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
-"""The reason why the difference between two readings cannot be used.
+"""The reason why the difference between two readings of the encoders cannot be used.
 
 - unknown: there is no earlier reading, or it is too old
 - leap: no motor can have turned that far
@@ -50,14 +50,14 @@ class Turned(Struct, frozen=True):
 
 
 class Encoders:
-    """Compares each reading of the encoders with the previous reading."""
+    """Converts each reading of the encoders to the angles turned since the previous reading."""
 
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start.
 
-        The host cannot receive a reading before the board has taken it. Between two readings, the
-        board's clock can therefore gain on the host's clock at most the delay of the first reading.
-        If it gains more than `quiet_ns`, the board has restarted.
+        Between two readings, the board's clock can gain on the host's clock only if the first
+        reading arrived late, and by no more than its delay. If the gain exceeds that delay by more
+        than `quiet_ns`, the board has restarted.
 
         Args:
             counts: Encoder counts per turn, 0 if unknown.
@@ -69,7 +69,7 @@ class Encoders:
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
         self._promptest = MinimumDelay(most=LATEST_MS)
-        """Tracks the delay of the readings in excess of the least delay, ms."""
+        """Measures by how much the delay of a reading exceeds the least delay, ms."""
 
     def forget(self) -> None:
         """Forget the last reading.

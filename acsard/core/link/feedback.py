@@ -31,7 +31,7 @@ APART_NS = 1000
 line."""
 
 LATER = 0.05
-"""Gain of the filter for the mean offset between the times of `PromptedTimes` and those of
+"""Gain of the filter for the mean offset between the two clocks, `PromptedTimes` and
 `FreeRunningTimes`."""
 
 FULL_READ = 1024
@@ -40,27 +40,28 @@ data."""
 
 DIFFERS = 1.5
 """Least difference between the number of reply periods and the number of command lines since the
-last read. Scheduling alone does not cause as much. `ReplyStyle` evaluates the reads that reach it,
-and the next `AFTER` reads."""
+last read of the port. `ReplyStyle` evaluates a read with at least this difference, because
+scheduling alone does not cause as much, and also the next `AFTER` reads."""
 
 TELLING = 2.5
-"""Least difference between the sum of periods and the sum of command lines for a decision of
-`ReplyStyle`."""
+"""`ReplyStyle` decides only if the sum of the reply periods and the sum of the command lines differ
+by at least this number."""
 
 LATEST = 100.0
-"""Longest time between two reads, in reply periods. `ReplyStyle` ignores a read after a longer
-time."""
+"""Longest time between two reads of the port that `ReplyStyle` evaluates, in reply periods."""
 
 CLEAR = 0.5
-"""Margin that a decision of `ReplyStyle` requires. The number of received lines must be nearer to
-one sum than to the other by at least this share of the difference between the sums."""
+"""Margin that a decision of `ReplyStyle` needs, as a share of the difference between the sum of the
+reply periods and that of the command lines. The number of received lines must be nearer to one sum
+than to the other by this margin."""
 
 AFTER = 3
-"""Number of further reads that `ReplyStyle` evaluates after a read that reaches `DIFFERS`."""
+"""Number of further reads of the port that `ReplyStyle` evaluates after one that reaches
+`DIFFERS`."""
 
 NEAR = 0.35
-"""Largest difference between the nearer sum and the number of received lines, as a share of the
-received lines. It is not 0 because some lines get lost."""
+"""`ReplyStyle` decides for a kind of board only if the expected and the received number of lines
+differ by at most this share of the received lines. It is not 0 because some lines get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -78,8 +79,8 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """The part of `dt`, at its start, whose lines were lost, s. The speeds of the lines before and
-    after it fill this part."""
+    """Length of the part of `dt`, at its start, in which lines were lost, s. The odometry fills
+    this part with the speeds of the lines before and after it."""
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the command line that this line answers, ns. None if
     that command line is unknown."""
@@ -99,7 +100,7 @@ class Feedback(Struct, frozen=True, gc=False):
 
 
 class ReplyStyle:
-    """Detects whether the board reports by its own clock or answers the daemon's lines.
+    """Detector of the kind of board: it reports by its own clock, or it answers the daemon's lines.
 
     While the daemon sends one line per period, both kinds of boards look alike. Sometimes the
     daemon sends more or fewer lines, because the host did not run or because a new command was sent
@@ -110,7 +111,7 @@ class ReplyStyle:
     """
 
     def __init__(self, speaks: bool) -> None:
-        """Start. `speaks` is True if the configuration says that the board has its own clock."""
+        """Start. `speaks` is True if the configuration says that the board reports by itself."""
         self.speaks: bool | None = speaks or None
         """True if the board reports by its own clock, False if it answers, None while unknown."""
         self._known = speaks
@@ -122,7 +123,10 @@ class ReplyStyle:
         self._left += 1
 
     def read(self, lines: int, periods: float) -> None:
-        """Process a read of `lines` lines. It came `periods` reply periods after the last read."""
+        """Process a read of the port that contained `lines` lines.
+
+        It came `periods` reply periods after the last read.
+        """
         left, self._left = self._left, 0
         if self._known or periods > LATEST:
             return
@@ -180,18 +184,18 @@ class Timeline:
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
         self._last_placed = Placed("reads", 0)
-        """The time of the last good line."""
+        """The time of the last good line, according to the clock that was used for it."""
         self._spoilt = False
         """Whether a bad or ignored line came since the last good line."""
         self._later = 0.0
-        """Mean time by which `PromptedTimes` places a reply later than `FreeRunningTimes`, ns."""
+        """Mean time by which `PromptedTimes` dates a line later than `FreeRunningTimes`, ns."""
         self.leaps = 0
-        """Number of readings with impossible counts. Each was replaced by speed times time."""
+        """Number of lines with impossible encoder counts. For these, speed times time is used."""
         self.restarted = False
         """Whether the board's clock in the last line shows that the board has restarted."""
 
     def forget(self) -> None:
-        """Start a new session: the next line does not follow the last one."""
+        """Start a new session: the motion between the last line and the next one is unknown."""
         self._encoders.forget()
         self._slots.forget()
         self._prompts.forget()
@@ -255,7 +259,7 @@ class Timeline:
             reading: The sample fields of a checked reply, None if it has none.
             following: The number of bytes in the read after the end of the line.
             length: The number of bytes of the line with its line end.
-            silent: Whether the link was silent before the line.
+            silent: Whether a silence that makes the link stale came before the line.
             asked_ns: Monotonic time at which the daemon wrote the line that this reply answers, ns.
                 None if unknown.
         """
@@ -318,9 +322,9 @@ class Timeline:
     def _since_last(self, placed: Placed) -> tuple[float, float]:
         """Return the time since the last good line, and the part of it whose lines were lost, s.
 
-        If two different clocks placed the lines, the result is the difference of their `due_ns`,
-        corrected by the mean offset of the clocks. This correction keeps the errors of many changes
-        between the clocks from adding up.
+        If two different clocks dated the lines, the time is the difference of their `due_ns`,
+        corrected by the mean offset of the clocks. Without this correction, the errors of many
+        changes between the clocks would add up.
         """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
@@ -339,14 +343,14 @@ class Timeline:
         return dt, dt - period if missing else 0.0
 
     def _compare(self, answered: Placed, slot: Placed) -> None:
-        """Update `_later` with the times of one reply according to both clocks."""
+        """Update `_later` with the times that the two clocks give for one reply."""
         later_ns = answered.due_ns - slot.due_ns
         if slot.dt is None or self._last_placed.clock != "slots":
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return the mean time by which `clock` places a line later than `FreeRunningTimes`, ns."""
+        """Return the mean time by which `clock` dates a line later than `FreeRunningTimes`, ns."""
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0

@@ -1,8 +1,8 @@
-"""Splits the received bytes into lines, with bounded memory.
+"""Splits the bytes from the serial port into lines, with bounded memory.
 
-This module does not know the meaning of a line. Lines end with LF or CR LF. After noise, a new line
-begins after the next LF. Empty lines are dropped silently, because the daemon starts every session
-with a bare line end, and a board that echoes may send it back.
+Lines end with LF or CR LF, and the module does not interpret them. After noise, a new line begins
+after the next LF. Empty lines are dropped silently: the daemon starts every session with a bare
+line end, and a board that echoes may send it back.
 """
 
 from __future__ import annotations

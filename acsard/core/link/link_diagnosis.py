@@ -22,10 +22,13 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
-"""Fraction of the silence after which a link is stale. If two control steps are further apart than
-this fraction, the cause of a silence is this computer and not the board."""
+"""Share of the silence after which a link is stale (`Link.quiet_ns`). If the time between two
+control steps is longer than this share, this computer caused the silence and not the board."""
 
-BUSY = "which other program uses the processor? (`top` shows it; as a service acsard has priority)"
+BUSY = (
+    "`top` shows which other program uses the processor; if acsard runs as the service, it has "
+    "priority"
+)
 """The advice for a computer that is late."""
 
 HOST = "this computer did not run for"
@@ -38,26 +41,26 @@ SHOWN = 64
 """Largest number of bytes that a diagnosis shows: a whole line and some noise."""
 
 Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
-"""The class of the received bytes.
+"""The class of the bytes that the board sent while the link was not up.
 
 - nothing: no byte at all
 - statuses: status lines of the board, but no reply
 - cut: pieces of valid lines, or lines without a line end
 - foreign: valid lines with other bytes before or after them
 - garbage: nothing that resembles a line
-- few: good lines among others
+- few: some good lines, and also bad ones
 - sparse: only good lines, but too few of them
 """
 
 LOOK_MENDS: dict[Look, str] = {
-    "nothing": "has the board power, is this its port, does mcu.baud_rate fit, are TX and RX "
-    "swapped?",
-    "statuses": "does the line from this computer (TX) reach the board's RX?",
+    "nothing": "does the board have power, is this its port, is mcu.baud_rate right, are TX and "
+    "RX swapped?",
+    "statuses": "is TX of this computer connected to RX of the board?",
     "cut": "does the board cut its lines short, or omit the line ends?",
-    "foreign": "does something disturb the cable, or print on it too?",
-    "garbage": "does mcu.baud_rate fit the board?",
-    "few": "check cable, ground and baud rate",
-    "sparse": "if the board sends its lines less often than the daemon, set mcu.reply_period",
+    "foreign": "is there noise on the cable, or does another program write to it too?",
+    "garbage": "is mcu.baud_rate the rate of the board?",
+    "few": "check the cable, the ground and the baud rate;",
+    "sparse": "if the board sends its lines less often than the daemon, set mcu.reply_period;",
 }
 
 _RIGHT = re.compile(TOKENS)
@@ -71,10 +74,11 @@ BLOCKED = (
 """The reason that is reported while the driver of the port accepts no bytes."""
 
 WINDOW = 1000
-"""Number of sent lines that are examined together: 10 s at 100 Hz."""
+"""Number of sent lines after which `UnansweredLines` counts the answers: 10 s at 100 Hz."""
 
 LOST = 0.02
-"""Share of lines without an answer above which the warning is given. A sound link loses none."""
+"""Share of sent lines without an answer above which `UnansweredLines` warns. A sound link loses no
+answer."""
 
 
 def is_ours(words: str) -> bool:
@@ -83,7 +87,7 @@ def is_ours(words: str) -> bool:
 
 
 class Lateness:
-    """Detects late control steps, which make this computer the cause of a silence."""
+    """Detector of late control steps, with which this computer itself causes silences."""
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
         """Start.
@@ -102,8 +106,8 @@ class Lateness:
     def look(self, now_ns: int, good: bool) -> bool:
         """Record a control step. `good` says whether the step received a good line.
 
-        Return True if a good line ends a silence that this computer caused. With the simulator,
-        which runs on this computer, every good line counts as such a line.
+        Return True if a good line ends a silence that this computer caused. The simulator runs on
+        this computer, so with it the result is True for every good line.
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
@@ -113,10 +117,14 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
-        """Return a sentence about the state `link`, and blame this computer if it is the cause."""
+        """Return a sentence about the state `link` of the link.
+
+        If this computer caused the silence, the sentence says so.
+        """
         if link == "stale" and self.late_s:
             return (
-                f"{HOST} {self.late_s:.2f} s, and received nothing from the microcontroller: {BUSY}"
+                f"{HOST} {self.late_s:.2f} s, so it received nothing from the microcontroller: "
+                f"{BUSY}"
             )
         if link == "stale" and self._simulated:
             return f"{SIMULATOR}: {BUSY}"
@@ -155,7 +163,7 @@ class Heard(Struct):
 
     @property
     def looks(self) -> Look:
-        """The class of the received bytes."""
+        """The class of the received bytes, as `Look` lists them."""
         if self.statuses and not self.lines:
             return "statuses"
         if not self.size:
@@ -181,26 +189,26 @@ class Heard(Struct):
             return (
                 f"{many(self.size, 'byte')} received but no line end; the last bytes are `{last}`"
             )
-        good, which = "none good", "last"
+        good, which = "none good", "last one"
         if self.good:
-            good, which = f"only {self.good} good", "last other"
+            good, which = f"only {self.good} good", "last bad one"
             if self.good == self.lines:
                 good = "all of them good, but too few"
         bad = printable_bytes(self.last, SHOWN)
-        last = f", the {which} `{bad}`" if self.good < self.lines else ""
+        last = f", the {which} is `{bad}`" if self.good < self.lines else ""
         return f"{many(self.lines, 'line')} received, {good}{last}"
 
     @property
     def words(self) -> str:
         """The whole diagnosis as a sentence for `state`."""
         if self.looks == "sparse" and self.late_s:
-            return f"{HOST} {self.late_s:.2f} s, and received too little for a link: {BUSY}"
+            return f"{HOST} {self.late_s:.2f} s, so it received too little for a link: {BUSY}"
         mend = f"{LOOK_MENDS[self.looks]} `acsard mcu check` finds out more"
-        return f"the microcontroller: {self.counted}; {mend}"
+        return f"no link to the microcontroller: {self.counted}; {mend}"
 
 
 class SilenceDiagnosis:
-    """Diagnoses, in intervals of `PATIENCE_NS`, why the link is not up."""
+    """Diagnosis of why the link is not up, made anew every 3 s (`PATIENCE_NS`)."""
 
     def __init__(self) -> None:
         self.heard: Heard | None = None
@@ -232,12 +240,12 @@ class SilenceDiagnosis:
 
 
 class UnansweredLines:
-    """Warns if the board does not answer all lines while the link is up.
+    """Warning that the board does not answer all lines while the link is up.
 
-    Nothing else shows this loss. After every `WINDOW` sent lines, the number of sent lines is
+    No other check detects this loss. After every `WINDOW` sent lines, the number of sent lines is
     compared with that of good lines. The warning is given once, and again only after a window
-    without loss or after the link was lost. A board that reports by its own clock at another rate
-    causes the same warning although it is not faulty.
+    without loss or after the link was lost. A sound board that reports by its own clock causes the
+    same warning if its rate is lower and mcu.reply_period is not set.
     """
 
     def __init__(self, reply_period: float) -> None:
@@ -250,7 +258,7 @@ class UnansweredLines:
         self._told = False
 
     def look(self, sent: int, good: int, linked: bool) -> Event | None:
-        """Process the present totals, and return the warning if it is due.
+        """Process the numbers of lines sent and received so far. Return the warning if it is due.
 
         Args:
             sent: Number of lines sent since the start.
@@ -271,9 +279,8 @@ class UnansweredLines:
             return None
         return Event(
             "lines_lost",
-            f"only {answers} of {lines} lines were answered: the others are lost on the way "
-            "there or back, or the microcontroller reports by its own clock; `acsard mcu check` "
-            "finds out which",
+            f"the microcontroller answered only {answers} of {lines} lines: lines or answers get "
+            "lost, or it reports by its own clock; `acsard mcu check` finds out which",
             "warning",
         )
 
@@ -302,8 +309,8 @@ def words(
             return heard.words
         if damaged(link, check):
             return (
-                "the microcontroller's replies arrive damaged; the daemon asks it for the "
-                "check again"
+                "the microcontroller's replies arrive damaged, so the daemon asks it for the "
+                "checksum again; check cable and ground"
             )
         if link.sparse_s:
             return _sparse(link.sparse_s, longest_reply)
@@ -332,7 +339,7 @@ def check_event(check: Negotiation, wants_samples: bool) -> Event:
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the serial lines are {check.in_force}"
     if check.state == "plain":
-        text += ": the microcontroller answers without the check"
+        text += ": the microcontroller answers without a checksum"
     elif fallen:
-        text += ": the microcontroller sends no counts"
+        text += ", but the microcontroller does not send encoder counts"
     return Event("link_check", text, "warning" if fallen else "info")

@@ -63,7 +63,7 @@ BAD_LINES = 5
 again."""
 
 SPARSE = 2
-"""Number of silences in a row, each ended by one good line, after which the lines are reported as
+"""Number of silences in a row, each ended by one good line, after which the board's lines count as
 too sparse. A single silence only means that the link was lost for a moment."""
 
 
@@ -75,7 +75,7 @@ class Link:
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
-        """Time between the last two good lines, s, if lines are repeatedly too sparse. Else 0."""
+        """Time between the last two good lines, s, after `SPARSE` silences in a row; else 0."""
         self._silences = 0
         """Number of silences in a row, each ended by one good line."""
         self._good_in_row = self._bad_in_row = 0
@@ -146,9 +146,9 @@ class Link:
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Make the link stale after a silence, or bring it up after GOOD_LINES good lines.
+        """Make the link stale after a silence, or up after GOOD_LINES good lines in a row.
 
-        `may_rise` is False if the link must not come up now.
+        `may_rise` is False if the link must not become "up" now.
         """
         silent = self.silent(now_ns)
         if self.state == "up":

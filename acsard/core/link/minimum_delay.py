@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 DRIFT = 0.01
-"""Largest relative drift between two clocks. A ceramic resonator has half of it."""
+"""Largest relative drift between two clocks. A ceramic resonator reaches half of it."""
 
 
 class MinimumDelay:
@@ -45,12 +45,12 @@ class MinimumDelay:
     def measure(self, ours: float, theirs: float) -> float:
         """Return the delay of an event in excess of the minimum, less the allowed drift.
 
-        A negative result means that the delay is below the accepted minimum, which only `believe`
-        changes. The arguments are those of `add`.
+        This method does not change the minimum. If the result is negative, the delay is below the
+        minimum, and a call of `believe` makes it the new one. The arguments are those of `add`.
         """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late
 
     def believe(self) -> None:
-        """Accept the delay of the last measured event as the minimum if it is less."""
+        """Make the delay of the last measured event the new minimum if it is below the minimum."""
         self.late = min(max(0.0, self.late), self._most)

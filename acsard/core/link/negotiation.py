@@ -1,7 +1,8 @@
-"""Negotiates whether lines have a check, at every opening of the port and after every gap.
+"""Negotiates with the board whether lines have a check: a sequence number and a CRC.
 
-The check is the sequence number and CRC of `checksum.py`. A question is a stop line with the check.
-A board that knows the check answers it in the same form. The states of the negotiation are:
+This is done at every opening of the port, and again after a gap in the lines. A question is a stop
+line with the check (`checksum.py`). A board that knows the check answers it in the same form. The
+states of the negotiation are:
 
 - off: mcu.link_check is "off". Lines are plain, and the daemon does not ask for the check.
 - waking: the daemon sends only stops. The board has not answered yet, so its silence proves
@@ -38,8 +39,8 @@ State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
 Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
 """The inputs of the state machine.
 
-- gap: the negotiation starts again
-- heard: a plain line came while the daemon asks
+- gap: the negotiation starts again, because the port was opened or lines were missing or damaged
+- heard: a plain line came while the daemon asks for the check
 - answer: the board answered a question correctly, without a sample
 - sample: the board answered a question correctly, with a sample
 - refusal: the board answered none of the questions
@@ -64,17 +65,17 @@ TABLE: dict[tuple[State, Sign], State] = {
 
 IN_FORCE: dict[State, str] = {
     "off": "plain",
-    "waking": "being asked for",
-    "asking": "being asked for",
+    "waking": "not checked yet",
+    "asking": "not checked yet",
     "plain": "plain",
     "checked": "checked",
     "sampled": "checked with samples",
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the negotiation does not end. Until it ends, the robot cannot drive.
+"""The reason why the negotiation of the check does not end; "" if there is none.
 
-"" means that there is no such reason.
+The robot cannot drive until the negotiation ends.
 
 - echo: the lines that the daemon sends come back
 - forgotten: the board answered with the check before and does not now
@@ -86,24 +87,24 @@ MENDS: dict[Trouble, str] = {
     "echo": "the daemon's own lines come back: TX and RX are connected to each other, or a "
     "terminal or the RS-485 adapter echoes, or the board reports the commanded speeds "
     "instead of the measured ones; fix that, then unplug the board and plug it in again",
-    "forgotten": "the microcontroller answered with a check before and now answers without: "
-    "either its replies are damaged (check cable and baud rate), or it runs other "
+    "forgotten": "the microcontroller answered with a checksum before and now answers without "
+    "one: either its replies are damaged (check cable and baud rate), or it runs other "
     "firmware (then unplug it and plug it in again)",
-    "unknown": 'the microcontroller answers without a check, but mcu.link_check = "require" '
-    "lets the robot drive only with one: install firmware that has the check, or "
+    "unknown": 'the microcontroller answers without a checksum, but mcu.link_check = "require" '
+    "lets the robot drive only with one: install firmware that supports the checksum, or "
     'write mcu.link_check = "auto"',
 }
 
 TRIES = 3
-"""Number of unanswered questions of one kind (with or without request letters) after which the
-daemon concludes that the board does not know that kind."""
+"""Number of questions of one kind, with or without request letters, that the daemon asks in vain
+before it concludes that the board does not know this kind."""
 
 WINDOW = 64
-"""Largest number of lines that wait for an answer. It is far below the number of sequence
-numbers."""
+"""Largest number of lines that wait for an answer. It is far below the number of sequence numbers,
+so a reply cannot match the wrong line."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
-"""Largest delay of an answer, ns. After a longer one the board's watchdog has stopped the
+"""Largest delay of an answer, ns. After a longer delay the board's watchdog has stopped the
 motors."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
@@ -122,16 +123,17 @@ REPORTS = 20
 0.2 s."""
 
 CHANGE = 2.0
-"""Sum of the speed changes that a run of reports must reach to count as an echo, rad/s. Each change
-is that of the wheel whose speed changes most. With coarse encoders, a smaller sum may be a
-coincidence."""
+"""Least sum of the speed changes in a run of reports that counts as an echo, rad/s. The change from
+one report to the next is the largest of the four wheels. With coarse encoders, a smaller sum may be
+a coincidence."""
 
 LINES = 8
-"""Number of sent lines with which a report is compared. At 100 Hz, this detects an echo that comes
-back within 70 ms."""
+"""Number of the newest sent lines with which `EchoDetector` compares a report. At 100 Hz, this
+detects an echo that comes back within 70 ms."""
 
 _Run = tuple[int, float, WheelSpeeds]
-"""Number of equal reports in a row, sum of their speed changes in rad/s, and the last speeds."""
+"""A run of reports that repeat sent lines: their number, the sum of their speed changes in rad/s,
+and the last speeds."""
 
 
 class Throttle:
@@ -158,9 +160,9 @@ class Throttle:
 
 
 class EchoDetector:
-    """Detects a run of reports that only repeat sent lines.
+    """Detector of an echo: received lines that only repeat the daemon's own lines.
 
-    A report is a reply without a sample. It has the same form as a command. So an echo looks like a
+    A report is a reply without a sample. It has the same form as a command, so an echo looks like a
     board that reports exactly the commanded speeds. A run of at least `REPORTS` reports is an echo
     under two conditions:
 
@@ -171,10 +173,11 @@ class EchoDetector:
 
     A board that measures its speeds is not taken for an echo, because the lag of its wheels is not
     a whole number of lines. This was simulated for accelerations of 0.1 to 100 m/s2, encoders of up
-    to 1,000,000 counts a turn, and motors that lag by 2 ms or more. The speed changes in a
-    run of equal reports then added up to at most 0.04 rad/s. A board that reports its set points,
-    or a simulator whose wheels have no lag, looks exactly like an echo. The daemon then does not
-    drive until the port is opened again, and reports the reason.
+    to 1,000,000 counts a turn, and motors that lag by 2 ms or more. The speed changes in a run of
+    reports that equalled sent lines then added up to at most 0.04 rad/s.
+
+    A board that reports its set points, or a simulator whose wheels have no lag, looks exactly like
+    an echo. The daemon then does not drive until the port is opened again, and reports the reason.
     """
 
     def __init__(self) -> None:
@@ -197,7 +200,7 @@ class EchoDetector:
         self._sent.append(line.removesuffix(b"\r\n"))
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a report, and return whether it completes an echo.
+        """Process a report, and return whether the last reports are an echo.
 
         `line` is the report without its line end, and `speeds` are the speeds in it.
         """
@@ -221,7 +224,7 @@ class EchoDetector:
 
 
 class Negotiation:
-    """The negotiation of the check.
+    """The negotiation of the check (sequence number and CRC) with the board.
 
     It makes the questions, adds the check to lines, and matches each reply with the line that it
     answers.
@@ -237,8 +240,8 @@ class Negotiation:
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
-        """The last question, without its line end, if it has request letters, so that no reply can
-        equal it. Otherwise b""."""
+        """The last question without its line end, b"" if it has no request letters. Replies have no
+        request letters, so a received line that equals this one is an echo."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
@@ -345,10 +348,10 @@ class Negotiation:
     # Lines from the board.
 
     def echoed(self, line: bytes) -> bool:
-        """Return whether `line`, without its line end, or an earlier line was an echo.
+        """Return whether `line`, which has no line end, or an earlier line is an echo.
 
-        `line` is compared with the last question. After an echo, every received line is rejected
-        until the port is reopened.
+        A line that equals the last question is an echo. After an echo, every received line is
+        rejected until the port is reopened.
         """
         if self._question and line == self._question:
             self.trouble = "echo"
@@ -401,7 +404,7 @@ class Negotiation:
     def judge(self, now_ns: int) -> None:
         """Count the last question as unanswered if its answer is overdue.
 
-        If no kind of question was answered, accept plain lines or set `trouble`.
+        After `TRIES` unanswered questions of each kind, accept plain lines or set `trouble`.
         """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:

@@ -1,9 +1,9 @@
 """Measures how coarsely encoders quantize the reported speeds, and adds whole counts to lines.
 
 If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds.
-Otherwise the pose uses speed times time, because the speeds alone do not show how many counts a
-turn has. The exception is firmware that divides counts by a fixed period. But then the time between
-its lines is known as well, so speed times time is wrong only by the rounding to two decimals.
+Otherwise the pose uses speed times time, because the speeds do not show how many counts a turn has.
+Only firmware that divides its counts by a fixed period would show it. But the time between the
+lines of such firmware is known, so its speed times time has only the error of two decimals.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import WholeCounts
 
 FLICKER = 0.0105
-"""Smallest change of a reported speed that counts as a step, rad/s. A smaller change is only
-rounding."""
+"""Smallest change of a wheel's reported speed that counts as a step, rad/s. A smaller change is
+only rounding."""
 
 BLOCK = 64
-"""Number of steps that are examined together. They include at least three counts, even if counts
-are rare and the firmware filters the speeds."""
+"""Number of steps of a reported speed that form a block, from which `Steps.size` is learned. Even
+if counts are rare and the firmware filters the speeds, at least three counts fall into a block."""
 
 FIRST = 24
-"""Number of steps in the first block after which `Steps.size` gets its first value, which may still
-grow."""
+"""Number of steps of a reported speed after which `Steps.size` gets its first value. This value may
+still grow until the end of the block."""
 
 RECUR = 3
-"""Number of steps in a block that must be at least as large as `Steps.size`. A single damaged line
-causes only two steps."""
+"""`Steps.size` is the third largest step of a block, because a single damaged line causes two large
+steps."""
 
 ALIKE = 3.0
-"""Bound on the step of a wheel, as a multiple of the second largest step of the four wheels. The
-bound is needed because random jumps look like steps too."""
+"""Bound on the quantization step of a wheel, as a multiple of the second largest step of the four
+wheels. The bound is needed because random jumps of a speed look like quantization too."""
 
 COARSE, JUMP_GAIN = 0.015, 0.06
-"""`COARSE` is the mean jump of a wheel, rad per line, above which its encoder is treated as coarse.
-An encoder with about 200 counts a turn reaches it. `JUMP_GAIN` is the gain of the filter for the
-mean jump."""
+"""`COARSE` is the mean jump of a wheel (`Coarseness`), rad per line, above which its encoder is
+treated as coarse. An encoder with about 200 counts a turn reaches it. `JUMP_GAIN` is the gain of
+the filter for the mean jump."""
 
 LONGEST_LINE = 0.03
-"""Longest time that a line may cover for a measurement of its jumps, s. Over a longer time, the
+"""Longest time between two lines whose speeds `Coarseness` compares, s. Over a longer time, the
 accelerations of the motors look like jumps."""
 
 NOTHING = (0.0, 0.0, 0.0, 0.0)
@@ -53,11 +53,11 @@ class Steps:
 
     One count more or less in a period T changes the reported speed by 2 pi / (counts per turn x T).
     This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step is not an acceleration. The size
-    is learned from the reports. So it is right for firmware that divides counts by its nominal
-    period, divides them by the measured time, or filters the speeds. Steps that counts cause recur.
-    A damaged line causes only two steps, one away from the speed and one back.
+    is learned from the reported speeds, so it is right whether the firmware divides counts by its
+    nominal period, divides them by the measured time, or filters the speeds. Steps that counts
+    cause recur. A damaged line causes only two steps, one away from the speed and one back.
 
-    `size` is in rad/s. It is `math.inf` until enough steps were found.
+    `size` is in rad/s. It is `math.inf` until `FIRST` steps were found.
     """
 
     def __init__(self) -> None:
@@ -89,9 +89,10 @@ class Steps:
 
 
 class Coarseness:
-    """Detects wheel speeds that jump back and forth from line to line, as with coarse encoders.
+    """Detector of wheel speeds that jump back and forth from line to line, as with coarse encoders.
 
-    A change of the acceleration causes a jump too, but only in one line.
+    The jump of a line is half the second difference of the speed, times the time that the line
+    covers. A change of the acceleration causes a jump too, but only in one line.
     """
 
     def __init__(self) -> None:
@@ -101,9 +102,9 @@ class Coarseness:
         """Filtered jump of each wheel, rad per line, and the wheel examined in the last line."""
 
     def add(self, speeds: Motors, own: float) -> bool:
-        """Process the speeds of a line, rad/s. Return whether the examined encoder looks coarse.
+        """Process the speeds of a line, rad/s. Return whether an encoder looks coarse.
 
-        Each call examines the encoder of one wheel. `own` is the time that the line covers, s.
+        Each call examines one wheel, in turn. `own` is the time since the previous line, s.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:
@@ -116,13 +117,16 @@ class Coarseness:
 
 
 class CountRecovery:
-    """The quantization of all wheels, learned from every good line of one port."""
+    """Adds to each good line of one port the counted angles and the quantization of the speeds."""
 
     def __init__(self, counts: int = 0) -> None:
         """Start. `counts` is the configured number of counts per turn, 0 if unknown."""
         self._configured, self._whole = counts, WholeCounts(counts)
         self.coarse_lines = 0
-        """Number of lines with jumps of coarse encoders while the counts are not configured."""
+        """Number of lines with speeds that jump as with coarse encoders.
+
+        They are counted only if the counts per turn are not configured.
+        """
         self.forget()
 
     def forget(self) -> None:
@@ -131,17 +135,22 @@ class CountRecovery:
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)
         self._reported, self._steps = NOTHING, NOTHING
-        """Learned step of each wheel, and the same step after the bound `ALIKE`, both rad/s."""
+        """Learned quantization step of each wheel, first without and then with the bound `ALIKE`,
+        rad/s."""
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Configured counts per turn of each wheel, 0 if the speeds are not whole counts."""
+        """Configured counts per turn of each wheel.
+
+        0 means that the counts are unknown or that the speeds are not whole counts.
+        """
         return (self._configured if self._whole.believed else 0,) * 4
 
     def look(self, line: Feedback) -> Feedback:
         """Return the line with the counted angle and the quantization step of each wheel added.
 
-        The counted angles are None if they are unknown.
+        The counted angles are None if they are unknown. If they include the time of a missing line,
+        `bridged` becomes 0.
         """
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:

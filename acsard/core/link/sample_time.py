@@ -1,11 +1,11 @@
-"""Estimates when the board read its encoders, with one clock for each of two kinds of boards.
+"""Estimates when the board read its encoders. There is one class for each of two kinds of boards.
 
 The time at which the host reads a line is not the time of its sample: an adapter, the scheduler or
 a stall of the host may have held the line back. `FreeRunningTimes` finds the period of a board that
 reports by its own clock. For a board that answers each command line, `PromptedTimes` uses the times
-at which the command lines were written. For each read of the port, call `read` on both classes.
-Then `place` returns the time of each line of the read as a `Placed`. `forget` starts a new session.
-`feedback.py` chooses the better clock for each line.
+at which the command lines were written. Each class is a clock. For each read of the port, call
+`read` on both. Then `place` returns the time of each line of the read as a `Placed`. `forget`
+starts a new session. `feedback.py` chooses the better clock for each line.
 """
 
 from __future__ import annotations
@@ -26,124 +26,129 @@ Read = tuple[int, int]
 read."""
 
 BRIDGED_S = 1.0
-"""Longest gap between two lines that is filled, s. After a longer one the board may have been
-reset."""
+"""Longest time without lines that is filled from the lines before and after it, s. After a longer
+time the board may have been reset."""
 
 
 class Placed(Struct, frozen=True, gc=False):
-    """The time of a line according to one of the clocks.
+    """The time of a line according to one of three clocks.
 
     `clock` is "slots" for `FreeRunningTimes`, "prompts" for `PromptedTimes`, and "reads" for the
-    times of the reads. `due_ns` is the monotonic time at which the host should have received the
-    whole line, ns.
+    times at which the host read the port. `due_ns` is the monotonic time at which the host should
+    have received the whole line, ns.
     """
 
     clock: Literal["slots", "prompts", "reads"]
     due_ns: int
     dt: float | None = None
-    """Time since the previous line that this clock placed, s. None for the first such line, and for
-    the clock "reads"."""
+    """Time since the previous line with a time from this clock, s. None for the first such line,
+    and for the clock "reads"."""
     bridged: float = 0.0
     """The part of `dt` whose lines were lost, s."""
     early: bool = False
-    """Whether the line came before it was due. Then `due_ns` is the time of its arrival, and the
-    time to the next line is the difference of the two `due_ns`."""
+    """Whether the line came before the clock expected it. Then `due_ns` is the time of its arrival,
+    and the time to the next line is the difference of their `due_ns` and not the next `dt`."""
 
 
-# A free-running board. A slot is one period of its clock, in which it sends one line.
+# A free-running board. A slot is one period of its clock, in which the board sends one line.
 
 WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
-"""Least duration of a window, ns, and its least number of reads. A clock is found or corrected from
-the reads of one window."""
+"""Least duration of a window, ns, and least number of reads of the port in it. From the reads of
+one window, `FreeRunningTimes` finds or corrects the clock of the board."""
 
 LOOP_GAIN = 0.2
-"""Gain g of the loop in `FreeRunningTimes` after it has settled. One window determines the error x
-of the clock to a few hundredths of a slot."""
+"""Gain g with which `FreeRunningTimes` corrects its clock after the first windows. The reads of one
+window show the error of the clock to a few hundredths of a period."""
 
 DRIFT = 0.01
-"""Largest relative error of a board's clock. A ceramic resonator has half of it."""
+"""Largest relative error of a board's clock. A ceramic resonator reaches half of it."""
 
 EXACT = 0.001
-"""Relative error within which a measured period that is not configured is rounded to whole ms. It
-covers the error of a quartz and the error of the fit."""
+"""A measured period is rounded to a whole number of ms if it differs from it by less than this
+share. The share covers the error of a quartz and of the measurement. A period within `DRIFT` of a
+configured one counts as the configured one."""
 
 LONE = 0.7
-"""If at least this share of the reads contains a single line, lines are treated as read one by
-one."""
+"""If at least this share of the reads of the port contains a single line, lines are treated as read
+one by one, and otherwise as batches of an adapter."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""Largest lateness of a line, in slots, in the window from which a clock is found. `LATE_ALONE` is
-for lines that are read one by one, `LATE_BATCHED` for batches; `HELD_NS` limits both."""
+"""Largest lateness of a line, in periods of the board, with which `FreeRunningTimes` accepts a
+clock that it has found. `LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for
+lines that an adapter batches. `HELD_NS` limits both."""
 
 HELD_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
-16 ms. At 20 Hz and less, a later line answers a command that was sent between two periods. If the
-lines of a slow board really vary by more, no clock is found, and the times of the reads are
-used."""
+16 ms. A line that is later than this probably answers a command that was sent between two periods.
+Then `FreeRunningTimes` finds no clock, even if the lines of a slow board really vary by more."""
 
 EARLY_ALONE, ALONE = 0.55, 12
-"""Limit for lines that came out of turn, in the window from which a clock is found. Such a line
-answers a command that was sent between two periods, and is earlier than the others by more than
-`EARLY_ALONE` slots. One such line is allowed, and one more for each `ALONE` reads. With more of
-them the clock is refused, because it would make all other lines a slot late."""
+"""A clock is refused if all reads except a few come more than `EARLY_ALONE` periods after their
+slots. A few means one, and one more for each `ALONE` reads. The lines of these few reads answer
+commands that were sent between two periods, and so the clock would be a period early for all other
+lines."""
 
 JUMP = 1.4
-"""If two reads with a single line each are less than this number of slots apart, no line is missing
-between them."""
+"""If two reads with a single line each are less than this number of periods apart, no line is
+missing between them."""
 
 SURE = 0.15
-"""Margin in slots. If the last line of a read is later than its greatest possible lateness by more
-than one slot and this margin, a line is missing."""
+"""Margin in periods. An adapter can delay a line only up to a limit. If a line is later than this
+limit by more than one period and the margin, a line before it is missing."""
 
 EARLY = 0.25
-"""If a line of a window is earlier than its slot by more than this number of slots, the clock is
-wrong."""
+"""If a line comes before its expected time by more than this number of periods, `FreeRunningTimes`
+gives its clock up as wrong."""
 
 LOSSY_READS = 0.45
-"""If more than this share of the reads in two windows follows missing lines, the period is
-wrong."""
+"""If lines seem to be missing before more than this share of the reads in two windows, the period
+is wrong."""
 
 
 class FreeRunningTimes:
     """The sample times of a free-running board, from the times at which its lines were read.
 
-    The board makes one line in each slot of length T. The time of a read alone does not show to
-    which slot a line belongs: an adapter holds lines back, and during a host stall they wait in the
-    kernel. Let a be the time of a read, k the slot of its last line and c the time of slot 0. Then
+    The board makes one line in each period T of its clock, here called a slot. The time of a read
+    alone does not show to which slot a line belongs: an adapter holds lines back, and during a host
+    stall they wait in the kernel. Let a be the time of a read, k the number of the slot of its last
+    line, and c the time of slot 0. Then the lateness of this line in slots is
 
         (1)  x = (a - c) / T - k
 
-    is the lateness of the read's last line in slots. Each missing line adds 1 to x.
+    Each missing line adds 1 to x. There are two cases:
 
-    If lines are read one by one, x is about 0, and a line that is read alone shows at once how many
-    lines are missing before it. If an adapter batches lines, x lies between 0 and 1. Then a read
-    shows single missing lines only if it came at least as soon after the previous read as usual.
-    Any other read shows a missing line only if x exceeds the greatest possible lateness. The
-    missing slots are spread over the lines of the read. A line that comes before its slot shows
-    that too many slots were counted as missing, so one is taken back. Twice a second the least x
-    corrects c and T in a second-order loop with the gain g:
+    - Lines are read one by one. Then x is about 0, and each line shows at once how many lines are
+      missing before it.
+    - An adapter batches lines. Then x lies between 0 and 1. A read shows a single missing line only
+      if it came no later after the previous read than usual. Any other read shows a missing line
+      only if x exceeds the greatest possible lateness.
+
+    The missing slots are spread over the lines of the read. If a line comes before its slot, too
+    many slots were counted as missing, so one is taken back. Twice a second the least x corrects c
+    and T in a second-order loop with the gain g:
 
         (2)  c += g x T                 (3)  T += g^2 / 2 x T / slots
 
-    No clock is found for lines without a regular period. A clock that the lines contradict is given
-    up.
+    In (3), `slots` is the number of slots since the last correction. If lines have no regular
+    period, no clock is found. A clock that the lines contradict is given up.
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
         """Start. `known` contains the periods that the configuration suggests, s."""
         self._known = known
         self.usual = 0.0
-        """The last measured T, ns. 0 until a clock has been found."""
+        """The last measured period T of the board, ns. 0 until a clock has been found."""
         self._stretch = 1.0
-        """Slots per line of the last read, including its share of the missing lines."""
+        """Slots per line of the last read: 1, and more if lines are missing before it."""
         self._before = 0
         self._first, self._slot = 0.0, 0
-        """The time c of slot 0, ns, and the slot k of the last line."""
+        """The time c of slot 0, ns, and the number k of the slot of the last line."""
         self._given = 0
         """Number of slots that were recently counted as missing lines. They may be taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
-        """`_lag` is the usual x of a read, `_batch` the usual time between two reads in slots,
-        `_gain` the gain g, and `_share` the share of the reads that follow missing lines."""
+        """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
+        both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
+        before which lines are missing."""
         self._batched: bool = False
         """Whether an adapter batches lines."""
         self._alone: bool = False
@@ -153,7 +158,7 @@ class FreeRunningTimes:
         self.forget()
 
     def forget(self) -> None:
-        """Give up the clock, because the board has changed or has another period."""
+        """Give up the clock, because the lines contradict it or may come from another board."""
         self.period: float | None = None
         """Nominal period of the firmware, s. None while no clock is known. The firmware divides its
         counts by this period even if its clock is fast or slow."""
@@ -180,7 +185,7 @@ class FreeRunningTimes:
         ahead = (at_ns - self._first) / self.usual - self._slot
         lost = self._missing(ahead, since / self.usual, lines, drained)
         if lost < 0 and (self._given <= 0 or ahead > 0):
-            self.forget()  # the lines come too early or later and later: another clock
+            self.forget()  # the lines come too early or ever later: the clock is wrong
             return 0
         self._slot += lost
         # If the missing lines cover more time than may be filled, place them all before the read.
@@ -202,7 +207,7 @@ class FreeRunningTimes:
 
     @property
     def late_ns(self) -> float:
-        """Mean time from the slot of a line to its read, ns."""
+        """Mean time from the beginning of a line's slot to the read of the line, ns."""
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
@@ -278,14 +283,15 @@ class FreeRunningTimes:
         """Yield candidate clocks, the likelier ones first.
 
         A candidate consists of the slot of each read's last line, the largest allowed lateness in
-        slots, and the period in ns. `gaps` are the times between the reads, ns. The order has three
-        reasons:
+        slots, and the period in ns. `gaps` are the times between the reads, ns.
 
-        - For jittery lines a configured period is more reliable than half a second of data.
-        - An adapter that holds lines back also passes them on one by one if they fill its packets.
-          So the configured periods are tried without missing lines before any other period is tried
-          with missing lines.
-        - Half a second of batches cannot distinguish two periods that hardly differ.
+        - Configured periods come first. For jittery lines they are more reliable than half a second
+          of data.
+        - An adapter that batches lines may also pass them on one by one, if they fill its packets.
+          So configured periods without missing lines come before measured periods with missing
+          lines.
+        - In batches, a measured period is left out if a configured period is within `DRIFT` of it,
+          because half a second cannot distinguish the two.
         """
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
         alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
@@ -305,7 +311,10 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a window: reset its least x and the numbers of reads, slots and lossy reads."""
+        """Start a window: reset its least lateness x and its numbers of reads and of slots.
+
+        `_lossy` is the number of reads in the window before which lines are missing.
+        """
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -313,7 +322,7 @@ class FreeRunningTimes:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct c and T by equations (2) and (3).
+        """Correct the clock by the equations (2) and (3) of the class at the end of a window.
 
         If the window contradicts the clock, give the clock up instead.
         """
@@ -347,9 +356,9 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot of each read's last line, from 0 for the first read.
+    """Return the number of the slot of each read's last line. The first read has the slot 0.
 
-    With a finite `period`, ns, a longer gap between two reads is counted as missing lines.
+    With a finite `period`, ns, slots without a line are counted too: their lines are missing.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -368,9 +377,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return the latest time of slot 0 for which no line is early, ns.
+    """Return the latest time of slot 0, ns, with which no read comes before its slot.
 
-    Also return the lateness of each read's last line, in slots. `period` is in ns.
+    Also return the lateness of each read with this time, in slots. `period` is in ns.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -380,93 +389,93 @@ def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, 
 # A prompted board.
 
 MEMORY = 64
-"""Largest number of written lines that are remembered because their replies may still come."""
+"""Largest number of command lines that are remembered because their replies may still come."""
 
 FAST = 0.05
-"""Gain per reply or read of the filters for the usual delay, its spread and the batches."""
+"""Gain per reply or read of the filters for the usual reply delay, its spread and the batches."""
 
 SLOW = 0.0125
-"""Gain per read of the slower filter that decides whether the board itself varies the delay."""
+"""Gain per read of the filter that decides whether the board itself varies the reply delay."""
 
 LEAST = 0.002
-"""Gain per reply with which the least delay rises towards the usual delay: a time constant of 500
-replies. So an outdated least delay is forgotten."""
+"""Gain per reply with which the least reply delay rises towards the usual delay, so that an
+outdated least delay is forgotten after about 500 replies."""
 
 CREEP, CREEPS_FOR = 0.05, 3
-"""Rise of the least delay of the last replies, as a fraction of the time since the last reply. So
-the delays of older replies are forgotten. The time is limited to between one and `CREEPS_FOR` times
-the usual time between two lines, because a board may stall and then answer all lines."""
+"""The least delay of the last replies rises by the share `CREEP` of the time since the last read,
+so that older replies are forgotten. This time counts as at least one and at most `CREEPS_FOR` times
+the usual time between two command lines, because a board may stall and then answer all lines."""
 
 LATE = 1.25
-"""Largest difference between the least delay of the last replies and the long-term least delay, in
-usual times between two lines. Above it, replies were lost. A limit of 1 is too low, because the
-delay may permanently rise by almost that much."""
+"""If the least delay of the last replies exceeds the long-term least delay by more than this,
+replies were lost. The unit is the usual time between two command lines. A limit of 1 is too low,
+because the delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""Share of lost replies below which the reply to a line is not taken for lost if another line
-follows that line closely."""
+"""If two command lines were written close together, a late reply proves a lost one only if at least
+this share of the replies was lost before."""
 
 JITTER_NS = 350_000
-"""Mean deviation of the delay that USB and the scheduler add to a constant delay, ns."""
+"""Mean deviation of the reply delay that USB and the scheduler cause, ns."""
 
 THOUGHT_NS = 800_000
-"""Mean deviation of the delay above which the board itself varies it, ns. USB and the scheduler
-rarely cause as much."""
+"""Mean deviation of the reply delay above which the board itself varies the delay, ns. USB and the
+scheduler rarely cause as much."""
 
 RISE_NS = 20_000
-"""Rise per read of the least delay on a batched link, ns. So an outdated least delay is forgotten.
-A link is batched if an adapter holds replies back, so that one read contains several."""
+"""Rise per read of the least reply delay on a batched link, ns, so that an outdated least delay is
+forgotten. A link is batched if an adapter holds replies back, so that one read contains several."""
 
 LOSING = 0.005
 """Gain of the filter for the share of lost replies. It is small, because a filter over 20 reads
-would already show 3 % after two lost replies."""
+would show 3 % after only two lost replies."""
 
 LOSSY = 0.03
-"""Share of lost replies on a batched link above which any line may lack its reply."""
+"""Share of lost replies above which a batched link counts as lossy. Then any command line may lack
+its reply."""
 
 SEVERAL = 0.15
-"""Share of the reads with several lines above which an adapter batches lines. Host stalls alone
-cause fewer such reads."""
+"""If more than this share of the reads of the port have several lines, an adapter batches lines.
+Host stalls alone cause fewer such reads."""
 
 THINKS = 0.6
-"""Filtered share of the reads with a varying delay above which the board itself varies the delay.
-An adapter that is filled line by line causes a varying delay too, but only for a quarter of a
-second."""
+"""If the reply delay varies in more than this filtered share of the reads, the board itself varies
+it. An adapter whose packets fill line by line varies it too, but only for a quarter of a second."""
 
 BATCH_NS = 2_000_000
-"""Mean deviation of the delay above which an adapter holds the lines back, ns. No board causes as
-much."""
+"""Mean deviation of the reply delay above which an adapter holds the lines back, ns. No board
+causes as much."""
 
 
 class PromptedTimes:
     """The sample times of a prompted board, from the command lines that its replies answer.
 
-    A plain reply does not say which line it answers. However, a board that answers each line takes
-    its sample when the line arrives. So the times at which the lines were written are the sample
-    times, except for a usual delay. The time between two samples is the time between their lines,
-    even if the host reads the replies late. If no line was written, no reply is missing.
+    In this class, a line is a command line of the daemon. A plain reply does not say which line it
+    answers. However, a board that answers each line takes its sample when the line arrives. So the
+    sample times are the times at which the lines were written, plus a usual delay. The time between
+    two samples is the time between their lines, even if the host reads the replies late.
 
-    Replies come in the order of the lines. Suppose that a reply is later than usual by more than
-    half the time from its line to the next line. Then it answers the next line, and the reply to
-    the earlier line was lost.
+    Replies come in the order of the lines. If a reply seems to be later than usual by more than
+    half the time from its line to the next line, it answers the next line instead. The reply to the
+    earlier line was lost.
     """
 
     def __init__(self, soonest_ns: int) -> None:
         """Start. `soonest_ns` is the least possible delay of a reply, ns.
 
-        It is the wire time of a line and its reply.
+        It is the time that a line and its reply take on the wire.
         """
         self._soonest = soonest_ns
         self._left: deque[int] = deque(maxlen=MEMORY)
         self.forget()
 
     def forget(self) -> None:
-        """Forget all lines, because they are answered or will never be answered."""
+        """Forget all command lines, because they are answered or will never be answered."""
         self._left.clear()
         self.restart()
 
     def restart(self) -> None:
-        """Forget which line was answered last, and the usual delay.
+        """Forget which command line was answered last, and the usual delay of the replies.
 
         The next reply is then assigned to the newest line that it can answer. The lines are kept,
         because replies to the last ones may still come.
@@ -475,34 +484,34 @@ class PromptedTimes:
         self._first = False
         """Whether the usual delay was measured on the first reply alone."""
         self._spread = self._least = 0.0
-        """`_spread` is the mean deviation from the usual delay, and `_least` the long-term least
-        delay, both ns."""
+        """`_spread` is the mean deviation from the usual reply delay, and `_least` the long-term
+        least delay, both ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
         self._sent: int | None = None
         self._apart = self._missing = 0.0
-        """`_sent` is the time at which the last line was written, and `_apart` the usual time
-        between two lines, both ns. `_missing` is the share of lost replies."""
+        """`_sent` is the time at which the last command line was written, and `_apart` the usual
+        time between two of them, both ns. `_missing` is the share of lost replies."""
         self._last: int | None = None
-        """Time of the last answered line, plus the excess of its reply's delay over the usual
-        delay, ns."""
+        """Time at which the last answered command line was written, ns. If its reply came later or
+        sooner than usual because of the board, the time is shifted by the difference."""
         self._passed = self._line = 0
-        """`_passed` is the time of the last line that was answered or given up, and `_line` that of
-        the last line that was answered, both ns."""
+        """`_passed` is the time at which the last command line that was answered or given up was
+        written. `_line` is that of the last line that was answered. Both are ns."""
         self._lost = False
-        """Whether a line was given up because of the last reply that was read alone."""
+        """Whether the last reply that was read alone showed that an earlier reply was lost."""
         self._given: list[int] = []
-        """Lines that the last read of a batched link gave up, in order. Their replies may have
-        waited in an adapter that stalled."""
+        """Times (ns) of the command lines whose replies the last read of a batched link counted as
+        lost, in order. An adapter that stalled may still bring these replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """For a batched link: `_base` is the least delay and `_batch` the usual time between two
-        reads, both ns. `_losses` is the share of lost replies."""
+        """For a batched link: `_base` is the least reply delay and `_batch` the usual time between
+        two reads, both ns. `_losses` is the share of lost replies."""
         self._several = 0.0
         """Filtered share of the reads that have several lines."""
         self._thinking = 0.0
-        """Filtered share of the reads in which the delay varied more than a scheduler or an adapter
-        causes."""
+        """Filtered share of the reads in which the reply delay varied more than USB and the
+        scheduler cause, but less than an adapter causes."""
 
     @property
     def thinks(self) -> bool:
@@ -511,7 +520,7 @@ class PromptedTimes:
 
     @property
     def lossy(self) -> bool:
-        """Whether replies get lost on a batched link, where `FreeRunningTimes` finds no clock."""
+        """Whether an adapter batches the replies, and more of them are lost than `LOSSY` allows."""
         return self._batched and self._losses > LOSSY
 
     @property
@@ -531,9 +540,6 @@ class PromptedTimes:
         """Process a read of `lines` lines. The last was complete at the monotonic time `at_ns`.
 
         `cut` says whether the read ends within a further line.
-
-        The delay of a reply that is read alone shows which line it answers. The delay of a batch
-        shows it only if it is longer than the adapter ever holds a reply back.
         """
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
@@ -549,7 +555,7 @@ class PromptedTimes:
             self._base, self._losses = self._delay, 0.0
 
     def place(self, asked_ns: int | None = None) -> Placed | None:
-        """Return the time of the next reply, or None if no line waits for a reply.
+        """Return the time of the next reply, or None if no command line waits for a reply.
 
         `asked_ns` is the monotonic time at which the answered line was written, if the reply names
         that line. Otherwise it is None.
@@ -590,12 +596,12 @@ class PromptedTimes:
         return Placed("prompts", due_ns, dt / NS_PER_S, bridged / NS_PER_S)
 
     def skip(self) -> None:
-        """Remove the line that the next reply answers, because the reply was damaged."""
+        """Remove the command line that the next reply answers, because the reply was damaged."""
         if self._left:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Discard the lines that are older than the one which the first reply answers.
+        """Discard the command lines that are older than the one which the first reply answers.
 
         The usual delay is not known yet. So the reply is assigned to the newest line that was sent
         early enough for the wire time of a line and its reply.
@@ -613,9 +619,9 @@ class PromptedTimes:
     def _shorten(self, line: int) -> None:
         """Correct the usual delay if a stall had delayed the first reply, on which it was measured.
 
-        In that case the next reply, which answers `line`, comes much earlier than usual. Without
-        this correction, the usual delay would fall by only 5 % of the difference per reply, and the
-        difference would count as variation. A delay that varies much hides lost replies.
+        The second reply, which answers the line written at `line` ns, then comes much earlier than
+        usual. Without the correction, the usual delay would fall by only 5 % of the difference per
+        reply. Until then the delay would seem to vary much, and this would hide lost replies.
         """
         own = self._at - line
         self._first = own < (self._delay or 0) - self._apart / 2
@@ -624,7 +630,7 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Give up the lines whose replies were lost.
+        """Give up the command lines whose replies were lost, for a batch of replies.
 
         The last reply of a batch shows the loss: it is too late for the line that it would answer.
         If many replies are lost, the first reply of the batch decides instead, because the board
@@ -666,10 +672,10 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Give up lines whose replies were lost.
+        """Give up command lines whose replies were lost, when a reply was read alone.
 
-        Return True if the line that was given up last was given up too early: the present reply
-        answers it. `delay` is the usual delay, ns.
+        Return True if the present reply answers the line that was given up last. `delay` is the
+        usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

@@ -284,7 +284,7 @@ class McuSession:
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        """Add one event per reason. After noise, one event per line would take a whole period."""
+        """Add one event per reason. After noise, one event per line would take too much time."""
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""
             self.events.append(
@@ -401,7 +401,7 @@ class McuSession:
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:
-            self.restarted = True  # also if an earlier update has reported a restart
+            self.restarted = True  # even if an earlier update has already reported a restart
         since_ns = self._link.good(read_at.mono_ns)
         silent = since_ns is None or since_ns > self.quiet_ns
         feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)

@@ -1,29 +1,30 @@
 """Recovers whole encoder counts from the speeds of a plain line, if the counts per turn are known.
 
-Let a be the angle of one count, and T the time in s since the previous sample. For a wheel that
-made n counts, firmware that divides counts by time reports the speed n a / T. T is the same for all
-four wheels, but the host knows it only to a few ms. With a coarse encoder that error falsifies the
-heading: at 16 counts a turn, one count is 0.4 rad of the wheel, and an error of 30 % in T is an
-error of 30 % of that angle. However, n is a whole number:
+Let a be the angle of one count in rad, and T the time in s in which a wheel made n counts. Firmware
+that divides counts by time reports the speed n a / T. T is the same for all four wheels, but the
+host knows it only to a few ms. With a coarse encoder, this error falsifies the heading. At 16
+counts a turn, one count is 0.4 rad of the wheel, and an error of 30 % in T is 30 % of that angle.
+However, n is a whole number, so T can be found from the speeds:
 
-1. Each candidate n for the fastest wheel implies a time T = n a / speed. The search starts at the n
+1. Each possible n of the fastest wheel implies a time T = n a / speed. The search starts at the n
    whose T is nearest to the host's estimate.
-2. The first n that makes the counts of the other wheels whole too is accepted.
-3. The error of the host's time is carried to the next line: if a sample was later than the host
-   believed, less time is left until the next sample. The carried time also corrects a wrong n.
+2. The search ends at the first n with which the counts of the other wheels are whole numbers too.
+3. The error of the host's time is carried to the next line: if the board took a sample later than
+   the host believed, less time is left until the next sample. If n was wrong, the carried time
+   makes up for it in the next line.
 
 With fine encoders, the host's time is too inaccurate to find n. Then the angle of each wheel is its
 speed times the host's time. That time includes the time carried from earlier lines, so no time is
 lost or counted twice.
 
-If the previous line is missing, either the reply or the command was lost. If the reply was lost, T
-covers only the time since that reply. If the command was lost, T covers the whole time since the
-last good line. The speeds are then whole counts in the longer time and not in the shorter one. A
-line that shows neither case is treated like most other lines, but only if one line is missing.
+If the previous line is missing, there are two cases. If the board answered and its reply was lost,
+T covers only the time since that reply. If the command was lost, the board did not answer, and T
+covers the whole time since the last good line. Only one of these times makes the speeds whole
+counts. If a line does not show which one, and one line is missing, the module assumes the case of
+most earlier lines.
 
 Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
-whole counts. The module detects this because the counts of the other wheels are not whole. The
-caller then uses speed times time.
+whole counts. The module detects this, and the caller then uses speed times time.
 """
 
 from __future__ import annotations
@@ -36,92 +37,94 @@ ROUNDING = 0.0052
 """Largest rounding error of a speed with two decimals, rad/s."""
 
 MOST_TRIES = 16
-"""Largest number of candidates n that are tried, which bounds the time of a control step."""
+"""Largest number of counts that are tried for the fastest wheel of a line. It bounds the time of a
+control step."""
 
 BY_CHANCE = 0.05
-"""Largest accepted probability that random speeds fit one of the candidates n tried so far.
+"""Largest accepted probability that random speeds look like whole counts.
 
-Above it, a fit proves nothing.
+The probability grows with each number of counts that is tried. Above the limit, speeds that look
+like whole counts prove nothing.
 """
 
 EXACT = 0.3
-"""Largest accepted difference between n and the count that the host's time implies, in counts.
+"""Largest accepted difference, in counts, between a whole number of counts and speed times host
+time.
 
-It applies if a fit proves nothing, as with fine encoders. It also decides whether a line covers the
-time of a missing one.
+It applies if the speeds alone prove nothing, as with fine encoders. It also helps to decide whether
+the counts of a line include those of the missing line before it.
 """
 
 WIDE, WIDE_S = 0.6, 0.005
-"""Largest difference between the firmware's time and the host's.
-
-It is `WIDE` times the host's time, plus `WIDE_S` seconds.
-"""
+"""Largest error of the host's time between two samples: `WIDE` times this time plus `WIDE_S` s."""
 
 KEPT = 0.95
-"""Largest share of the host's time error that is carried to the next line. With a share of 1, the
-carried error of two clocks that differ by 0.5 % would grow for ever."""
+"""Largest share of the error of the host's time that is carried to the next line. If the whole
+error were carried and the clocks differed by 0.5 %, the carried error would grow for ever."""
 
 REPEATED = 0.65
-"""After less than this share of the firmware's last T, a line with unchanged speeds may repeat the
-previous line. Firmware that is asked again too soon has no new counts."""
+"""Limit for a line with unchanged speeds, as a share of the time over which the firmware last
+counted. A line that follows sooner may be a repetition of the previous line, because firmware that
+is asked again too soon has no new counts."""
 
 SOON, OFF = 0.45, 0.25
-"""Limits for a line with unchanged speeds. After less than `SOON` times the firmware's last T, it
-is always a repetition. Between `SOON` and `REPEATED` times the last T, it is a repetition only if
-it shows no whole counts, or if the host's time differs from that of whole counts by more than `OFF`
-counts."""
+"""Limits for a line with unchanged speeds. `SOON` is a share of the time over which the firmware
+last counted. A line that follows sooner is a repetition of the previous line. A line between `SOON`
+and `REPEATED` is a repetition if its speeds are not whole counts, or if the host's time contradicts
+its counts by more than `OFF` counts of the fastest wheel."""
 
 UNSURE, SLOW = 0.2, 0.025
-"""`UNSURE` is the mean error of the host's time, in counts of the fastest wheel, above which the
-nearest n is often wrong. A random time has a mean error of 0.25. An encoder with 96 counts a turn
-reaches `UNSURE` behind a USB adapter that batches lines for 16 ms. `SLOW` is the gain of the filter
-for this error."""
+"""`UNSURE` is a mean error of the host's time, in counts of the fastest wheel. Above it, the
+nearest whole number of counts is often wrong. A random time has a mean error of 0.25. An encoder
+with 96 counts a turn reaches `UNSURE` behind a USB adapter that batches lines for 16 ms. `SLOW` is
+the gain of the filter for this error."""
 
 GAIN, DOUBTFUL = 0.1, 0.3
-"""`GAIN` is the gain of the filter for the share of lines that are not whole counts. From the share
-`DOUBTFUL` on, no line is treated as whole counts."""
+"""`GAIN` is the gain of the filter for the share of lines whose speeds are not whole counts. If
+this share reaches `DOUBTFUL`, no line is treated as whole counts."""
 
 
 class WholeCounts:
-    """The recovery of the whole counts of four wheels, line by line."""
+    """Recovery of whole encoder counts from the speeds of four wheels, line by line."""
 
     def __init__(self, counts: int) -> None:
         """Start. `counts` is the number of encoder counts per wheel turn, 0 if unknown."""
         self.angle = math.tau / counts if counts else 0.0
-        """Angle of one count, rad, 0 if unknown."""
+        """Angle of one encoder count, rad, 0 if unknown."""
         self.forget()
 
     def forget(self) -> None:
         """Forget all earlier lines, because they may be those of another board."""
         self._apart = self._period = 0.0
-        """`_apart` is how much earlier the last sample was than the host believed, s. `_period` is
-        the firmware's last T, s."""
+        """`_apart` is the time in s by which the board took the last sample earlier than the host
+        believed. `_period` is the time in s by which the firmware divided its last counts."""
         self._run = 0
         """Number of lines with recovered counts since the last line without them."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False
-        """Whether the last line covers the time of the missing line before it."""
+        """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Filtered share of the lines that cover the time of the missing line before them, among
-        the lines that show whether they do."""
+        """Filtered share of the lines whose counts include those of the missing line before them.
+        Lines that do not show whether they do are ignored."""
         self._doubt = self._unsure = 0.0
-        """`_doubt` is the filtered share of the lines that are not whole counts. `_unsure` is the
-        filtered error of the host's time, in counts."""
+        """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
+        is the filtered error of the host's time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Reset the carried time, because a line does not show the firmware's T."""
+        """Reset the carried time, because the last line does not show the firmware's time."""
         self._apart, self._run = 0.0, 0
 
     @property
     def believed(self) -> bool:
-        """Whether the firmware reports whole counts, as far as its lines show."""
+        """Whether the counts per turn are known, and few recent lines contradict whole counts."""
         return self.angle > 0.0 and self._doubt < DOUBTFUL
 
     def turned(self, speeds: Motors, own: float, gap: float = 0.0) -> Motors | None:
         """Return the angle by which each wheel turned since the previous line, rad.
 
-        Return None if the firmware does not report whole counts, or if no speed exceeds its
-        rounding error. If all speeds are 0, the angles are 0 too.
+        The angles are whole counts. If the line does not show the counts, they are speed times
+        time. Return None if the firmware does not report whole counts, or if the speeds are not all
+        0 but none exceeds its rounding error.
 
         Args:
             speeds: The speeds in the line, rad/s.
@@ -207,7 +210,7 @@ class WholeCounts:
         Args:
             speeds: The speeds in the line, rad/s.
             fastest: The largest absolute value of the speeds, rad/s.
-            want: The host's estimate of T, with the carried time, s.
+            want: The host's estimate of the time between the samples, with the carried time, s.
         """
         count = fastest / self.angle
         exact = want * count  # counts if the host's time were right

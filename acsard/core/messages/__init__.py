@@ -1,1 +1,4 @@
-"""Messages on the bus, pure: structs, the topic table, encodings, reports and signatures."""
+"""Defines the messages on the bus: types, the table of keys, encodings, reports and signatures.
+
+The package does no input or output.
+"""

@@ -4,8 +4,8 @@ The codec is derived from the type of the struct. It writes plain CDR (XCDR1), l
 the encapsulation header of 4 bytes. It reads both byte orders. Numbers are aligned relative to the
 byte after the header.
 
-The codec of each type is compiled once to a list of parts. Neighbouring numbers form one part that
-a single call packs. So a message needs a few calls and not one for each field. `cdr_types.py` reads
+The codec of each type is compiled once to a list of parts. Neighbouring numbers form one part,
+which a single call packs, so a message needs fewer calls than it has fields. `cdr_types.py` reads
 the types.
 """
 
@@ -42,14 +42,14 @@ _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
 class CdrError(AcsardError):
-    """The bytes are not a valid message of the expected type."""
+    """Error for bytes that are not a valid message of the expected type."""
 
 
 class Cdr(Generic[T]):
     """Codec of one struct type. The constructor raises `TypeError` if CDR cannot represent it."""
 
     def __init__(self, cls: type[T]) -> None:
-        # A cache key must be hashable, and mypy does not know that of a type variable.
+        # The cache of `_compiled` needs hashable arguments. For mypy, a type variable is not one.
         of_type: Any = cls
         self._parts, self._build = _compiled(of_type)
 
@@ -70,7 +70,10 @@ class Cdr(Generic[T]):
         """
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
-            raise CdrError(f"needs the header of plain CDR, but has {payload[:4].hex(' ')}")
+            raise CdrError(
+                "the payload must begin with the header of plain CDR, not with "
+                f"{payload[:4].hex(' ')}"
+            )
         source = _Source(payload, order)
         found: list[object] = []
         for part in self._parts:
@@ -99,14 +102,16 @@ class _Source:
     def _unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
         start, self.at = self.at, self.at + layout.size
         if self.at > len(self.data):
-            raise CdrError(f"ends after {len(self.data)} bytes, in the middle of a field")
+            raise CdrError(
+                f"the payload ends after {len(self.data)} bytes, in the middle of a field"
+            )
         return layout.unpack_from(self.data, start)
 
     def count(self, least: int) -> int:
         """Read the length of a sequence whose items take at least `least` bytes each."""
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
-            raise CdrError(f"a length of {count} in {len(self.data)} bytes")
+            raise CdrError(f"a sequence of {count} items does not fit into {len(self.data)} bytes")
         return int(count)
 
     def text(self) -> str:
@@ -115,16 +120,16 @@ class _Source:
         self.at += count
         # Some writers encode an empty string as length 0, without the final zero byte.
         if raw[-1:] not in (b"\0", b""):
-            raise CdrError("a string without its end")
+            raise CdrError("a string does not end with a zero byte")
         try:
             return raw[:-1].decode()
         except UnicodeDecodeError as error:
-            raise CdrError(f"a string that is not UTF-8: {error.reason}") from None
+            raise CdrError(f"a string is not UTF-8: {error.reason}") from None
 
 
 def _whole(code: str, value: Any) -> Any:
     if code == "?" and value > 1:
-        raise CdrError(f"a boolean of {value}")
+        raise CdrError(f"a boolean must be 0 or 1, not {value}")
     return bool(value) if code == "?" else value
 
 
@@ -155,7 +160,7 @@ _put_count = _packs("I")
 
 @lru_cache(256)
 def _text_bytes(text: str) -> bytes:
-    """Return a string as CDR with its length, cached because a robot repeats a few strings."""
+    """Return a string as CDR with its length. It is cached, because a robot repeats few strings."""
     raw = text.encode() + b"\0"
     return struct.pack("<I", len(raw)) + raw
 

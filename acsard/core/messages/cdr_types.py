@@ -1,4 +1,4 @@
-"""Reads the type of a struct: its fields in the order of CDR, and how to build an instance.
+"""Reads the type of a struct for `cdr.py`: its fields in order, and how to build an instance.
 
 A number declares its width with `Meta(extra={"cdr": code})`, where the code is one of the struct
 module (`B i I q Q`, and `f` for a float32). A `float` without a code is a float64. In a field of
@@ -13,13 +13,15 @@ from typing import Any
 from msgspec import inspect
 
 SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
-"""Size of a number in bytes by its code. A number is aligned to its size."""
+"""Size of a number in CDR, in bytes, by its code in the struct module. CDR aligns a number to its
+size."""
 
 Build = Callable[[Iterator[object]], object]
-"""Function that takes the values of a struct's leaves from an iterator and returns the struct."""
+"""Function that returns a struct. It takes the values of the fields from an iterator, those of
+nested structs included."""
 
 Limit = tuple[float, float]
-"""Least and greatest value of a number."""
+"""Least and greatest value of a number, in the number's unit."""
 
 
 def struct_info(cls: Any) -> inspect.StructType:
@@ -41,7 +43,10 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 
 
 def builder(info: inspect.StructType) -> Build:
-    """Return a function that builds this struct from the values of its leaves."""
+    """Return a function that builds this struct from the values of its fields.
+
+    The values of the fields of nested structs stand in the place of the nested struct.
+    """
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
     return lambda values: info.cls(*[child(values) for child in children])

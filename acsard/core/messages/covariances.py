@@ -2,8 +2,8 @@
 
 A matrix is row major, and its axes are x, y, z, roll, pitch and yaw. Wheels do not measure z, roll
 and pitch. These axes get the configured variances, limited to a range that RViz can draw and a
-filter can invert. With `odometry.covariance = "constant"` both matrices are the configured
-diagonals without a limit.
+filter can invert. With `odometry.covariance = "constant"`, the matrices of pose and twist are the
+configured diagonals without this limit.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from acsard.core.config.settings import Diagonal, OdometryConfig
 from acsard.core.values import PoseCovariance, TwistVariances
 
 SMALLEST, LARGEST = 1e-6, 1e6
-"""Smallest and largest variance of an axis that is not measured, m2 or rad2."""
+"""Smallest and largest variance of an axis that is not measured: m2 or rad2 for a pose, m2/s2 or
+rad2/s2 for a twist."""
 
 UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
-"""Covariance of a twist that is not measured on any axis, m2/s2 and rad2/s2."""
+"""Covariance of a twist of which nothing is measured: 6x6, row major, m2/s2 and rad2/s2."""
 
 
 class Covariances:
@@ -29,7 +30,7 @@ class Covariances:
         self._unmeasured_rates = _bounded(self._twist)
 
     def of_pose(self, p: PoseCovariance) -> list[float]:
-        """Return the covariance of the pose in the frame odom, m2, m rad and rad2.
+        """Return the 6x6 covariance of the pose in the frame odom, row major, m2, m rad and rad2.
 
         Roll, pitch and yaw are rotations about axes through the robot that are parallel to the axes
         of odom.
@@ -49,7 +50,7 @@ class Covariances:
         # fmt: on
 
     def of_twist(self, v: TwistVariances) -> list[float]:
-        """Return the covariance of the twist in the frame of the base, m2/s2 and rad2/s2."""
+        """Return the 6x6 covariance of the twist in the frame base_link, m2/s2 and rad2/s2."""
         if self._constant:
             return _diagonal(*self._twist)
         return _diagonal(v.linear, v.lateral, *self._unmeasured_rates, v.angular)

@@ -1,4 +1,6 @@
-"""Converts `Outputs` and `Snapshot` to the rows of `diagnostics`, which rqt_robot_monitor shows.
+"""Makes the rows of the message `diagnostics`, which rqt_robot_monitor shows.
+
+The rows come from the outputs of the last step (`Outputs`) and the robot's state (`Snapshot`).
 
 The levels have these meanings:
 
@@ -42,7 +44,8 @@ from acsard.core.values import (
 OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
-"""Levels of the modes in which the robot waits for a person to clear a latch."""
+"""Diagnostic level of the modes in which the robot waits for a person to clear a latch. The other
+modes have the level OK."""
 
 BOARD = {
     "": (OK, "no emergency-stop input"),
@@ -50,13 +53,13 @@ BOARD = {
     "pressed": (WARN, PRESSED),
     "silent": (ERROR, SILENT),
 }
-"""Level and text of each state of the emergency-stop input."""
+"""Diagnostic level and text of each state of the emergency-stop input."""
 
 OF_LEVEL = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
-"""Level of the row for each level of the battery."""
+"""Diagnostic level for each level of the battery."""
 
 REFUSED_S = 2.0
-"""Time for which a refused command is shown, s: two messages at the default rate of 1 Hz."""
+"""Time for which `diagnostics` shows a refused command, s: two messages at the default 1 Hz."""
 
 MISSED_SHARE = 0.01
 """Fraction of the control periods of the last minute that may be missed without a warning."""
@@ -65,7 +68,7 @@ NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
 
 class Row(Struct, frozen=True):
-    """A row of `diagnostics` without the name of the robot."""
+    """A row of `diagnostics`: one part of the robot, its level, and details as text by name."""
 
     name: str
     level: int
@@ -130,7 +133,7 @@ def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
     level, message = OK if outputs.link == "up" else ERROR, outputs.link
     if mcu.simulated:
-        level, message = max(level, WARN), f"{message}: the simulator; no real wheel turns"
+        level, message = max(level, WARN), f"{message}: this is the simulator, no real wheel turns"
     return Row("serial link", level, message, values | _counted(snapshot.counters, "line"))
 
 
@@ -180,8 +183,8 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
         "front_more_left": f"{left:.3f}",
         "front_more_right": f"{right:.3f}",
     }
-    trouble = doubt.text or (doubt.slow and f"slower than commanded: {values['slow']}")
-    level, message = WARN if trouble else OK, trouble or "front and rear agree"
+    trouble = doubt.text or (doubt.slow and f"wheels slower than commanded: {values['slow']}")
+    level, message = WARN if trouble else OK, trouble or "front and rear wheels agree"
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
     return Row("wheels", level, message, values)
 

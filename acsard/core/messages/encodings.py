@@ -1,9 +1,13 @@
 """Encodes and decodes messages in msgpack, JSON and CDR.
 
 The encoding of an incoming payload is the one that its Zenoh Encoding names. If the Zenoh Encoding
-names none of the three, the first bytes of the payload decide: `{`, also after white space, means
-JSON, the header of a map means msgpack, and `00 00` or `00 01` means CDR. Decoding raises
-`DecodeError` and no other exception.
+names none of the three, the first bytes of the payload decide:
+
+- JSON: `{`, also after white space
+- msgpack: the header of a map
+- CDR: `00 00` or `00 01`
+
+Decoding raises `DecodeError` and no other exception.
 """
 
 from __future__ import annotations
@@ -32,7 +36,10 @@ _text = msgspec.json.Encoder()
 
 
 class DecodeError(AcsardError):
-    """A payload that cannot be used. `reason` is the last part of the name of its counter."""
+    """Error for a payload that cannot be decoded.
+
+    `reason` is the last part of the name of the counter in which such payloads are counted.
+    """
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -70,7 +77,7 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """Return the encoding of a payload. Raises `DecodeError` if it is unknown.
+    """Return the encoding of a payload. Raises `DecodeError` if the encoding is unknown.
 
     `encoding` is the Zenoh Encoding of the payload.
     """
@@ -86,7 +93,7 @@ def detect(encoding: str, payload: bytes) -> Format:
         return "cdr"
     raise DecodeError(
         "unknown_encoding",
-        f"neither a JSON object, a msgpack map nor CDR: {payload[:16]!r}",
+        f"the payload is not a JSON object, a msgpack map or CDR: {payload[:16]!r}",
     )
 
 
@@ -119,7 +126,7 @@ class Decoder(Generic[T]):
 
 
 def _where(words: str, payload: bytes) -> str:
-    """Return the text of a JSON error with line and column in place of the byte offset."""
+    """Return the text of a JSON error with the line and the column in place of the byte offset."""
     match = _AT_BYTE.fullmatch(words)
     if match is None:
         return words

@@ -1,4 +1,4 @@
-"""Describes the validity of the bus's TLS certificates, for `state`, `diagnostics` and `doctor`."""
+"""Describes how long the TLS certificates are valid, for `state`, `diagnostics` and `doctor`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S
 
 EXPIRY_DAYS = 30
-"""Number of days of validity below which a certificate is a warning."""
+"""Number of remaining days below which the end of a certificate is a warning."""
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -30,7 +30,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
             "certificates is missing (`acsard doctor` says which)",
         )
     whose, ends_ns = first(ends)
-    of = f" (that of {whose})" if whose else ""
+    of = f" (certificate of {whose})" if whose else ""
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
         return 2, f"expired {-days:.0f} days ago{of}: TLS refuses every client"
@@ -40,9 +40,9 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 
 
 def first(ends: Mapping[str, int]) -> tuple[str, int]:
-    """Return the owner and the end of the certificate that ends first.
+    """Return the owner and the end (wall-clock ns since 1970) of the certificate that ends first.
 
-    If two certificates end at the same time, the one with a name is returned. The reason is that
-    the TLS gateway reports the ends of all its certificates as one number without a name.
+    The TLS gateway reports the first end of all certificates under the name "". If a certificate
+    with an owner's name has the same end, return that name.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

@@ -3,7 +3,7 @@
 A message that the daemon publishes has all its fields, and a later version may add more. Its schema
 therefore requires all fields and allows others. A message that the daemon receives may omit fields
 with a default, and unknown fields are refused. A type that is used in both directions has two
-schemas: its own name for publishing, and the name with `In` appended for receiving.
+schemas: `Imu` for publishing, and `ImuIn` for receiving.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ ENOUGH: dict[type, list[str]] = {
     Imu: ["angular_velocity"],
     SpeedLimit: ["speed_limit"],
 }
-"""Required fields of some received types. Other types require each field without a default."""
+"""Required fields of some received types. In other types, each field without a default is
+required."""
 
 Schema = dict[str, Any]
 

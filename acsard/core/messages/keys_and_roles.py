@@ -43,11 +43,12 @@ class Topic(Struct, frozen=True):
     note: str
     """Meaning of the message."""
     publish: Role | None = None
-    """Least role that may put on the key. None means that no client may put on it."""
+    """Lowest role that may put on the key. None means that no client may put on it."""
     subscribe: Role | None = None
-    """Least role that may subscribe to the key. None means that no client may subscribe to it."""
+    """Lowest role that may subscribe to the key. None means that no client may subscribe."""
     query: Role | Literal["<role>"] | None = None
-    """Least role that may query the key. `<role>` means the role that the key ends with."""
+    """Lowest role that may query the key. `<role>` means the role that the key ends with. None
+    means that no client may query it."""
     local: bool = False
     """True for a key that only programs on the robot's own machine may use."""
     latched: bool = False
@@ -69,7 +70,7 @@ class Service(NamedTuple):
     """One row of the table of services."""
 
     least: Role
-    """Least role that may call the service. Every client may stop the robot."""
+    """Lowest role that may call the service."""
     note: str
     """Effect of the service."""
     payload: str = ""
@@ -91,7 +92,7 @@ SERVICES: dict[Verb, Service] = {
     ),
     "activate": Service(
         "operator",
-        "switch on, so that commands count; the payload {latch} names the latch",
+        "switch on, so that commands have an effect; the payload {latch} names the latch",
         "Release",
         '{"latch": 1800000000000}',
         optional=True,
@@ -122,7 +123,7 @@ IMU = "imu"
 """Key on which a gyro's samples arrive. The simulator publishes those of its own gyro on it."""
 
 SPEED_LIMIT = "speed_limit"
-"""Key on which a speed filter lowers the robot's highest speed."""
+"""Key on which a client, such as Nav2's speed filter, lowers the robot's highest speed."""
 
 DESCRIPTION = "robot_description"
 """Key of the robot's URDF."""
@@ -149,7 +150,7 @@ JSON_TREE = "json/"
 
 
 def json_key(key: str) -> str:
-    """Return the key on which the messages of a published key also appear as JSON."""
+    """Return the key on which the daemon also publishes the messages of `key`, as JSON."""
     return JSON_TREE + key
 
 
@@ -215,12 +216,12 @@ TOPICS: tuple[Topic, ...] = (
     # A gyro changes the pose, as set_pose does, so it needs the same role. Clients may subscribe to
     # the gyro of the simulator and query it.
     Topic(
-        IMU, "in", "Imu", "any", "turn rate from a gyro, with [odometry] gyro",
+        IMU, "in", "Imu", "any", "turn rate of a gyro; used if `[odometry] gyro = true`",
         publish="maintainer", subscribe="viewer", query="viewer", gyro=True,
     ),
     Topic(
         SPEED_LIMIT, "in", "SpeedLimit", "10 Hz",
-        "lowers the highest speed, m/s or %; 0 lifts it", publish="operator",
+        "lowers the highest speed, m/s or %; 0 ends the limit", publish="operator",
     ),
     Topic(
         "stop", "in", "anything", "any", "any PUT stops the robot like srv/stop", publish="viewer",
@@ -244,14 +245,15 @@ TOPICS: tuple[Topic, ...] = (
 FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
-"""The rows of keys that clients can follow: the published keys and the simulator's gyro."""
+"""The rows of keys that clients can follow: the published keys and the key of the gyro."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The rows of keys on which the daemon publishes. A query gets the last message."""
+"""The rows of keys on which the daemon publishes. A query of such a key returns the last
+message."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the table whose keys exist with this configuration."""
+    """Return the rows of the table of keys whose keys exist with this configuration."""
     simulated, gyro, urdf = config.mcu.simulated, config.odometry.gyro, bool(config.ros.urdf)
     return tuple(
         topic
@@ -265,7 +267,7 @@ def offered(config: Config) -> tuple[Topic, ...]:
 def published(config: Config) -> tuple[Topic, ...]:
     """Return the rows of the keys on which a daemon with this configuration publishes.
 
-    The simulator also publishes its gyro.
+    With the simulator, this includes the key of the gyro.
     """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
@@ -281,7 +283,7 @@ COMMANDS = ("cmd", "wheel_cmd")
 
 
 def command_key(kind: str, source: str, certificate: str = "") -> str:
-    """Return the key on which a sender puts commands as a source.
+    """Return the key, below the robot's id, on which a sender puts the commands of a source.
 
     Over TLS each certificate has its own key. The access rules let no other certificate put on it.
 
@@ -312,13 +314,13 @@ def unknown(key: str) -> bool:
 
 
 def key_hint(key: str) -> str:
-    """Return a question with the most similar key of the table, or the advice to list the keys."""
+    """Return a hint for an unknown key: the most similar key, or the advice to list the keys."""
     known = [topic.key for topic in TOPICS if "<" not in topic.key]
     return hint(key, known, "`acsard topics` lists the keys")
 
 
 def by_key(key: str) -> Topic | None:
-    """Return the row with exactly this key, or None. Placeholders match only themselves."""
+    """Return the row whose key is exactly `key`, placeholders included, or None."""
     return next((topic for topic in TOPICS if topic.key == key), None)
 
 

@@ -1,6 +1,6 @@
-"""Formats the pose and the motion of the robot in one line for a person.
+"""Formats messages such as the pose and the motion of the robot in one line for a person.
 
-Covariances, stamps and frames are left out. Programs read them from the JSON.
+Covariances, stamps and frames are left out. Programs read them from the message in JSON.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from acsard.core.messages.state_warnings import brief, charge, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
-    """Return a pose as text with units. The arguments are in m and rad, the text in degrees."""
+    """Return a pose as text with units. `yaw` is in rad, and in degrees in the text."""
     return [
         f"x {signed(x, 3, 8)} m",
         f"y {signed(y, 3, 8)} m",
@@ -55,7 +55,7 @@ def _state(state: RobotState) -> list[str]:
 
 
 def power(battery: BatterySummary) -> list[str]:
-    """Return voltage, current and charge of a battery, each with its unit, "-" if unknown."""
+    """Return voltage, current and charge of a battery as text with units, "-" if unknown."""
     return [
         f"{signed(battery.volts, 2, 6).strip().removeprefix('+')} V",
         f"{signed(battery.amps, 2, 7).strip()} A",

@@ -1,7 +1,7 @@
 """Derives the permissions of each role from the table of keys in `keys_and_roles.py`.
 
-These functions make the access rules of the daemon and of the TLS gateway, the rules of a fleet's
-router, the permissions of the page, and the tables of roles in the documentation.
+The access rules of the daemon, of the TLS gateway and of a fleet's router, the permissions of the
+page, and the tables of roles in the documentation come from these functions.
 """
 
 from __future__ import annotations
@@ -19,30 +19,33 @@ Use = Literal["publish", "subscribe", "query"]
 USES: tuple[Use, ...] = get_args(Use)
 
 MAY: dict[Role, str] = {
-    "viewer": "it may follow and stop, not drive",
-    "operator": "it may drive by the listed sources, stop and clear",
-    "maintainer": "it has every permission",
+    "viewer": "this role may read data and stop the robot, but not drive it",
+    "operator": "this role may drive by the sources in commands.sources, stop and clear",
+    "maintainer": "this role has every permission",
 }
-"""The permissions of each role in words, for the error message of a tool without permission."""
+"""The permissions of each role in words, for the error message of a tool that lacks one."""
 
 
 def has(role: str, least: Role) -> bool:
-    """Return whether `role` includes the role `least`. A client without a role has the role ""."""
+    """Return whether `role` has the permissions of the role `least`.
+
+    A client without a role has the role "", which has no permissions.
+    """
     return role in ROLES and ROLES.index(role) >= ROLES.index(least)
 
 
 def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
-    """Return the keys of `rows` for which `role` is the least role that has the permission `use`.
+    """Return the keys of `rows` for which `role` is the lowest role with the permission `use`.
 
-    Keys of commands are left out, because they contain names of the configuration. `source_keys`
-    returns these keys, and `COMMAND_ROLE` is their least role.
+    The keys of commands are left out, because they contain names from the configuration.
+    `source_keys` returns the keys of commands, and `COMMAND_ROLE` is their lowest role.
     """
     exact = (pair for row in rows if not row.local for pair in _exact(row, use))
     return [key for key, least in exact if least == role and "<" not in key]
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield each key that a row stands for, with the least role that has the permission `use`."""
+    """Yield each key that a row stands for, with the lowest role that has the permission `use`."""
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":
         yield from ((row.key.replace("<role>", role), role) for role in ROLES)
@@ -56,11 +59,11 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 
 
 def least_role(key: str) -> Role:
-    """Return the least role that may use `key`, the part of the full key after the robot's id.
+    """Return the lowest role that may use `key`, the part of the full key after the robot's id.
 
-    To use a key means to put on it if the daemon receives on it, to query it if the daemon answers,
-    and otherwise to subscribe to it. For an unknown key the function returns the lowest role. That
-    result grants no permission: it is for the hint to a client that has received nothing.
+    To use a key means to put on it if clients may do that, else to query it, else to subscribe to
+    it. For an unknown key, return the lowest role. This grants no permission: callers use the
+    result for a hint to a client that has received nothing.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

@@ -1,9 +1,10 @@
 """Keeps the last events for the topic `events`.
 
-An event that repeats is one row with a count. If each repetition had its own row, a computer that
+Events that repeat are one row with a count. If each repetition had its own row, a computer that
 misses a control period every second would push a fault out of the twenty rows within 20 s. An event
-whose `news` is true always gets its own row. The log, in contrast, has a line for each event that
-is added here.
+whose `news` is true always gets its own row.
+
+The log has a line for each event that is added here.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ LAST = 20
 """Number of rows that are kept, so that a client that polls slowly seldom misses an event."""
 
 PAUSE_NS = 60 * NS_PER_S
-"""Time without a repetition after which an event of the same name gets a new row."""
+"""Time after which the next event of the same name gets a new row and does not count as a
+repetition, ns."""
 
 
 class _Row(Struct, frozen=True):

@@ -82,18 +82,19 @@ class _Rate:
 
 
 class Report:
-    """Builds messages. It keeps only the last outputs, the last estimate and the last events."""
+    """Builder of messages. It keeps only the last outputs, estimate and events."""
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
     ) -> None:
         self.certificate_ends = dict(certificate_ends or {})
-        """End of each TLS certificate, in the form of the argument `ends` of `expiry`.
+        """End of each TLS certificate, wall-clock ns since 1970, by the name of its owner.
 
-        If the daemon may not read the robot's own certificate, the TLS gateway reports its end.
+        The robot's own certificate has the name "". If the daemon may not read that certificate,
+        the TLS gateway reports its end.
         """
         self.settings_differ = ""
-        """How the settings in force differ from the configuration file, in words; "" if equal."""
+        """Settings in force that differ from the configuration file, in words; "" if none does."""
         self.speed_limit = ""
         """The speed limit that lowers a setting, in words; "" if none does."""
         self.description = ""
@@ -106,7 +107,6 @@ class Report:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use this configuration from now on."""
         self._config = config
         rates = asdict(config.rates) | {"battery": BATTERY_HZ}
         self._rates = {key: _Rate(hz) for key, hz in rates.items()}
@@ -117,7 +117,8 @@ class Report:
     ) -> Iterator[tuple[str, Message]]:
         """Return an iterator over the pairs of key and message to publish after this step.
 
-        The messages of feedback come first, because `state` takes ten times as long to build.
+        The messages of the feedback (`odom`, `tf`, `wheel_states`) come first, because `state`
+        takes ten times as long to build.
 
         Args:
             outputs: the outputs of the step.
@@ -303,7 +304,7 @@ class Report:
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
         """Return the battery message, or None if the board has never reported a battery.
 
-        Its stamp is the time of the board's last report.
+        The stamp is the time of the board's last report, or of the step if the reports have ended.
         """
         battery, now = snapshot.battery, outputs.now
         if battery is None:

@@ -1,8 +1,8 @@
 """The types of the messages on the bus, with the unit of each field.
 
 A type has the name and the fields of its ROS 2 counterpart if there is one. A field means the same
-in msgpack, JSON and CDR. Unknown fields are refused: a command with a misspelt axis is an error,
-and not a command to stand still.
+in msgpack, JSON and CDR. Unknown fields are refused, so a command with a misspelt axis is an error.
+If the field were ignored, the command would mean zero speed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
-"""Maximum length of a list. A longer one is refused quickly, and no robot has as many joints."""
+"""Limit of 64 items for a list or a map, so that a huge one is refused quickly. No robot has as
+many joints."""
 
 
 def one_of(values: Iterable[object]) -> Meta:
@@ -299,7 +300,7 @@ class RobotState(Message, frozen=True):
     linear: float | None
     angular: float | None
     wheels: list[float]
-    """Measured speeds in the order front right, front left, rear left, rear right."""
+    """Measured speeds, rad/s, in the order front right, front left, rear left, rear right."""
     link: Annotated[str, one_of(get_args(State))]
     source: str
     sources: list[SourceState]
@@ -389,7 +390,7 @@ class GatewayState(Message, frozen=True):
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
     """Number of checks that found all connections in use. There are four checks a second."""
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
-    """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
+    """End of the certificate, ns since 1970; 0 if the library to read it is missing."""
 
 
 class String(Message, frozen=True):
@@ -568,4 +569,5 @@ MESSAGES: dict[str, type[Message]] = {
         WhoAmI,
     )
 }
-"""The types that are messages of their own, by name. The key `schema/<Type>` answers for them."""
+"""The types that are whole messages and not only parts of one, by name. A query of the key
+`schema/<Type>` returns the schema of each."""

@@ -1,12 +1,12 @@
-"""Decodes the attachment of a command or a service call, which names the program that sends it.
+"""Decodes the attachment of a command or a service call. It names the program that sends it.
 
 An attachment is a map in JSON or msgpack:
 
     {"sender": "joystick/8Xg2kq0vRw-1yEJc7hPzUA", "stamp": 1795154884365624370, "sequence": 12}
 
-The sender id is `NAME/SECRET`. Only the program and the daemon know it, so it proves which program
-sends. The daemon publishes the `public_name` of the sender, from which nobody can compute the id.
-An attachment of any other form is ignored.
+The sender id is `NAME/SECRET`. Only the program and the daemon know the id, so it proves which
+program sends. The daemon publishes only the `public_name` of the sender, from which nobody can
+compute the id. An attachment of any other form is ignored.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ MAX_SENDER = 64
 """Largest number of characters in a sender id."""
 
 MAX_NAME = 40
-"""Largest number of characters of the name in a public name. The rest of an id is the secret."""
+"""Largest number of characters that a public name takes from the name in a sender id."""
 
 DIGITS = 16
-"""Number of hexadecimal digits of the hash in a public name.
+"""Number of hexadecimal digits of the hash in a public name: 64 bits.
 
-Nobody can find a second id with the same 64 bits.
+With so many bits, nobody can find another sender id with the same hash.
 """
 
 MARKS = " @._-:/+"
-"""Characters besides letters and digits that a public name may contain.
+"""Characters besides letters and digits that a public name may contain. Others become "?".
 
-The daemon's texts use other characters to separate a name from the words beside it.
+So a name cannot contain the characters that separate it from other words in the daemon's texts.
 """
 
 
@@ -51,7 +51,7 @@ class Signature(Struct, frozen=True, omit_defaults=True):
     steady: bool = False
     """True if the clock of `stamp` is never adjusted while the sender runs.
 
-    A late stamp then means that the command itself is late.
+    If such a stamp is old, the command itself is late.
     """
 
     def pack(self) -> bytes:
@@ -64,7 +64,7 @@ _msgpack = msgspec.msgpack.Decoder(Signature)
 
 
 def unpack(attachment: bytes) -> Signature | None:
-    """Return the decoded attachment, or None if it has another form."""
+    """Return the decoded attachment, or None if it is not a valid signature."""
     if not attachment:
         return None
     try:

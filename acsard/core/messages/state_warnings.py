@@ -1,8 +1,8 @@
-"""Lists the warnings about a robot, such as a low battery. A robot may have them while `ready`.
+"""Lists the warnings about a robot, such as a low battery.
 
-If nobody reacts to a warning, it may end the robot's work hours or weeks later. `fleet`, `top`,
-`echo --short`, the page and `/metrics` show the warnings with the same words. Programs find the
-same facts in `state`.
+A robot in the mode `ready` may have warnings, too. If nobody reacts to a warning, its cause may end
+the robot's work hours or weeks later. `acsard fleet`, `top` and `echo --short`, the page and
+`/metrics` show the warnings in the same words. Programs find the same facts in `state`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ WHATS: tuple[What, ...] = get_args(What)
 """Every subject of a warning; the most urgent one is the first."""
 
 WARNING = "WARNING"
-"""The word in front of the warnings in a line of text."""
+"""The word in front of the warnings if they are part of a line of text."""
 
-ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop silent"}
+ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop not reported"}
 
 BATTERY = {
     "warning": "battery low",
@@ -38,7 +38,7 @@ BATTERY = {
 
 
 class StateWarning(Struct, frozen=True):
-    """One warning."""
+    """A warning about a robot. `what` is its subject."""
 
     what: What
     brief: str

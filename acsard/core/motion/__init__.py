@@ -1,1 +1,1 @@
-"""The motion of the base, without I/O: kinematics, odometry, choice of command, limits, modes."""
+"""Odometry, choice of the command, limits, modes and safety inputs of the robot, without I/O."""

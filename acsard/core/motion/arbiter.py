@@ -8,9 +8,8 @@ live while one of its senders is.
   of one source.
 - A live source that is not armed yet (`neutral.py`) keeps its priority, and the robot stands still.
   Otherwise a source of lower priority would drive the robot in its place.
-- A source that sends zeros holds the robot still for any length of time, because an operator who
-  wants that and a controller that has failed look the same. `state` and the log report such a
-  source.
+- A source that sends zeros holds the robot still for any length of time. An operator who wants that
+  and a controller that has failed look the same. `state` and the log report such a source.
 
 `Objection` lists a short name for each reason to refuse a command, and `arbiter_text.py` contains
 the sentences for people. `values.Command` explains source, sender and clock.
@@ -36,8 +35,8 @@ Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unp
 """The reason to refuse a command, or "" if the arbiter accepts it."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""Durations, s. When one of them is over, `state` reports that a sender has sent only zeros, or has
-not been armed, for at least this long."""
+"""Durations, s, that `state` reports: the time for which a sender has sent only zeros or has not
+been armed, rounded down to one of these values."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -97,7 +96,7 @@ class _Source:
         return added
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Return a rank that can be compared with the ranks of other senders.
+        """Return the rank of a sender. `add` replaces the sender with the lowest rank.
 
         A sender that is armed and live ranks highest. A sender that is only armed comes next, and
         then all others. Among equals, the sender with the later last message ranks higher.
@@ -107,10 +106,10 @@ class _Source:
         return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """Disarm the sender `name` if the zero that armed it came from a clock not proven yet.
+        """Disarm the sender `name` if it was armed by a zero whose stamp was never proven right.
 
-        `was_set` means that the clock of the sender was set. Then the sender must send a new zero
-        in any case.
+        If `was_set` is true, the sender's clock was set. The sender must then send a new zero in
+        any case.
         """
         sender = self.senders.get(name)
         if sender is None:
@@ -121,16 +120,20 @@ class _Source:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """Return the live senders: armed ones before others, and among equals the first to come."""
+        """Return the senders whose last command is not older than the timeout.
+
+        Armed senders come before others. Among equals, the one that began to send first comes
+        first.
+        """
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live
         return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
 
     def latest_ns(self) -> int | None:
-        """Return the monotonic arrival, ns, of the last command of any sender that counted.
+        """Return the monotonic time at which the source's last accepted command arrived, ns.
 
-        Return None if no command has counted since `require_neutral`.
+        Return None if no command has been accepted since `require_neutral`.
         """
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
@@ -141,16 +144,19 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the wait of a sender that is not armed.
+        """Return the `Wait` of a sender that must send a zero first.
 
-        `lasts` is the time for which the sender has sent speeds, s, or 0.0 if that is not reported
-        yet.
+        `lasts` is the time for which the sender has sent speeds, s, or 0.0 while that time is too
+        short to report.
         """
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why this source waits if stamps of its senders do not count, otherwise None."""
+        """Return why the source waits although it sends: the stamps of its commands do not count.
+
+        Return None if no recent command was refused because of its stamp.
+        """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
@@ -222,10 +228,10 @@ class Arbiter:
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
-        """Record that a message arrived that could not be decoded or was lost.
+        """Record a message that was lost or could not be used, but that may have been a speed.
 
-        The message may have been a speed, so an earlier zero of its sender no longer arms this
-        sender. `sender` is "" if the sender is unknown. The message may then come from any sender
+        A zero before the message, whose `commands.neutral_pause` is not over yet, then no longer
+        arms its sender. `sender` is "" if it is unknown. The message may then come from any sender
         of `source`.
         """
         known = self._sources.get(source)
@@ -238,7 +244,7 @@ class Arbiter:
             known.senders[sender].notice(arrived_ns)
 
     def choose(self, now_ns: int) -> Choice:
-        """Return the command that the robot follows now."""
+        """Return the command that the robot follows now, or the reason why it follows none."""
         first: tuple[_Source, Sender] | None = None
         kept = self._followed
         for source in self._ranking:
@@ -276,7 +282,7 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return whose speeds have no effect because the source `holder` sends zeros.
+        """Return which sender's speeds have no effect because the source `holder` sends zeros.
 
         The result is the name of another source, or words for another sender of `holder`. It is ""
         if no other sender sends speeds.
@@ -289,7 +295,10 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum, ns, of the rises of foreign clocks' delays that no visible adjustment explains."""
+        """Sum of the rises of command delays that count as clocks that were set, ns.
+
+        It contains only rises without a visible adjustment of the sender's clock (`freshness.py`).
+        """
         return self._freshness.forgiven_ns
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
@@ -313,7 +322,7 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """Return the largest value of `LASTING_S`, s, that a duration of `ns` has reached, or 0.0."""
+    """Return a duration of `ns` rounded down to a value of `LASTING_S`, s; 0.0 if it is shorter."""
     if ns < LASTING_S[0] * NS_PER_S:
-        return 0.0  # as in nearly every step
+        return 0.0  # Nearly every step ends here.
     return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)

@@ -1,4 +1,4 @@
-"""Sentences and events about modes, commanders and commands.
+"""Creates sentences and events about modes, commands and the senders that drive the robot.
 
 The sentences go into `state`, `diagnostics` and the log. `event_throttle.py` decides how often an
 event becomes a line of the log.
@@ -13,10 +13,11 @@ from acsard.core.values import Event, Refusal, Wait
 
 REFUSED = {
     "unknown_source": "not one of commands.sources",
-    "not_finite": "NaN or infinity",
-    "too_many_senders": f"{MAX_SENDERS} other senders of this source are active",
-    "unproven": "a new sender counts once its delays have proved steady; this is not an error",
-    "stale": "older than the source's timeout allows, or older than a command that was "
+    "not_finite": "the command contains NaN or infinity",
+    "too_many_senders": f"{MAX_SENDERS} other senders of this source are active; end one first",
+    "unproven": "the robot follows a new sender when its commands have arrived with steady "
+    "delays; this is not an error",
+    "stale": "the command is older than the source's timeout allows, or older than one that was "
     "accepted: the network delayed it, or the sender's clock was set",
 }
 """The words for each reason to refuse a command."""
@@ -27,20 +28,20 @@ characters, or 67 with a certificate. A sender without an attachment is named af
 the sender may choose."""
 
 ROS_NEVER = (
-    ' (`ros2 topic pub` of a speed never sends one; "After a clear" in deploy/ros2/README.md '
+    ' (`ros2 topic pub` of a speed never sends a zero; "After a clear" in deploy/ros2/README.md '
     "lists tools that do)"
 )
 
 
 def chosen(choice: Choice) -> str:
-    """Return words that say which source the robot follows, or why it follows none."""
+    """Return words that name the source that drives the robot, or the reason why none does."""
     if choice.wait.what == "command":
         return "waiting for a command: no source has sent one within its timeout"
     return waiting(choice.wait) or f"commanded by {choice.source}"
 
 
 def waiting(wait: Wait) -> str:
-    """Return a sentence that says what a source waits for, "" if it waits for nothing."""
+    """Return a sentence with the condition that a source waits for, "" if it need not wait."""
     match wait.what:
         case "nothing":
             return ""
@@ -48,8 +49,8 @@ def waiting(wait: Wait) -> str:
             return "a command"
         case "proof":
             return (
-                f"{wait.source} is new: it drives once its delays have been steady for "
-                f"{wait.seconds:g} s"
+                f"{wait.source} is new: the robot follows it when its commands have arrived with "
+                f"steady delays for {wait.seconds:g} s"
             )
         case "late":
             return (
@@ -67,23 +68,29 @@ def waiting(wait: Wait) -> str:
         case "zeros":
             kept = f"; {wait.kept} sends speeds and must wait" if wait.kept else ""
             zeros = f"only zeros for over {lasting(wait.lasts)}"
-            return f"held by {wait.source}, which sends {zeros}{kept}"
+            return f"held by {wait.source}, which has sent {zeros}{kept}"
         case "higher":
             return f"{wait.source} has priority: wait until it is silent"
         case "equal":
             return f"{wait.source} has the same priority and came first: wait until it is silent"
         case "senders":
-            return f"{wait.senders} more of its senders: wait until the first one is silent"
+            return (
+                f"{wait.senders} more of this source's senders must wait until the first one is "
+                "silent"
+            )
 
 
 def missed(periods: int) -> Event:
     """Return the event for `periods` control periods that ended without a step."""
-    text = f"{periods} in a row"
+    text = f"{periods} control periods in a row"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 
 def refused(refusal: Refusal) -> Event:
-    """Return the event for a command that was refused, or that came from a clock not proven yet."""
+    """Return the event for a refused command.
+
+    A command of a new sender, whose delays are not proved steady yet, has an event of its own.
+    """
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
@@ -91,23 +98,24 @@ def refused(refusal: Refusal) -> Event:
 
 
 class CommandEvents:
-    """Creates the events for changes of the mode and of the commander."""
+    """Creates the events for changes of the mode, and of the source and sender that drive."""
 
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""
-        """The source for which the log last reported speeds without effect; "" without one."""
+        """The source whose speeds have no effect, as last reported in the log; "" without one."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
-        """Return the events for changes of the mode and of the commander.
+        """Return the events for changes since the last call.
 
-        The commander is the source and its sender. It is compared with the last one that drove the
-        robot, even if that was long ago.
+        The events report a new mode, a new commander (the source and sender that drive the robot),
+        and speeds without effect. A new commander differs from the last one that drove the robot,
+        even if that was long ago.
 
         Args:
             mode: The present mode.
             choice: The present choice of the arbiter.
-            why: The reason of the mode.
+            why: The reason of the mode, in words.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:
@@ -122,7 +130,10 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return one event when the speeds of a source have had no effect for a while."""
+        """Return an event if the speeds of a source have had no effect for a while.
+
+        Each source is reported once, until its speeds have an effect or another one is reported.
+        """
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

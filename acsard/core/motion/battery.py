@@ -1,8 +1,9 @@
 """Follows the battery that the board reports, and decides when it stops the robot.
 
 The thresholds in `[battery]` are compared with a mean over time, because the current of starting
-motors makes the voltage drop for some tenths of a second. `lifecycle.py` keeps the latch of a stop.
-Nothing releases this latch until the mean has risen above the threshold by `battery.hysteresis`.
+motors makes the voltage drop for some tenths of a second. An empty battery latches a stop, which
+`lifecycle.py` keeps. The call `clear` does not release the stop until the mean has risen above the
+threshold by `battery.hysteresis`.
 
 If a board no longer reports its battery, the robot does not stop: a robot that stands still in the
 way is the greater danger, and the voltage falls slowly. The level is then "unknown".
@@ -37,10 +38,10 @@ much after a gap, or if reports are rare. If a board reports once a second, its 
 about three times as slow."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
-"""The levels of a known battery, the best first."""
+"""The battery levels without "unknown", from the best to the worst."""
 
 MISSING = "the board has not reported its battery, but [battery] has thresholds"
-"""The sentence for a battery that has thresholds but is never reported."""
+"""The message if `[battery]` has thresholds and the board has never reported its battery."""
 
 SILENT = f"the board has not reported its battery for {SILENT_S:g} s"
 
@@ -72,13 +73,14 @@ def _with_unit(config: BatteryConfig, value: float) -> str:
 
 
 class Battery:
-    """The battery of one robot."""
+    """The values of the battery that the board reports, and the level that follows from them."""
 
     def __init__(self, config: BatteryConfig) -> None:
         self._config = config
         self._bounds = config.bounds
         self.status: BatteryStatus | None = None
-        """The battery, None if the board has never reported its voltage or its charge."""
+        """The values and the level of the battery; None if the board has never reported its voltage
+        or its charge."""
         self.stopped_now = False
         """Whether the level fell to "stop" in the last `look`."""
         self._values: dict[str, tuple[float, int]] = {}
@@ -91,13 +93,14 @@ class Battery:
         """The level in the last event, None before the first one."""
         self._mean: float | None = None
         self._since_ns = self._mean_ns = 0
-        """Monotonic times, ns, of the first and of the last report since the last silence."""
+        """Monotonic times, ns, since the last silence: of the first report, and of the last report
+        in the mean."""
         self._stood_ns = 0
         """Sum of the weights of the reports in the mean since the last silence, ns."""
 
     @property
     def held(self) -> bool:
-        """Whether the battery keeps a stopped robot from being cleared."""
+        """Whether the call `clear` is refused, because the last known level is "stop"."""
         return self._known == "stop"
 
     @property
@@ -160,7 +163,10 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Return the level, or None while it is not known yet."""
+        """Update the level from the mean and return it, or None during the first `SETTLE_S`.
+
+        "unknown" means that the board does not report the quantity of the thresholds.
+        """
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None

@@ -7,8 +7,9 @@ straight away from it, at `AWAY_SPEED` or less. No turn is allowed until then, b
 the robot could sweep into the obstacle. A robot with four wheels cannot move sideways, so no motion
 leads away from a bumper at the left or the right.
 
-If a board has reported bumpers and no longer does, a stop is latched with either setting. Like the
-emergency-stop input, a bumper is not a safety function: the status line may be lost or late.
+If a board has reported bumpers and no longer does, a stop is latched with "stop" and with "away".
+Like the emergency-stop input, a bumper is not a safety function, because the status line may be
+lost or late.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ AWAY_SPEED = 0.1
 """Highest speed away from a pressed bumper, m/s."""
 
 DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
-"""Sign of the linear speeds that lead away from a bumper at each place; 0 if no speed does."""
+"""Sign of the linear speeds that lead away from a bumper at each place; 0 if no motion does."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
@@ -33,7 +34,7 @@ SILENT = f"the board reported no bumpers for {SILENT_S:g} s, which counts as pre
 
 
 def missing(safety: SafetyConfig) -> str:
-    """Return why a robot whose board has not reported its bumpers does not become ready."""
+    """Return why the robot is not ready: its board has not reported the configured bumpers."""
     count = len(safety.bumpers)
     return (
         f"safety.bumpers has {many(count, 'place')}, but the microcontroller has not reported "
@@ -58,7 +59,7 @@ def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
 
 
 class Bumpers(BoardInput):
-    """The state of all bumpers of one robot."""
+    """The state of all bumpers of one robot, and the motion that they allow."""
 
     # In contrast to `TABLE`, silence changes the state even while a bumper is pressed, because a
     # silent board cannot report the press of another bumper.
@@ -80,7 +81,8 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether a press latches a stop. Silence of the board always does."""
+        """Whether the bumpers latch a stop: for a press, unless `safety.bumper` is "away", and for
+        silence of the board always."""
         return not self._away or self.state == "silent"
 
     @property
@@ -103,15 +105,19 @@ class Bumpers(BoardInput):
         """Return a sentence with the pressed bumpers and the motion that they still allow."""
         allowed = ALLOWED.get(self._direction())
         if allowed is None:
-            return f"{self.why}: no motion leads away, so the robot stands until the release"
-        return f"{self.why}: only straight {allowed}, at most {AWAY_SPEED:g} m/s"
+            return (
+                f"{self.why}: no straight motion leads away from the pressed bumpers, so the robot "
+                "stands until they are released"
+            )
+        return f"{self.why}: the robot drives only straight {allowed}, at most {AWAY_SPEED:g} m/s"
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return whether each bumper is pressed according to a status line.
 
-        Return None if the line reports no bumpers, or the wrong number of them. The report of a
-        pressed bumper may be missing from such a line, so the line must not release any bumper.
-        If no places are configured and a bumper is pressed, the line may report any number.
+        Return None if the line reports no bumpers, or another number of them than configured (or,
+        without configured places, than before). Such a line may lack a bumper that is pressed, so
+        it must not release any bumper. If no places are configured and a bumper is pressed, any
+        number is accepted.
         """
         bumpers = status.bumpers
         if bumpers is None:
@@ -127,7 +133,7 @@ class Bumpers(BoardInput):
         return pressed_words(self._places, self.pressed or ())
 
     def advice(self) -> str:
-        """Return words for the log: what the robot or the operator can do after a press."""
+        """Return words for the log: how the robot may move, or what the operator must do."""
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:

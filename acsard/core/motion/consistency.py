@@ -5,8 +5,8 @@ odometry which wheels to believe, whether they slip, and by how much the robot t
 the gyro. It uses three modules:
 
 - `wheel_faults.py` compares the two wheels of each side with each other and with their command. It
-  ignores a wheel whose encoder is proved faulty. If the contradiction lasts, it reports a fault,
-  which stops the robot.
+  ignores a wheel whose encoder is faulty. If a contradiction lasts, it reports a fault, which stops
+  the robot.
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the believed wheels.
 - `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
   come out right): the configured one, or one learned from the comparison with a gyro.
@@ -29,7 +29,10 @@ from acsard.core.values import Event, GyroSample, GyroStatus
 
 
 class ConsistencyChecks:
-    """All checks of one robot. The caller calls `look` and then `learn` for each feedback line."""
+    """All consistency checks of one robot.
+
+    For each feedback line, the odometry calls `look`, updates the pose, and calls `learn`.
+    """
 
     def __init__(
         self,
@@ -38,7 +41,7 @@ class ConsistencyChecks:
         encoder_counts: int,
         feedback: FeedbackConfig,
     ) -> None:
-        """Start.
+        """Create the checks of one robot.
 
         Args:
             odometry: The table `[odometry]`, which says whether there is a gyro, and whether the
@@ -53,39 +56,39 @@ class ConsistencyChecks:
         multiplier = kinematics.multipliers[2]
         self._track = LearnedTrack(multiplier) if odometry.learned_track else None
         self._by_wheels = 0.0
-        """Turn of the robot in the last line according to the wheels, rad."""
+        """Turn of the robot during the last feedback line according to the wheels, rad."""
         self.turn: Turn | None = None
-        """Turn of the robot in the last line according to the gyro; None if the odometry must use
-        the wheels instead."""
+        """Turn of the robot during the last feedback line according to the gyro. None means that
+        the odometry must use the turn of the wheels."""
         self.on_trial = False
-        """Whether the wheels provided the turn of the last line, and the gyro will correct it when
-        the gyro is proven to work."""
+        """Whether the turn of the last feedback line came from the wheels only because the gyro is
+        not proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
         self.slips = False
         """Whether the wheels slip: they contradict each other or the gyro."""
         self.events: list[Event] = []
-        """Events of the last line, for the log."""
+        """Log events of the last feedback line."""
 
     @property
     def gyro_status(self) -> GyroStatus:
-        """The state of the gyro, and the use of the effective track that was learned from it."""
+        """The state of the gyro, and whether the odometry uses the track learned from the gyro."""
         status = GyroStatus() if self.gyro is None else self.gyro.status
         return status if self._track is None else replace(status, track_use=self._track.use)
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store the gyro's samples since the last step, in order."""
+        """Store the gyro samples that arrived since the last step, the oldest first."""
         if self.gyro is not None:
             self.gyro.hear(samples)
 
     def forgive(self) -> None:
-        """Drop the pending corrections of the pose by the gyro, because the pose was set."""
+        """Cancel the pending correction of the pose by the gyro. Call this when the pose is set."""
         if self.gyro is not None:
             self.gyro.forgive()
 
     def look(self, line: Feedback, rolled: Rolled) -> bool:
-        """Check a feedback line and `rolled`, the wheel angles since the line before it.
+        """Check a feedback line and `rolled`, the wheel angles since the line before.
 
-        Return whether a wheel is now known to be faulty. The caller must then recompute the earlier
-        lines without this wheel.
+        Return whether the check has just found a faulty wheel. The caller must then recompute the
+        pose from the earlier lines without this wheel.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -103,16 +106,17 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Record that the caller corrected the wheels' turn during the gyro's trial by `turn` rad.
+        """Record that the odometry recomputed `on_trial` lines, whose turn changed by `turn` rad.
 
-        Return the part of this correction that the gyro has already applied to the pose, rad.
+        Return `turn` if the gyro is proven by now and so has corrected the pose already, otherwise
+        0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 
     def learn(self, turned: float) -> Track | None:
-        """Record that the last line turned the pose by `turned` rad, and learn the track from it.
+        """Finish a feedback line, which turned the pose by `turned` rad, and collect its events.
 
-        Return the track to use from now on, None if tracks are not learned.
+        Return the effective track for the next lines, None if no track is learned from a gyro.
         """
         gyro, track, self.events = self.gyro, self._track, self.wheels.events
         if gyro is None:

@@ -32,9 +32,9 @@ TABLE: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "ok"): "released",
     ("silent", "pressed"): "pressed",
 }
-"""Maps (state, sign) to the next state, where the sign is the news from the board: the input is not
-pressed (`ok`), is pressed, or was not reported (`silence`). A pair without an entry does not change
-the state."""
+"""Maps (state, sign) to the next state. The sign is `ok` or `pressed` if the board reports that,
+and `silence` if the board has not reported the input for `SILENT_S`. A pair without an entry does
+not change the state."""
 
 SILENT_S = 0.5
 """Seconds without a report of the input after which it counts as pressed. A board reports the input
@@ -45,35 +45,35 @@ LATE_NS = 150_000_000
 period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
-"""Extra time, ns, before the board counts as silent after this computer was late. The daemon reads
-the lines that arrived in the meantime. It grants the extra time only once between two reports, so a
-computer that is always late does not delay the stop forever."""
+"""Extra time, ns, before the board counts as silent after this computer was late. In this time the
+daemon reads the lines that have arrived meanwhile. It grants the extra time only once between two
+reports, so a computer that is always late does not delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = f"the board reported no emergency-stop input for {SILENT_S:g} s, which counts as pressed"
 
-RELEASE, CHECK = "release it there", "check the board and its cable"
-"""What the operator must do before the call `clear`: if an input is pressed, and if the board does
-not report it."""
+RELEASE, CHECK = "release it at the robot", "check the board and its cable"
+"""What the operator must do before the call `clear`: the first if an input is pressed, the second
+if the board does not report it."""
 
 MISSING = (
     'safety.estop = "required", but the microcontroller has not reported an emergency-stop input: '
     "does its firmware send status lines with `estop=`?"
 )
-"""The sentence for a robot that is not ready because the board has never reported the input."""
+"""The message for a robot that is not ready because the board has never reported the input."""
 
 DRIVER_FAULT = "the board reports a fault of a motor driver"
-DRIVER_MEND = "mend it, or switch the robot off and on"
+DRIVER_MEND = "repair the driver, or switch the robot off and on"
 """`DRIVER_FAULT` is the reason of the fault that the board reports with `driver=fault`, and
 `DRIVER_MEND` is what the operator must do before the call `clear`."""
 
 
 class BoardInput(ABC):
-    """The state of one input, or of several that the board always reports together."""
+    """The state of one safety input, or of several that the board always reports together."""
 
     table = TABLE
     silent: str
-    """The sentence for a robot that is stopped because the board does not report the inputs."""
+    """The message for a robot that is stopped because the board does not report the inputs."""
     events: tuple[EventName, EventName]
     """The names of the events of a press and of a release."""
 

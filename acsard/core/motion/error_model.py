@@ -15,10 +15,10 @@ The settings can describe more errors than these. If the sides were the only cau
 The model uses k = min(2 D, Y L^2 / 2) for the sides. The remaining part of D or Y is an error of
 the robot as a whole. In addition, skidding gives each turn the variance `yaw_variance_per_radian`.
 
-The errors of the parameters do not average out, so they are not noise (Borenstein & Feng,
-Measurement and Correction of Systematic Odometry Errors in Mobile Robots, 1996). `columns` returns
-one column for each parameter: the error of a step if this parameter is off by one standard
-deviation.
+The errors of parameters, such as a wheel radius, do not average out, so they are not noise
+(Borenstein & Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots,
+1996). `columns` returns one column for each parameter: the error of a step if this parameter is off
+by one standard deviation.
 
 `ErrorModel` holds the noise and the columns for the settings and the track in use. The covariance
 of the pose (`uncertainty.py`) and that of the twist (`TwistUncertainty`) use both.
@@ -34,20 +34,20 @@ from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import Twist, TwistVariances
 
 Column = tuple[float, float, float, float]
-"""The effect of a parameter's error on a step.
+"""The error of a step if one parameter, such as a wheel radius, is off by one standard deviation.
 
 The numbers are the errors of the distance for each m and for each rad of the step (m/m, m/rad), and
 the errors of the turn for each m and for each rad of the step (rad/m, rad/rad).
 """
 
 SLIPPING = 100.0
-"""Factor on the variances of the wheels while they slip."""
+"""Factor by which slip of the wheels increases the variances of a step and of the twist."""
 
 DECIMAL = 0.01
 """Resolution of the wheel speeds in a feedback line, which have two decimals, rad/s."""
 
 MOST = 1e9
-"""Largest variance of the turn rate, rad2/s2. It means "unknown"."""
+"""Largest variance of a twist, m2/s2 and rad2/s2. It means "unknown"."""
 
 LEAST = 1e-8
 """Smallest variance of a twist, m2/s2 and rad2/s2. Filters treat a smaller one as an error."""
@@ -56,17 +56,17 @@ PERIOD = 0.01
 """Period of the feedback lines that is assumed before one is measured, s."""
 
 SMOOTHED = 0.05
-"""Weight of a new period in the mean period.
+"""Weight of the newest period in the mean period of the feedback lines.
 
 A single period means little, because several lines may be read at the same time.
 """
 
 
 class Noise:
-    """The variances of the noise of a step."""
+    """Computes the noise of a step: the variances of its distance and its turn."""
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
-        """Compute the noise for these settings and this effective track, m."""
+        """Start with these settings and this effective track, m."""
         wheels = min(
             2 * odometry.distance_variance_per_metre,
             odometry.yaw_variance_per_metre * track * track / 2,
@@ -80,12 +80,14 @@ class Noise:
         self._to_both = wheels / (2 * track)
 
     def of(self, distance: float, turn: float, turned: float) -> tuple[float, float, float]:
-        """Return var(d), var(dyaw) and cov(d, dyaw) of a step, m2, rad2 and m rad.
+        """Return the noise of a step: var(distance), var(turn) and their covariance.
+
+        The units of the result are m2, rad2 and m rad.
 
         Args:
             distance: the distance of the step, m.
             turn: the turn of the step, rad.
-            turned: the part of |turn| that is not encoder noise, rad.
+            turned: the part of |turn| that is not encoder noise, rad. Only this part skids.
         """
         left, right = abs(distance - self._half * turn), abs(distance + self._half * turn)
         path, sides = abs(distance), left + right
@@ -97,7 +99,10 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of a step and the columns of the parameters, for the settings and track in use."""
+    """The noise of a step, and the effects of the parameters' errors.
+
+    Both follow from the settings and from the effective track in use.
+    """
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
         """Start with the configured track."""
@@ -116,7 +121,7 @@ class ErrorModel:
         self.noise = Noise(odometry, self.track)
 
     def turn_by(self, learned: Track | None) -> None:
-        """Use this effective track from now on. None means that the daemon never learns a track."""
+        """Use this effective track from now on; None if `[odometry] learned_track` is off."""
         self.track = self._kinematics.track * (learned or CONFIGURED).share
         """Effective track in use, m."""
         self.columns = columns(self._declared, self._kinematics, learned)
@@ -194,7 +199,7 @@ class TwistUncertainty:
         self.bend()
 
     def bend(self) -> None:
-        """Use the track that the model uses now, from now on."""
+        """Use the present effective track of the error model from now on."""
         self._to_angular = self._model.radius**2 / self._model.track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
@@ -239,7 +244,10 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return the variances while the wheels slip. The robot then also moves sideways."""
+        """Return the variances multiplied by `SLIPPING`, because the wheels slip.
+
+        The lateral variance grows too, because the robot may move sideways.
+        """
         return TwistVariances(
             min(SLIPPING * variances.linear, MOST),
             min(SLIPPING * variances.lateral, MOST),
@@ -247,8 +255,8 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return the variances if a gyro measures the turn rate.
+        """Return the variances with `angular`, the variance of a gyro's turn rate, rad2/s2.
 
-        `angular` is the variance of the gyro's turn rate, rad2/s2.
+        The gyro's variance replaces that of the wheels.
         """
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -1,9 +1,8 @@
-"""Throttles events into log lines: repeated events of one name become one line per second, with the
-number of events.
+"""Limits how many log lines the events of one name cause: at most one per second on average.
 
-At first a few lines of one name may be written at once, and after that one per second. The throttle
-counts the events in between and reports their number with the next line. So neither a client that
-floods the bus nor a serial line with a loose contact can flood the log.
+A few lines of one name may be written at once, and after that one per second. The next line reports
+the number of events in between. So neither a client that floods the bus nor a serial line with a
+loose contact can flood the log.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ from typing import get_args
 from acsard.core.values import NS_PER_S, Event, EventName, Level
 
 BURST = 5
-"""Number of lines of one name that may be written at once: enough for a person who presses
-buttons."""
+"""Number of log lines of one event name that may be written at once: enough for a person who
+presses buttons."""
 
 MOST = 8
-"""Largest number of kinds, and of clients' names, that one line lists. The limit is needed because
-a client may use any number of names."""
+"""Largest number of kinds of events, and of clients' names, that one log line lists. A client may
+use any number of names."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
 
 class _Held:
-    """Events of one name that wait for their line."""
+    """Events of one name that wait for their common log line."""
 
     def __init__(self) -> None:
         self.count, self.news, self._level = 0, False, 0
@@ -42,7 +41,7 @@ class _Held:
         _count(self._by, event.by, event.count)
 
     def line(self) -> Event:
-        """Return one event for all waiting ones, with the worst level and the text of the last."""
+        """Return one event for all waiting ones, with the worst level and the last text."""
         last, what = self.last, _numbered(self._kinds)
         if self.count > last.count and last.text:
             what = f"{what or f'{self.count} times'}; the last"
@@ -52,16 +51,19 @@ class _Held:
 
 
 class EventThrottle:
-    """The events that wait for a log line, and the time of the next line for each event name."""
+    """Decides which events become log lines now, and holds the events that must wait."""
 
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._free_ns: dict[EventName, int] = {}
-        """For each name, the monotonic time, ns, at which the lines so far would end if they were
-        written one per second."""
+        """For each event name, the monotonic time, ns, at which the lines so far would be over if
+        they were written one per second."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Add new events, and return the events to log now, which may include older ones."""
+        """Add new events, and return the events to log now.
+
+        A returned event may combine several, also older ones that had to wait.
+        """
         if not (events or self._held):
             return ()
         for event in events:
@@ -72,8 +74,8 @@ class EventThrottle:
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line of this name may be written now, and if so, count it as written.
 
-        `news` is whether any of the waiting events is marked as news. If none is, lines may not be
-        written in a burst.
+        `news` is true if any of the waiting events is marked as news. Only then may up to `BURST`
+        lines be written at once.
         """
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
@@ -83,7 +85,7 @@ class EventThrottle:
 
 
 NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
-"""The start of a line that combines several events."""
+"""Matches the start of the text of a log line that combines several events."""
 
 
 def together(before: Event, line: Event) -> Event:

@@ -32,80 +32,88 @@ from typing import Literal
 from acsard.core.values import NS_PER_S, Command
 
 DRIFT = 5000
-"""Bound on the drift between the two clocks: they differ by less than one part in 5000, twice the
-error of a bad crystal."""
+"""The sender's clock may run faster or slower than ours by one part in this number. One part in
+5000 is twice the error of a bad crystal."""
 
 FORGET_NS = 250 * NS_PER_S
-"""Pause, ns, after which a clock is new again, because it may have drifted by 50 ms. Both the
-arrivals and the stamps must show the pause. If only the arrivals show it, a network held the
-commands back, and the clock stays known."""
+"""Pause of a sender, ns, after which its clock counts as new, because it may have drifted by 50 ms.
+Both the arrivals and the stamps must show the pause. If only the arrivals show it, the network held
+the commands back, and the clock stays known."""
 
 KEEP_NS = 3600 * NS_PER_S
-"""Silence after which a clock is forgotten to save memory, ns."""
+"""Silence of a sender, ns, after which its clock is forgotten to save memory."""
 
 EARLY_NS = NS_PER_S // 20
-"""A fall of the delay by more than this, ns, is a backlog or a clock that was set, not jitter."""
+"""A fall of the delay by more than this, ns, is not jitter: a backlog has ended, or a clock was
+set."""
 
 WAVER_NS = NS_PER_S
 """A rise of the delay by more than this, ns, is not jitter: the network held commands back."""
 
 EVEN, CREPT = 200, 20
-"""A proof compares the minimum delays of its two halves. They may differ by the duration of the
-proof divided by `EVEN`. If the delay creeps (see `CREEP`), they may differ by the duration divided
-by `CREPT`. The centres of the halves are half a duration apart, so the allowed slopes are 1 % and
-10 %. NTP slews a clock by up to 8.3 %."""
+"""A proof (a test whether the delay is constant) compares the minimum delays of its two halves.
+They may differ by the duration of the proof divided by `EVEN`, or divided by `CREPT` if the delay
+creeps (see `CREEP`). The centres of the halves are half a duration apart, so the delay may change
+by 1 % or 10 % of the time. NTP slews a clock by up to 8.3 %."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if its change between two commands is at most the time between them divided by
-`CREEP`, plus `JITTER_NS`. Otherwise it jumps."""
+`CREEP`, plus `JITTER_NS`. Otherwise the delay jumps."""
 
 LONGEST_PROOF_NS = 2 * NS_PER_S
-"""Longest duration of a proof, ns. A proof takes the timeout of the source if that is shorter."""
+"""Longest nominal duration of a proof (a test whether the delay is constant), ns. If the timeout of
+the source is shorter, the proof takes that time."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Shortest duration of a proof after a jump of the delay, ns. Such a jump more likely comes from a
-backlog that arrives in bursts than from a clock that was set."""
+"""Shortest time for which the delay must be constant after it has jumped, ns. A jump comes more
+likely from a backlog that arrives in bursts than from a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""Silence that ends a proof, ns. If both the stamps and the arrivals show a pause of this length, a
-foreign clock may have been set by any amount during the pause. Sequence numbers distinguish a pause
-from lost commands."""
+"""Silence of a sender, ns, that ends a proof. If both the stamps and the arrivals show a pause of
+this length, a foreign clock may have been set by any amount during the pause. Sequence numbers
+distinguish a pause from lost commands."""
 
 STANDS_NS = 10_000
-"""If the stamps of two successive commands differ by at most this, ns, but the commands did not
-arrive together, the clock was set back by about the time between the arrivals. The second stamp
-need not be the earlier one: Zenoh's own clock never goes back, but advances by a fraction of a
-microsecond for each message until the wall clock has caught up."""
+"""If two successive commands arrive apart, but their stamps differ by at most this, ns, the clock
+was set back by about the time between the arrivals. The second stamp may be slightly later, because
+Zenoh's own clock never goes back: it advances by a fraction of a microsecond for each message until
+the wall clock has caught up."""
 
 APART_NS = NS_PER_S // 500
-"""Commands that arrive within this time of each other may have been sent together, ns."""
+"""Commands that arrive within this time of each other, ns, may have been sent together."""
 
 TOGETHER_NS = NS_PER_S // 2000
 """Commands that arrive within this time of each other, ns, come from one queue, the oldest first. A
-proof evaluates a half only after the last of them has arrived. No sender may send more than 1000
+proof waits for the last of them before it compares delays. No sender may send more than 1000
 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
-"""Budget for rises of a foreign clock's delay without a visible adjustment: 1 s, in ns, and the
-number of seconds that refill it by one second."""
+"""Budget, ns, for rises of the delay that count as a clock that was set, although no adjustment was
+visible. Only a foreign clock has it. `FORGIVE_RATE` seconds refill it by one second."""
 
 MAX_CLOCKS = 1024
-"""Largest number of clocks that are remembered. If there are more, usually the clock that was
-silent for longest is forgotten. A client would have to use this many names within 0.05 s to make
-the daemon forget the clock of a sender at 20 Hz."""
+"""Largest number of clocks that are remembered. If there are more, usually the one that was silent
+for longest is forgotten. To make the daemon forget the clock of a sender at 20 Hz, a client would
+have to use this many names within 0.05 s."""
 
 State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
-"""The verdict on a command. A `fresh` command counts, and a `stale` one does not. An `unproven` one
-does not count yet, and neither does a `first` one, with which a proof begins. A command with the
-verdict `set` counts, but its clock seems to have been set, so the sender must return to neutral."""
+"""The verdict on a command.
+
+- `fresh`: it is accepted.
+- `stale`: it is refused, because it is late or superseded by a newer one.
+- `first`: the test of a new clock begins with it, so it does not drive the robot.
+- `unproven`: the test of a new clock is not over, so it does not drive the robot.
+- `set`: it is accepted, but the clock seems to have been set. The sender must send a zero first.
+"""
 
 
 class _Proof:
     """A test whether the delays have become constant, starting with one command.
 
     The test divides the time into halves, each of which is half of the nominal duration of a proof.
-    It compares the minimum delays in them, because minima have less jitter than single delays.
+    It compares the minimum delays of the halves, because minima have less jitter than single
+    delays.
 
     - For a known clock (`again`), the test compares the first half with the second. If it fails, it
       begins again with its second half.
@@ -120,13 +128,14 @@ class _Proof:
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self._last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
-        """Start of each of the last halves, monotonic ns, and the minimum delay in it, ns."""
+        """For each of the last halves, its start, monotonic ns, and its minimum delay, ns."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
-        """Add a command and return the state of the proof.
+        """Add a command, and return whether the delays are proven constant.
 
-        "failed" means that a new proof must begin with this command. A command cannot complete the
-        proof if its delay exceeds the lowest delay of the proof by more than the timeout.
+        "open" means that the test goes on. "failed" means that a new test must begin with this
+        command. A command that is later than the lowest delay by more than the timeout cannot
+        complete the test.
 
         Args:
             delay: Delay of the command, ns.
@@ -168,34 +177,35 @@ class _Proof:
 
 
 class _Clock:
-    """One clock of a sender, and the estimate of the minimum delay of the commands it stamped."""
+    """One clock of a sender, and the estimated minimum delay of the commands with its stamps."""
 
     def __init__(self, at_ns: int) -> None:
         self.state: State = "new"
         self.at_ns = at_ns
         """Arrival of the last command, monotonic ns."""
         self.forgiven_ns = 0
-        """Rise of the delay at the last `set` beyond the visible adjustments of the clock, ns."""
+        """Rise of the delay, ns, that the last verdict `set` trusted beyond the visible adjustments
+        of the clock."""
         self._stamp_ns = 0
         self._delay = 0
         self._number: int | None = None
         """Sequence number of the last command."""
         self._least = 0
-        """Minimum of the trusted delays, ns. It rises over time by the largest possible drift."""
+        """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
         """Amount by which the minimum has fallen recently, ns."""
         self._floor: int | None = None
-        """Lowest delay of a steady clock, ns. It rises over time by the largest possible drift.
-        None for a foreign clock."""
+        """Lowest delay of a steady (never adjusted) clock, ns. It rises with time by the largest
+        possible drift. None for a foreign clock."""
         self._before: int | None = None
         """Delay before the first visible adjustment since a command was last on time, ns; None
         without one."""
         self._shown = 0
         """Sum of the visible adjustments of the clock since a command was last on time, ns."""
         self._doubted: tuple[int, int, int] | None = None
-        """An adjustment that the next command must confirm, because the network may have swapped or
-        repeated a command. The numbers are the delay before it, its amount, and the stamp before
-        it, all in ns."""
+        """An adjustment of the clock that the next command must confirm, because the network may
+        have swapped or repeated a command. The numbers are the delay before the adjustment, its
+        amount, and the stamp before it, all in ns."""
         self._paused = False
         """Whether the sender has paused since a command was last on time. Its clock may then have
         been set by any amount."""
@@ -206,14 +216,18 @@ class _Clock:
 
     @property
     def was_known(self) -> bool:
-        """Whether a command of this clock was accepted, so lowest delay and order are known.
+        """Whether a command of this clock was accepted, so that the order of its stamps counts.
 
-        This stays true if a proof begins again.
+        This is False again after a pause of `FORGET_NS`.
         """
         return self._accepted is not None
 
     def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
-        """Return the verdict on the next command of this clock."""
+        """Return the verdict on the next command of this clock, and update the minimum delay.
+
+        `stamp_ns` is the time of sending by this clock, ns. `timeout_ns` is the timeout of the
+        command's source.
+        """
         at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
         if silence > FORGET_NS and departed > FORGET_NS:
@@ -245,7 +259,7 @@ class _Clock:
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return by how much this delay of a steady clock exceeds the lowest one, ns.
+        """Return by how much this delay of a steady (never adjusted) clock exceeds the lowest, ns.
 
         `silence` is the time since the command before, ns.
         """
@@ -256,8 +270,9 @@ class _Clock:
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int | None) -> None:
         """Record a pause of the sender, or an adjustment: stamps that go back or stand still.
 
-        The next command must confirm the adjustment: its stamp also goes back, stands still, or has
-        not caught up yet. Nothing is recorded if the sequence numbers show that commands were lost.
+        The next command must confirm an adjustment: its stamp also goes back or stands still, or is
+        not later than the stamp before the adjustment. Nothing is recorded if the sequence numbers
+        show that commands were lost.
 
         Args:
             stamp_ns: Stamp of this command, ns.
@@ -316,10 +331,10 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
-        """Trust the delay that the proof has shown, if that is allowed, and return the verdict.
+        """Trust the delay that the proof has shown if that is allowed, and return the verdict.
 
-        A larger delay is allowed by a visible adjustment of the clock, by a pause of the sender, or
-        by the rest of the budget.
+        A rise of the delay is allowed if an adjustment of the clock was visible, if the sender has
+        paused, or if the budget is large enough.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -332,7 +347,7 @@ class _Clock:
         return self._believe(proof, "set")
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Increase the budget by the time since the last call / `FORGIVE_RATE`, up to `most_ns`."""
+        """Refill the budget for the time since the last call, up to `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -347,27 +362,28 @@ class _Clock:
 
 
 class Freshness:
-    """The clocks of all senders that stamp their commands."""
+    """The clocks of all senders that stamp their commands, and the verdicts on commands."""
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Foreign clocks of which no command was accepted yet. After a silence of `GAP_NS` they are
-        forgotten."""
+        """Foreign clocks (they may be adjusted) without an accepted command. They are forgotten
+        after a silence of `GAP_NS`."""
         self._unproved: dict[str, _Clock] = {}
-        """Steady clocks of which no command was accepted yet. They are kept for `KEEP_NS`, because
-        their lowest delay is valid from the first command on."""
+        """Steady clocks (never adjusted) without an accepted command. They are kept for a silence
+        of `KEEP_NS`, because their lowest delay is valid from the first command on."""
         self._numbers: dict[str, tuple[int, int]] = {}
-        """Sequence number and arrival, ns, of the last command of each sender whose commands have
-        numbers but no stamps."""
+        """Sequence number and monotonic arrival, ns, of the last command of each sender whose
+        commands have numbers but no stamps."""
         self.forgiven_ns = 0
-        """Sum of all rises of foreign clocks' delays that no visible adjustment explains, ns."""
+        """Sum of the rises of the delay that count as clocks that were set, although no adjustment
+        of the clock was visible, ns."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
-        """Return the verdict on a command.
+        """Return the verdict on a command, and remember its stamp and sequence number.
 
-        A command without a stamp is never too old, but it is stale if its number is out of order.
-        `timeout_ns` is the timeout of its source.
+        A command without a stamp is never too old, but it is stale if its sequence number is out of
+        order. `timeout_ns` is the timeout of the command's source.
         """
         if command.stamp_ns is None:
             return self._in_order(command)
@@ -406,9 +422,9 @@ class Freshness:
     def _forget(self, now_ns: int) -> None:
         """Forget clocks that were silent for long, and one more if there are over `MAX_CLOCKS`.
 
-        The latter is a steady clock without an accepted command that was silent for `GAP_NS`, or
-        else the clock that was silent for longest. The number of clocks is limited because a
-        recording begins with all of them, and the control loop writes them in one step.
+        That one is preferably a steady clock without an accepted command that was silent for
+        `GAP_NS`, otherwise the clock that was silent for longest. The number of clocks is limited
+        because a recording begins with all of them, and the control loop writes them in one step.
         """
         limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
         for held, silent_ns in limits:
@@ -425,6 +441,6 @@ class Freshness:
 def _oldest(held: dict[str, _Clock]) -> _Clock:
     """Return the clock that was silent for longest.
 
-    It is the first one, because each command moves its clock to the end.
+    This is the first one, because each command moves its clock to the end.
     """
     return next(iter(held.values()))

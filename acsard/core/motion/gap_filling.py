@@ -23,9 +23,9 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Limits of an implausible stretch during which the robot is assumed to have kept its speed. Either
-the implausible lines in a row last at most `MAX_LOST_S` s together, or there are at most `MAX_LOST`
-of them, of any duration."""
+"""Limits for implausible lines in a row, during which the robot is assumed to have moved at the
+speed of the next plausible line. The lines must last at most `MAX_LOST_S` s together, or there must
+be at most `MAX_LOST` of them. The motion during longer ones is unknown."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
@@ -39,8 +39,8 @@ SPAN = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Weight of `GUESS`, in spans, and the largest weight of the mean over all spans: a minute of
-driving."""
+"""Weight of `GUESS` and largest weight of the mean of all measurements, each as a number of spans
+of `SPAN` s. 300 spans are a minute of driving."""
 
 GROWTH = 5
 """Exponent in the growth of a gap's variance with the duration of the gap (`Gaps`)."""
@@ -50,15 +50,16 @@ class Rolled(Struct, frozen=True, gc=False):
     """Wheel angles since the last plausible line, rad, in the order of `WHEELS`."""
 
     pieces: tuple[Motors, ...]
-    """The angles that follow from speeds, in the order of time. Each piece becomes an arc of the
-    path. No piece is zero for all wheels."""
+    """The angles that follow from speeds, in the order of time, rad. Each piece becomes an arc of
+    the path. No piece is zero for all wheels."""
     turned: Motors
-    """The angles according to encoder counts. In time, they come before `pieces`."""
+    """The angles according to the encoder counts in the lines, rad. This motion came before that
+    of `pieces`."""
     seen: Motors
-    """The angles during `seconds` according to the speeds or counts of this line, with their
-    rounding errors."""
+    """The angles during `seconds` according to the speeds or counts in the last line, with their
+    rounding errors, rad."""
     seconds: float
-    """Duration of `seen`, s."""
+    """Duration of the motion `seen`, s."""
     bridged: float
     """Part of `seconds` that no line covers, and for which the speeds were assumed, s."""
     unknown: float
@@ -68,10 +69,10 @@ class Rolled(Struct, frozen=True, gc=False):
 
 
 class Rolling:
-    """Computes wheel angles from plausible lines, and remembers the implausible ones before."""
+    """Computes the wheel angles up to each plausible line, over implausible ones before it."""
 
     def __init__(self, quiet: float = math.inf) -> None:
-        """Start. After `quiet` s without feedback the daemon commands rest."""
+        """Start. The daemon commands rest after `quiet` s without feedback."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
         """Three sums of durations, s: of implausible lines without counts, of the gaps before these
@@ -160,12 +161,12 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Discard the unfinished span, and start a new one with the speeds `twist`."""
+        """Discard the unfinished measurement, and start a new one with the speeds `twist`."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """Measure the acceleration with a line that reports `twist` for the last `dt` s."""
+        """Measure the acceleration with a further line. It reports `twist` for the last `dt` s."""
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)
         self._seconds += dt

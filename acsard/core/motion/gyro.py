@@ -1,4 +1,4 @@
-"""Takes the heading from a gyro, if there is one. The distance remains that of the wheels.
+"""Takes the heading from a gyro, if there is one. The distance still comes from the wheels.
 
 The method is gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from
 gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro, and a gyro's bias
@@ -10,9 +10,8 @@ corrects it afterwards. A gyro that reads the opposite sign, degrees or zero is 
 used (`gyro_trial.py`). If a gyro is silent, or its rate is out of all proportion to the wheels, the
 heading comes from the wheels.
 
-The module remembers the angle that it has returned so far, not the time of its last result. So the
-turn of the next line includes a sample that arrives late or is held back for a moment, and such
-errors do not add up.
+The module remembers the angle that it has returned so far, not the time of its last result. So a
+sample that arrives late is included in the turn of the next line, and such errors do not add up.
 """
 
 from __future__ import annotations
@@ -33,11 +32,12 @@ REST_S = 0.2
 """Time for which all four wheels must report zero speed before the robot counts as standing, s."""
 
 SILENT_NS = NS_PER_S // 5
-"""Age of the last sample, ns, from which on the gyro counts as silent. Until then, the rate of the
-last sample is assumed to continue."""
+"""Age of the last sample, ns, at which the gyro counts as silent. Until then, the robot is assumed
+to turn at the rate of the last sample."""
 
 LATEST_NS = NS_PER_S // 4
-"""If the delay of a sample exceeds this, ns, the clock of its sender must have been set."""
+"""If the delay of a sample exceeds the least delay so far by more than this, ns, the clock of its
+sender must have been set."""
 
 SET_BACK_NS = NS_PER_S // 50
 """If a stamp is earlier than the previous one by more than this, ns, the clock of the sender was
@@ -52,35 +52,36 @@ LEAST_DELAY_S = 0.002
 """Smallest correction of the delay that is applied, s."""
 
 SLIP_S = 0.5
-"""Seconds after the last contradiction for which the wheels still count as slipping."""
+"""Seconds for which the wheels count as slipping after they last contradicted the gyro."""
 
 MOST_SLIP_S = 5.0
 """Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is stuck, or is not
 a gyro."""
 
 ENOUGH_BLOCKS = 20.0
-"""Number of blocks of turning (`gyro_match.py`) from which on the ratio of the gyro's turn to the
-wheels' turn is trusted."""
+"""Number of blocks, each of 0.1 s of turning (`gyro_match.py`), after which the ratio of the gyro's
+turn to the wheels' turn is trusted."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
     "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
     f"{REST_S + KNOWN_S:.1f} s",
-    "used": "the heading is the gyro's",
+    "used": "the heading comes from the gyro",
     "silent": "the gyro is silent: the heading comes from the wheels alone",
-    "disagrees": "the wheels slip: the gyro measures another turn than the wheels",
-    "reversed": "not used: the gyro turns in the opposite direction to the wheels: check its "
-    "mounting",
-    "in degrees": "not used: the gyro reads 57 times too much: it sends degrees per second, not "
-    "radians",
-    "dead": "not used: the gyro measures no rate while the wheels turn the robot",
-    "not believed": "not used: the gyro's rate does not fit the wheels at all: does its z axis "
-    "point up?",
+    "disagrees": "the wheels slip: the gyro measures a different turn than the wheels",
+    "reversed": "the gyro is not used, because it turns in the opposite direction to the wheels: "
+    "check its mounting",
+    "in degrees": "the gyro is not used, because its rate is 57 times too high: it sends degrees "
+    "per second, and must send radians per second",
+    "dead": "the gyro is not used, because it measures no turn while the wheels turn the robot: "
+    "check the gyro",
+    "not believed": "the gyro is not used, because its rate does not match the wheels at all: does "
+    "its z axis point up?",
 }
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """The turn of the robot since the line before: `angle` is in rad, and `variance` in rad2.
+    """The turn of the robot since the previous feedback line: `angle` in rad, `variance` in rad2.
 
     The variance does not include the error of the gyro's scale, which does not average out
     (`uncertainty.py`).
@@ -93,9 +94,11 @@ class Turn(Struct, frozen=True, gc=False):
     be this rate times the duration of the line."""
     rate_variance: float
     wheels: float | None = None
-    """The angle that the wheels would report for this turn, including their skid, rad."""
+    """The angle that wheels without a fault would report for this turn, rad. Wheels that skid
+    report more than the turn of the robot."""
     slips: bool = False
-    """Whether the wheels slip: recently they reported another turn than the gyro."""
+    """Whether the wheels slip: within the last half second, they reported another turn than the
+    gyro."""
 
 
 class Gyro:
@@ -104,10 +107,10 @@ class Gyro:
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
-        """The effective track that was learned from an earlier gyro, None without one."""
+        """The effective track that was learned with an earlier gyro, None without one."""
         self.owes = False
-        """Whether the turn of the last line came from the wheels, and the gyro will correct it as
-        soon as the gyro is proven."""
+        """Whether the turn of the last feedback line came from the wheels only because the gyro is
+        not proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Events of the last `turn`, for the log."""
@@ -117,23 +120,25 @@ class Gyro:
         """Start over with a gyro whose bias, delay and direction are unknown."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples that were measured after the last line, each with its monotonic time, ns."""
+        """Samples that no `turn` has used yet, each with the monotonic time of its measurement,
+        ns."""
         self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
-        """Time of the last sample in `_angle`, monotonic ns; None before the first one."""
+        """Monotonic time of the last sample that `_angle` contains, ns; None before the first
+        one."""
         self._rate = 0.0
         self._angle = self._given = 0.0
-        """Angle of all samples until the last line, and the part of this angle that `turn` has
-        returned, rad."""
+        """Sum of the turns of all samples that were used, and the angle that `turn` has returned so
+        far, rad."""
         self._variance = 0.0
         """Variance of the angle that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
         """Variance of the rate now, rad2/s2."""
         self._hole = False
-        """Whether samples are missing since the last line, or the gyro was silent at that line."""
+        """Whether samples are missing since the last feedback line, or the gyro was silent then."""
         self.forgive()
 
     @property
@@ -152,10 +157,10 @@ class Gyro:
         return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store the samples since the last step, in order."""
+        """Store the samples that arrived since the last step, the oldest first."""
         for sample in samples:
             if sample.anew:
-                # The track belongs to the wheels and the floor, whichever gyro measured it.
+                # The track is a property of wheels and floor, so it stays valid with another gyro.
                 self._learned = self.learned
                 self._begin()
             self._hole |= len(self._heard) == self._heard.maxlen
@@ -201,15 +206,16 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
-        """Drop the pending correction of the pose, for example because the pose was set."""
+        """Cancel the pending correction of the pose by the gyro. Call this when the pose is set."""
         self._owed = self._owed_variance = 0.0
-        """Correction of the pose that is pending while the gyro is on trial: the gyro's turn minus
-        the wheels' turn, rad, and its variance, rad2. It is applied if the gyro is proven."""
+        """The pending correction of the heading: the gyro's turn minus the wheels' turn while the
+        gyro was not proven, rad, and its variance, rad2. It is applied once the gyro is proven."""
 
     def taken_back(self, turn: float) -> float:
-        """Record that the caller changed the wheels' turn in lines that this gyro `owes`.
+        """Record that the odometry recomputed lines with `owes`, whose turn changed by `turn` rad.
 
-        `turn` is the change, rad. Return the part of it that the gyro has already corrected, rad.
+        Return `turn` if the gyro is proven by now and so has corrected the pose already, otherwise
+        0.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -219,9 +225,10 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return when a sample was measured, in ns of our monotonic clock plus a constant.
+        """Return the monotonic time at which a sample was measured, plus a constant delay, ns.
 
-        The result is the time of arrival, corrected by the sample's stamp, which has no jitter.
+        This is the time of arrival without the jitter of the network. The sample's stamp shows this
+        jitter. A sample without a stamp keeps its time of arrival.
         """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
@@ -255,10 +262,10 @@ class Gyro:
     # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Test the gyro if it is not proven yet; return whether the wheels provide this turn.
+        """Test the gyro if it is not proven yet, and return whether the wheels provide this turn.
 
-        The wheels provide the turn while the gyro is not proven, except at rest: then they do not
-        show whether a person turns the robot.
+        The wheels provide it while the gyro is not proven. At rest the gyro provides it, because
+        the wheels do not show whether a person turns the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:
@@ -285,7 +292,7 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """Correct the gyro's delay. At rest this does not change the heading."""
+        """Correct the assumed delay of the gyro. At rest, this does not change the heading."""
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:
             earliest, latest = DELAYS_NS

@@ -18,17 +18,19 @@ WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""If a sample differs from the bias by more standard deviations than this, it is not noise."""
+"""Number of standard deviations. A sample at rest that differs from the bias by more is not noise.
+"""
 
 SLACK = 0.01
-"""Further allowed difference from the bias, rad/s, because a robot that stands may vibrate."""
+"""Further allowed difference of a sample from the bias, rad/s. A robot that stands may vibrate."""
 
 LEAST_NOISE = 1e-5
-"""Smallest assumed standard deviation of a sample, rad/s. A gyro that repeats one value is not free
-of noise, but coarse."""
+"""Smallest assumed standard deviation of a sample, rad/s. A gyro that repeats one value still has
+errors, because its resolution is coarse."""
 
 ANEW_S = 1.0
-"""Time at rest with a different but constant reading, s, after which this reading becomes the bias.
+"""If the reading at rest differs from the bias but stays constant for this time, s, it becomes the
+new bias.
 
 Possible causes are a restart of the gyro, a change of its temperature, or a robot that was turned
 while the first bias was learned.
@@ -39,7 +41,7 @@ LEARNING = 0.02
 
 
 class Bias:
-    """The estimated bias and its variance."""
+    """The estimated bias of a gyro, its variance, and the noise of the gyro's samples."""
 
     def __init__(self) -> None:
         self.value = 0.0
@@ -58,11 +60,11 @@ class Bias:
         return self._rested_s >= KNOWN_S
 
     def drift(self, dt: float) -> None:
-        """Increase the variance by the possible drift of the bias in `dt` s."""
+        """Increase the variance by the drift that the bias may have in `dt` s."""
         self.variance += WALK * WALK * dt
 
     def rest(self, rate: float, variance: float, dt: float) -> bool:
-        """Learn from a sample while the wheels stand; return False if the sample shows a turn.
+        """Learn from a sample while the wheels stand; return False if it shows a turning robot.
 
         Args:
             rate: the turn rate of the sample, rad/s.
@@ -85,10 +87,10 @@ class Bias:
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """Return whether a contradicting sample shows that the bias has changed.
+        """Process a sample that contradicts the bias, and return whether the bias has changed.
 
-        The bias has changed if the contradicting samples are constant for `ANEW_S`. Otherwise the
-        robot turns.
+        The bias has changed if such samples are constant for `ANEW_S`. Until then, the robot is
+        assumed to turn.
         """
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:

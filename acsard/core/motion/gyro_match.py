@@ -8,8 +8,8 @@ ratio of the configured effective track to the true one, and T the delay of the 
 A least-squares fit finds the coefficients a and -a T from means over blocks of a tenth of a second.
 The fit forgets old data only while the robot turns.
 
-An error of the wheels' rate is also an error of the change of this rate. On a straight drive with
-coarse encoder counts, such errors would look like a delay of half a block. Therefore a change
+Rounding to encoder counts causes an error of w, and the same error appears again in dw/dt. On a
+straight drive with coarse counts, this would look like a delay of half a block. Therefore dw/dt
 counts as 0 unless the gyro's rate also changes, within the longest delay of a gyro.
 """
 
@@ -25,66 +25,66 @@ BLOCK_S = 0.1
 counts."""
 
 LEAST_RATE = 0.05
-"""Smallest turn rate, rad/s, at which a block contributes to the ratio."""
+"""Smallest turn rate according to the wheels, rad/s, at which the robot counts as turning."""
 
 LEAST_CHANGE = 0.3
-"""Smallest change of the turn rate, rad/s2, at which a block contributes to the delay."""
+"""Smallest change of the turn rate, rad/s2, from which the delay is learned. If the gyro's rate
+changes more slowly, the change of the wheels' rate counts as 0."""
 
 MEMORY = 0.995
 """Factor by which each new block of turning reduces the weight of the earlier ones. The last 20 s
 of turning have most of the weight."""
 
 ROUGH, FINE = 0.5, 0.1
-"""Standard deviation of the ratio before any data, and the smallest one that is assumed.
-
-The ratio depends on the floor and on the turn rate.
-"""
+"""Standard deviation of the ratio of the gyro's turn to the wheels' turn: before any data, and the
+smallest one that is assumed. It is not smaller, because floor and turn rate change the ratio."""
 
 STRETCH = 1.0
-"""Turn to one side over which the error of the ratio is measured, rad.
-
-The delay of the gyro hardly matters over such a turn.
-"""
+"""Turn to one side, rad, called a stretch. Each stretch measures the error of the ratio once. The
+delay of the gyro hardly matters over such a turn."""
 
 KEPT, PRIOR = 0.9, 0.1
-"""Factor by which each new stretch reduces the weight of the earlier ones, and the initial weight
-of `ROUGH` as a number of stretches."""
+"""Factor by which each new stretch (a turn of `STRETCH`) reduces the weight of the earlier ones,
+and the initial weight of `ROUGH` as a number of stretches."""
 
 DELAY_S = 0.2
-"""Standard deviation of the delay before any data, s."""
+"""Standard deviation of the gyro's delay before any data, s."""
 
 NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
-"""Initial values of the three least-squares sums that contain the delay."""
+"""Initial values of the three least-squares sums from which the delay is computed."""
 
 BEFORE, BEHIND = 2, 3
 """Numbers of blocks before and after a block in which the gyro's rate may show the change of the
 wheels' rate in this block. The gyro is 0.1 s early to 0.3 s late (`gyro.DELAYS_NS`)."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""Standard deviation of a block's mean rate: a constant in rad/s, plus a fraction of the rate."""
+"""Standard deviation of a block's mean turn rate: a constant in rad/s, plus a fraction of the rate.
+"""
 
 LAG_S = 0.05
-"""Uncertainty of the gyro's delay in the test for a contradiction until the delay is known, s."""
+"""Standard deviation of the gyro's delay, s, that the test for a contradiction assumes until the
+delay has been measured."""
 
 CERTAIN_S = 0.004
-"""If the standard deviation of the delay is below this, s, the delay is reported."""
+"""`Match.delay` returns a delay only if its standard deviation is below this, s."""
 
 WINDOW_S = 0.2
-"""Time over which the turns of wheels and gyro are compared for a contradiction, s."""
+"""Gyro and wheels contradict each other if their turns over this time differ too much, s."""
 
 LEAST_SLIP = 0.015
-"""Standard deviation, rad, of the difference of the turns over `WINDOW_S` in normal operation.
-
-Encoder counts and vibration can cause it.
-"""
+"""Standard deviation, rad, of the difference between the turns of gyro and wheels over `WINDOW_S`
+without slip. Encoder counts and vibration cause it."""
 
 CERTAIN = 3.0
-"""If the difference of the turns exceeds this number of standard deviations, it is a contradiction.
-"""
+"""Gyro and wheels contradict each other if their turns over `WINDOW_S` differ by more than this
+number of standard deviations."""
 
 
 class Block(Struct, frozen=True, gc=False):
-    """The turns of wheels and gyro in a block, rad, and the change of the wheels' rate, rad/s2."""
+    """The turn of the robot during one block of time according to wheels and gyro, rad.
+
+    `change` is the change of the turn rate according to the wheels, rad/s2.
+    """
 
     wheels: float
     gyro: float
@@ -92,25 +92,27 @@ class Block(Struct, frozen=True, gc=False):
     time: float
     """Duration of the block, s."""
     slips: bool
-    """Whether the wheels slip. Then nothing is learned from the block."""
+    """Whether the wheels slip. If they do, nothing is learned from the block."""
 
 
 class Match:
-    """Compares the robot's turn according to wheels and gyro, feedback line by feedback line."""
+    """Learns how the gyro's turns relate to the wheels' turns, feedback line by feedback line."""
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
-        """Least-squares sums. Their initial values mean that the ratio is roughly 1."""
+        """Least-squares sums. Their initial values stand for a ratio of 1 with the standard
+        deviation `ROUGH`."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
-        """Turn of the gyro that the fit did not predict, and whole turn of the wheels, both in the
-        present stretch, rad."""
+        """In the present stretch (see `STRETCH`): the turn of the gyro minus the turn that the fit
+        predicted, and the turn of the wheels, rad."""
         self._ways = PRIOR * STRETCH**2
         self._offs = ROUGH**2 * self._ways
-        """Weighted sums of the squares of `_way` and `_off` over the completed stretches, rad2."""
+        """Weighted sums of `_way` squared and of `_off` squared over the completed stretches, rad2.
+        """
         self._lag = LAG_S
         self.blocks = 0.0
-        """Number of blocks of turning that are remembered."""
+        """Number of blocks in which the robot turned; older blocks count less (`MEMORY`)."""
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
@@ -121,13 +123,15 @@ class Match:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the ratio from one stretch to the next."""
+        """Standard deviation of the ratio of the gyro's turn to the wheels' turn, measured from the
+        differences between turns of about `STRETCH` rad."""
         return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
         """Return the delay of the gyro minus the assumed delay, s, or None if it is uncertain.
 
-        If the result is a number, the caller must add it to the assumed delay.
+        A number restarts the measurement of the delay, so the caller must add the number to the
+        assumed delay.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
@@ -146,7 +150,7 @@ class Match:
             wheels: the turn according to the wheels, rad.
             gyro: the turn according to the gyro, rad.
             dt: the duration of the line, s.
-            slips: whether the wheels slip. Then nothing is learned from the line.
+            slips: whether the wheels slip. If they do, nothing is learned from the line.
         """
         self._slide(wheels, gyro, dt)
         rate = wheels / dt
@@ -189,7 +193,7 @@ class Match:
             sums[2] -= old[2]
 
     def _learn(self) -> None:
-        """Learn from the block before the last `BEHIND` blocks."""
+        """Learn from the block that was completed `BEHIND` blocks ago."""
         block = self._blocks[BEFORE]
         wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
         rates = [one.gyro / one.time for one in self._blocks]
@@ -220,4 +224,5 @@ class Match:
         """The ratio a: the turn of the gyro divided by the turn of the wheels."""
         self._slope = (self._dg * self._ww - self._wg * self._wd) / det
         self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
-        """Standard deviation of the ratio."""
+        """Assumed standard deviation of `ratio`. It falls from `ROUGH` to `FINE` with more blocks.
+        """

@@ -1,9 +1,9 @@
 """Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
 A gyro that is mounted upside down, reads degrees or is disconnected reports another turn than the
-wheels. So does a sound gyro if the wheels slip. The past decides which of the two is wrong: a gyro
-that has never agreed with the wheels in a turn is not believed yet. Wheels that skid turn the robot
-by less than they roll, so gyro and wheels need to agree only within wide bounds.
+wheels. So does a sound gyro if the wheels slip. Therefore a gyro is not believed until it has
+agreed with the wheels in a turn once. It needs to agree only within wide bounds, because wheels
+that skid turn the robot by less than they roll.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate according to the wheels, rad/s. If a line shows at least this rate to the other side, a
-new turn begins. A lower rate may come from a single encoder count."""
+"""Turn rate according to the wheels, rad/s. If a line shows at least this rate to the other side
+than before, a new turn begins. A lower rate may come from a single encoder count."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
 """Smallest mean turn rate according to the wheels, rad/s, and the time over which the mean is
@@ -30,38 +30,42 @@ REFUTED_S = 0.3
 """Least time of turning before a gyro is refuted, s. No gyro has a delay as long as this."""
 
 DEGREES = (15.0, 150.0)
-"""Range of the ratio to the wheels for a gyro that reads degrees. The ratio is about 57.3 times
-that of a sound gyro."""
+"""Range of the gyro's turn divided by the wheels' turn for a gyro that reads degrees. This ratio is
+about 57.3 times that of a sound gyro."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
 
 class Trial:
-    """The trial of a gyro, line by line until it is proven.
+    """Compares a gyro with the wheels, line by line, until the gyro is proven to work.
 
-    A refuted gyro may still be proven later.
+    A gyro that is refuted may still be proven later.
     """
 
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """The present stretch: turn according to the wheels, rad; duration, s; turn according to
-        the gyro, rad."""
+        """The present stretch, which ends after `STRETCH_S`: the turn according to the wheels, rad,
+        the duration, s, and the turn according to the gyro, rad."""
         self._fast = self._fast_gyro = 0.0
         """Turns according to wheels and gyro, rad, over all stretches of this turn that were fast
         enough to call a gyro dead."""
 
     @property
     def open(self) -> bool:
-        """Whether the gyro is not proven yet."""
+        """Whether the gyro is not proven to work yet."""
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Add the robot's turn in one line of `dt` s according to wheels and gyro, rad.
+        """Add the turn of the robot in one feedback line, and update the verdict.
 
-        `certain` is False while the gyro's bias is unknown. The only possible verdict is then "in
-        degrees".
+        Args:
+            wheels: The turn according to the wheels, rad.
+            gyro: The turn according to the gyro, rad.
+            dt: Duration of the line, s.
+            certain: Whether the gyro's bias is known. If not, the only new verdict can be "in
+                degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro
@@ -92,7 +96,7 @@ class Trial:
         self._wheels = self._gyro = self._seconds = self._fast = self._fast_gyro = 0.0
 
     def _says_nothing(self) -> bool:
-        """Return whether the gyro reads about zero in turns too fast to be a straight drive."""
+        """Return whether the gyro reads about zero although the wheels report a fast turn."""
         fast, gyro = self._fast, self._fast_gyro
         if abs(self._stretch) >= LEAST_RATE * self._stretch_s:
             fast, gyro = fast + self._stretch, gyro + self._stretch_gyro
@@ -108,7 +112,7 @@ class Trial:
 
 
 def _named(ratio: float) -> Verdict:
-    """Return the fault of a gyro that has this ratio to the wheels."""
+    """Return the fault of a gyro. `ratio` is its turn divided by the turn of the wheels."""
     least, most = PROPORTIONS
     if DEGREES[0] <= abs(ratio) <= DEGREES[1]:
         return "in degrees"

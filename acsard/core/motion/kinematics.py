@@ -21,7 +21,7 @@ from acsard.core.values import Twist, WheelSpeeds
 
 
 class Kinematics:
-    """Converts between twists of base_link (m/s, rad/s) and wheel speeds (rad/s)."""
+    """Converts between twists of base_link (m/s, rad/s) and wheel speeds (rad/s) of one robot."""
 
     def __init__(self, drive: DriveConfig) -> None:
         self.multipliers = (
@@ -67,8 +67,9 @@ class Kinematics:
         """Return the wheel angle of each side that follows from the other side and the turn, rad.
 
         The first result is the angle of the left side, computed from `right` and `turn`. The second
-        is the angle of the right side, computed from `left` and `turn`. This is equation (3) for
-        angles. `left` and `right` are wheel angles, rad, and `turn` is the turn of the base, rad.
+        is the angle of the right side, computed from `left` and `turn`. `left` and `right` are the
+        mean wheel angles of the sides, rad, and `turn` is the turn of the base, rad. The equation
+        is (3) of the module, for angles.
         """
         across = turn * self.track
         return (

@@ -14,8 +14,8 @@ from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
 """Smallest relative standard deviation of a learned track. It is not 0, because the floor and the
-turn rate may change. It is half of `gyro_match.FINE`, the error at a single moment, because a drive
-consists of many moments."""
+turn rate may change. It is half of `gyro_match.FINE`, because that is the error at one moment, and
+a drive consists of many moments."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
 """Relative standard deviations of the learned track: below the first, an uncertain track becomes
@@ -29,16 +29,16 @@ slippery ones. Beyond the range, one of the two tracks must be wrong.
 """
 
 INWARDS = 1.05
-"""Factor by which the track must be inside the range before it is used.
+"""A learned track is used only if it is inside `BOUNDS` by this factor, and until it leaves them.
 
-Without this hysteresis, a track near a bound could alternately be used and not be used.
+Without this hysteresis, a track near a bound could be used and not used in turn.
 """
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only shown)",
     "uncertain": "(uncertain)",
     "too far off": "(too far off)",
-    "used": "in use",
+    "used": "(in use)",
 }
 
 
@@ -46,7 +46,7 @@ class Track(Struct, frozen=True):
     """An effective track, relative to the configured one."""
 
     share: float = 1.0
-    """The track divided by the configured one."""
+    """The effective track divided by the configured one."""
     deviation: float = 0.0
     """Relative standard deviation of the track.
 
@@ -58,15 +58,15 @@ CONFIGURED = Track()
 
 
 class LearnedTrack:
-    """The decision between the configured and the learned track."""
+    """Decides between the configured and the learned effective track."""
 
     def __init__(self, multiplier: float) -> None:
         """Start. `multiplier` is the configured track divided by the wheel separation."""
         self._multiplier = multiplier
         self.use: TrackUse = "uncertain"
-        """The present use of the learned track."""
+        """Whether the learned track is in use, or why it is not."""
         self.used = CONFIGURED
-        """The track in use."""
+        """The effective track in use, configured or learned."""
         self.event: Event | None = None
         """The event if the last `look` changed `use`, otherwise None."""
 
@@ -76,7 +76,10 @@ class LearnedTrack:
         self.use = _use(learned, before)
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
         if learned is not None and self.use != before:
-            told = f"the wheels' effective track: {beside(learned, self._multiplier, self.use)}"
+            told = (
+                "effective track, as wheel_separation_multiplier: "
+                f"{beside(learned, self._multiplier, self.use)}"
+            )
             level: Level = "warning" if self.use == "too far off" else "info"
             self.event = Event("learned_track", told, level, kind=self.use)
 
@@ -91,12 +94,12 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Return the learned and the configured multiplier in words, and which one is in use.
+    """Return words with the learned and the configured track, and which of them is in use.
 
-    `multiplier` is the configured track divided by the wheel separation.
+    Both tracks are given as multiples of the wheel separation. `multiplier` is the configured one.
     """
     value = learned.share * multiplier
-    configured = "" if use == "used" else " in use"
+    configured = "" if use == "used" else " (in use)"
     return (
         f"learned {value:.3f} ± {value * learned.deviation:.3f} {NOTES[use]}, "
         f"configured {multiplier:.3f}{configured}"
@@ -104,10 +107,9 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
 
 
 def tracks(gyro: GyroStatus, multiplier: float) -> str:
-    """Return the learned and the configured multiplier in words, from the state of the gyro.
+    """Return words with the learned and the configured track, "" if no track is learned yet.
 
-    `multiplier` is the configured track divided by the wheel separation. The result is "" if no
-    track is learned yet.
+    Both tracks are given as multiples of the wheel separation. `multiplier` is the configured one.
     """
     if gyro.track is None:
         return ""

@@ -57,23 +57,23 @@ class Lifecycle:
         found = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in found if latch is not None], default=0)
         self._numbered = False
-        """Whether this run has set a latch. The number of the first one is chosen so that no
-        earlier run used it."""
+        """Whether this run of the daemon has set a latch. The first latch of a run gets a number
+        that no earlier run used."""
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
         """Monotonic times at which the last stop and the last fault were latched, ns."""
         self._cleared_ns = LONG_AGO_NS
-        """Monotonic time at which a fault was last cleared, ns. A stop may have been latched in
-        addition to this fault."""
+        """Monotonic time at which a fault was last cleared, ns. For `LOOK_FIRST_S` after that, a
+        call `clear` without a number does not release a stop."""
         self._stop_asked_ns = LONG_AGO_NS
         """Monotonic time at which the request for the last stop arrived, ns."""
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off, ns."""
         self._held = self._mend = ""
-        """Why the call `clear` may release nothing, in words, and what the operator must do about
-        it. Both are "" while the reports of the board permit the call."""
+        """Why the call `clear` is refused, and what the operator must do about it. Both are ""
+        while the reports of the board permit the call."""
         self._freed_ns = LONG_AGO_NS
-        """Monotonic time, ns, of the step in which the board's reports last began to permit the
-        call `clear`, or in which the cause of a fault occurred again. Earlier calls are refused."""
+        """Monotonic time, ns, of the last step in which the board began to permit the call `clear`,
+        or in which the cause of a latched fault occurred again. Earlier calls are refused."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, ns; None before that step."""
         self._derive()
@@ -81,7 +81,7 @@ class Lifecycle:
     # facts
 
     def begin(self, now: Instant) -> None:
-        """Record `now` as the time of the first step. Later calls of this method change nothing."""
+        """Record `now` as the time of the first step. A later call changes nothing."""
         if self._began_ns is None:
             self._began_ns = now.mono_ns
 
@@ -92,15 +92,15 @@ class Lifecycle:
             self._derive()
 
     def command(self, fresh: bool) -> None:
-        """Record whether there is a command to follow, and derive the mode."""
+        """Record whether the robot has a fresh command to follow, and derive the mode."""
         if fresh is not self._commanded:
             self._commanded = fresh
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop for a cause that the board reports, under a new number.
+        """Latch a stop that the board causes, for example by its emergency-stop input.
 
-        `why` is the reason as a whole sentence.
+        The latch gets a new number. `why` is the reason as a whole sentence.
         """
         self._stopped_ns = self._stop_asked_ns = now.mono_ns
         self._latch(stop=self._made(now, "", why))
@@ -109,8 +109,8 @@ class Lifecycle:
         """Record whether the reports of the board forbid the call `clear`.
 
         Args:
-            why: Why `clear` may release nothing, "" if the board permits it.
-            mend: What the operator must do first, "" if the board permits it.
+            why: Why `clear` is refused, "" if the board permits the call.
+            mend: What the operator must do first, "" if the board permits the call.
             now_ns: Monotonic time of this step, ns.
         """
         if self._held and not why:
@@ -146,7 +146,7 @@ class Lifecycle:
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
         """Latch a stop under a new number, and return the answer for the client.
 
-        If a stop that was requested at the same time or later is latched, that stop stays instead.
+        If the latched stop was requested at the same time as this one or later, keep that latch.
 
         Args:
             by: Name of the client, "" if unknown.
@@ -164,7 +164,9 @@ class Lifecycle:
         return "stopped and latched; srv/clear releases it"
 
     def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
-        """Release the fault, or else the stop, and return the answer; "" if none was latched.
+        """Release the fault if one is latched, otherwise the stop, and return the answer.
+
+        The answer is "" if neither is latched. Raise `RefusedError` if the call is refused.
 
         Args:
             number: Number of the latch that the sender has seen, None if the request has none.
@@ -191,7 +193,7 @@ class Lifecycle:
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
             raise RefusedError(
-                "a stop or a fault came at the same time or later: call srv/clear again"
+                "a stop or a fault came at the time of this call or later: call srv/clear again"
             )
         if latches.fault is None:
             self._latch(stop=None)
@@ -200,7 +202,9 @@ class Lifecycle:
         self._latch(fault=None)
         if latches.stop is None:
             return "cleared; each sender must send a zero before it drives"
-        return f"fault cleared; still {_stopped(latches.stop)}: call srv/clear again"
+        return (
+            f"fault cleared, but the robot is still {_stopped(latches.stop)}: call srv/clear again"
+        )
 
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
         """Switch the robot on; return True if it was off.
@@ -210,6 +214,9 @@ class Lifecycle:
                 0 stands for a robot that is off only because `auto_activate` is False.
             asked_ns: Monotonic time at which the request arrived, ns.
             now: Both clocks at this step.
+
+        Raises:
+            RefusedError: The request is not allowed now, or its sender may not know the latch.
         """
         require_allowed(self.mode, "activate")
         if not self._off:
@@ -223,7 +230,7 @@ class Lifecycle:
                 self._require_seen(latch, self._off_ns, asked_ns, "srv/activate")
             if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
                 raise RefusedError(
-                    f"{latch.why} at the same time or later: call srv/activate again"
+                    f"{latch.why} at the time of this call or later: call srv/activate again"
                 )
         self._dormant = False
         self._latch(inactive=None)
@@ -237,12 +244,12 @@ class Lifecycle:
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
         self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
-        return "inactive: ramping to zero; srv/activate switches it on"
+        return "inactive: the robot ramps to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
-        """Record the limits that `set` made lower than in the configuration file, with the latches.
+        """Store the limits that the service `set` has lowered, so that they survive a restart.
 
-        `limits` contains their values by key.
+        `limits` contains the lowered keys of `[limits]` with their values.
         """
         if limits != self.latches.lowered:
             self.latches = replace(self.latches, lowered=limits)
@@ -297,15 +304,15 @@ class Lifecycle:
         )
 
     def _require_seen_stop(self, asked_ns: int) -> None:
-        """Raise `RefusedError` if the sender of a clear may not know the latched stop.
+        """Raise `RefusedError` if the sender of a call `clear` may not know the latched stop.
 
-        `asked_ns` is the monotonic time at which the request arrived, ns.
+        `asked_ns` is the monotonic time at which the call arrived, ns.
         """
         stop = self.latches.stop
         if stop is None:
             return
         if asked_ns - self._cleared_ns < LOOK_FIRST_S * NS_PER_S:
-            # The network may have delivered one clear twice.
+            # The network may have delivered one call twice.
             raise RefusedError(
                 f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
                 f"{_stopped(stop)}: look at it, then call srv/clear again"
@@ -317,7 +324,8 @@ class Lifecycle:
 
         Args:
             latch: The latch that the request would release.
-            set_ns: Monotonic time at which this run set it, ns; long ago if an earlier run did.
+            set_ns: Monotonic time at which this run set the latch, ns; `LONG_AGO_NS` if an earlier
+                run set it.
             asked_ns: Monotonic time at which the request arrived, ns.
             call: Name of the service, for the message.
         """
@@ -332,18 +340,18 @@ class Lifecycle:
             # restarted and the wall clock may have been set since.
             came = f"the daemon started {age_s:.1f} s ago and the robot is still {_stopped(latch)}"
         raise RefusedError(
-            f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, "
-            "or with the number of the latch that you have seen"
+            f"{came}: look at the robot, then call {call} again when {LOOK_FIRST_S:g} s have "
+            "passed since then, or name the number of the latch that you have seen"
         )
 
 
 def number_after_restart(kept: int, now: Instant) -> int:
-    """Return a number for a new latch that no earlier run of the daemon gave to another latch.
+    """Return a number for a new latch that no earlier run of the daemon has used.
 
-    The latch file does not contain latches that were released. If the wall clock was set back, a
-    number just above the stored ones may be the number of a released latch. A late call `clear` of
-    that latch would then release the new one. To make the two numbers differ, the time since the
-    computer started is added.
+    The number is the wall-clock time in ms. If that is not above `kept`, because the wall clock was
+    set back, the number is `kept` + 1 plus the time since the computer started in ms. `kept` + 1
+    alone could be the number of a released latch, which the latch file does not contain. A late
+    call `clear` for that latch would then release the new one.
 
     Args:
         kept: The largest number of the latches in the latch file, or less than 1 without any.

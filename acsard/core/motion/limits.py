@@ -32,7 +32,7 @@ class _State(Struct, frozen=True):
 
 
 class Limiter:
-    """Moves the allowed twist towards a requested one, step by step and within the limits."""
+    """Moves the allowed twist step by step towards a requested one, within the `[limits]`."""
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
@@ -44,8 +44,8 @@ class Limiter:
     def use(self, limits: LimitsConfig) -> None:
         """Use these limits from now on.
 
-        A twist above them slows down at the configured deceleration. A lower limit of the wheel
-        speed takes effect at once, so the caller may lower it only at rest.
+        A twist above the new limits slows down at the configured deceleration. A lower limit of the
+        wheel speed takes effect at once, so the caller may lower it only at rest.
         """
         self._linear = _Axis(
             limits.linear_speed,
@@ -63,15 +63,18 @@ class Limiter:
         )
         self._wheel_speed = limits.wheel_speed
         self._wished = self._goal = REST
-        """The last requested twist, and the same twist within the limits of speed."""
+        """The last requested twist, and that twist scaled down to the speed limits."""
 
     @property
     def twist(self) -> Twist:
-        """The last allowed twist."""
+        """The twist that the limiter allowed in the last step, m/s and rad/s."""
         return self.state.twist
 
     def follow(self, wished: Twist, dt: float) -> Twist:
-        """Move towards the finite twist `wished` for `dt` s, and return the twist to apply."""
+        """Move the allowed twist towards `wished` for `dt` s, and return it.
+
+        `wished` must not contain NaN or infinity.
+        """
         if wished is not self._wished:  # the daemon steps more often than a sender sends
             self._wished = wished
             self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
@@ -89,10 +92,11 @@ class Limiter:
         return twist
 
     def coast(self, dt: float, stop: bool = False) -> Twist:
-        """Slow down for `dt` s, both axes in the same proportion; return the twist to apply.
+        """Slow down towards rest for `dt` s, and return the allowed twist.
 
-        If `stop` is true, the stop decelerations apply. A negative `dt` changes nothing, because it
-        must not speed up the robot.
+        Linear and angular speed fall in the same proportion. If `stop` is true, the limits
+        `*_stop_deceleration` apply. A negative `dt` counts as 0, so that it cannot speed up the
+        robot.
         """
         dt, twist = max(0.0, dt), self.twist
         seconds = max(
@@ -110,9 +114,10 @@ class Limiter:
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:
-        """Return the twist with both axes scaled together to their limits, so curvature is kept.
+        """Return the twist scaled down to the speed limits, with the same curvature.
 
-        An axis with the limit 0 is set to zero first and does not slow down the other one.
+        An axis (linear or angular) with the limit 0 is set to zero first, and does not slow down
+        the other axis.
         """
         linear = wished.linear if self._linear.speed else 0.0
         angular = wished.angular if self._angular.speed else 0.0
@@ -131,9 +136,10 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    """Return `speed` after `dt` s on the way to `goal`, and the slope (change of speed per s) used.
+    """Move `speed` towards `goal` for `dt` s; return the new speed and the acceleration used.
 
-    `slope` is the slope of the step before.
+    `slope` is the acceleration in the step before. The units are m/s and m/s2 for the linear axis,
+    and rad/s and rad/s2 for the angular one.
     """
     if dt <= 0.0:
         return speed, slope
@@ -143,11 +149,11 @@ def _approach(
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
     if axis.jerk and abs(target) > abs(speed):
-        slope = slope if slope * wanted > 0 else 0.0  # left over from braking
+        slope = slope if slope * wanted > 0 else 0.0  # the other sign is left over from braking
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
-        # The slope may fall faster than jerk allows only if it would pass the goal otherwise. It
-        # never exceeds the acceleration limit, which may have been lowered.
+        # The slope may fall faster than the jerk limit allows only if the speed would pass the goal
+        # otherwise. The slope never exceeds the acceleration limit, which may have been lowered.
         most = min(axis.acceleration, max(most, abs(slope) - step))
     used = max(-most, min(most, wanted))
     # Return the goal itself if it is reached: in floating point, speed + wanted * dt may miss it.
@@ -155,10 +161,10 @@ def _approach(
 
 
 def _flattenable(away: float, step: float, dt: float) -> float:
-    """Return the steepest slope that can still fall to zero before the speed has changed by `away`.
+    """Return the steepest acceleration that can fall to zero while the speed changes by `away`.
 
-    The slope falls by `step` in each period of `dt` s. The slopes s, s - step and so on over n more
-    periods add up to dt ((n + 1) s - step n (n + 1) / 2).
+    The acceleration falls by `step` in each period of `dt` s. If it starts at s and falls for n
+    more periods, the speed changes by dt ((n + 1) s - step n (n + 1) / 2).
     """
     n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)
     return (away / dt + step * n * (n + 1) / 2.0) / (n + 1)

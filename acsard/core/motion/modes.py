@@ -34,7 +34,7 @@ class Mode(StrEnum):
 
 
 class RefusedError(AcsardError):
-    """A request that the robot's mode does not allow; the text is for the person who asked."""
+    """A request that the robot does not allow now. The caller gets the text as the reason."""
 
 
 def mode_of(
@@ -71,7 +71,7 @@ REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",
     (Mode.STOPPED, "deactivate"): "the robot is stopped and cannot move: call srv/clear first",
 }
-"""Requests that a mode refuses, and the answer to the person who asked."""
+"""The requests that each mode refuses, and the reason that the caller gets as the answer."""
 
 
 def require_allowed(mode: Mode, verb: Verb) -> None:

@@ -1,8 +1,7 @@
-"""The neutral-first rule for one sender: whether it may drive, decided by the commands that it has
-sent.
+"""Decides by the neutral-first rule whether one sender may drive the robot.
 
-Only a zero, which is a command to rest, arms a sender. Silence alone never does. An armed sender
-stays armed until `require_neutral` is called.
+A sender may drive if it is armed. Only a zero, which is a command to rest, arms a sender. Silence
+does not. The sender stays armed until `require_neutral` or `unlearn` is called.
 
 - If no other program shares the sender's identity, a zero arms the sender at once, even directly
   after speeds.
@@ -22,35 +21,36 @@ from acsard.core.values import REST, Command
 
 
 class Sender:
-    """One sender of a source. Two programs are two senders if their identities differ."""
+    """One sender of a source: its last command, and whether it is armed."""
 
     def __init__(self, timeout_ns: int, pause_ns: int, neutral_first: bool) -> None:
         self.use(timeout_ns, pause_ns)
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Monotonic arrival, ns, of a zero of a shared identity after which no speed has arrived
-        yet; None without one."""
+        """Monotonic time, ns, at which a zero of a shared identity arrived; None if there is none
+        or if a speed has arrived since."""
         self._proven_zero_ns: int | None = None
         self.name = ""
         self.twist = REST
         self.arrived_ns: int | None = None
-        """Arrival of the last command that counted since `require_neutral`, ns; None without
-        one."""
+        """Monotonic time at which the last accepted command arrived, ns; None if no command has
+        been accepted since `require_neutral`."""
         self.came_ns = 0
-        """Arrival of the command that ended the sender's last silence, ns. The arbiter prefers the
-        sender that came first."""
+        """Monotonic time, ns, of the command that ended the sender's last silence. The arbiter
+        prefers the sender that came first."""
         self.zeros_ns: int | None = None
-        """Arrival of the first zero since the last speed, ns; None if a speed came last."""
+        """Monotonic time, ns, of the first zero since the last speed or silence; None if the last
+        accepted command was a speed."""
         self.ros = False
         """Whether the last command came from ROS, whose tools send no zero by themselves."""
         self.shared = False
         """Whether several programs may share this identity."""
         self.noticed_ns = 0
-        """Arrival of the last message, ns, even if that message did not count."""
+        """Monotonic time of the last message, ns, even if that message was refused."""
         self._doubted_ns: int | None = None
         self.doubt: Verdict = "unproven"
-        """The verdict on the stamp of the last command that did not count."""
+        """The verdict on the last command that was not accepted because of its stamp."""
 
     def use(self, timeout_ns: int, pause_ns: int) -> None:
         """Apply this command timeout and this `commands.neutral_pause`, both in ns, from now on."""
@@ -61,11 +61,11 @@ class Sender:
         return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns
 
     def doubtful(self, now_ns: int) -> bool:
-        """Return whether recent commands do not count because of their stamps."""
+        """Return whether a recent command was not accepted because of its stamp."""
         return self._doubted_ns is not None and now_ns - self._doubted_ns <= self._timeout_ns
 
     def armed(self, now_ns: int) -> bool:
-        """Return whether the sender may drive."""
+        """Return whether the sender has sent the zero that lets it drive."""
         self._settle(now_ns)
         return self._armed
 
@@ -75,36 +75,40 @@ class Sender:
         self._armed = self._proven_armed = not self._neutral_first
 
     def unlearn(self) -> None:
-        """Undo the arming by zeros whose stamps were never proven.
+        """Undo the effect of zeros whose stamps were never proven right.
 
-        Such zeros may come from a backlog.
+        The network may have held such a zero back, so that the sender no longer commands rest.
         """
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def notice(self, at_ns: int) -> None:
-        """Record a message that does not count, but that may have been a speed.
+        """Record a message that was refused, but that may have been a speed.
 
-        `at_ns` is its monotonic time of arrival, ns.
+        A zero that has not armed a shared identity yet then no longer does. `at_ns` is the
+        monotonic time at which the message arrived, ns.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
         self.noticed_ns = at_ns
 
     def missed(self) -> None:
-        """Record that unread messages of this sender were lost. Each may have been a speed."""
+        """Record that messages of this sender were lost, each of which may have been a speed.
+
+        A zero that has not armed a shared identity yet then no longer does.
+        """
         self._zero_ns = self._proven_zero_ns = None
 
     def refuse(self, command: Command, why: Verdict) -> None:
-        """Record a command that does not count, with the verdict `why` on its stamp."""
+        """Record a command that was refused because of its stamp. `why` is the verdict on it."""
         self.notice(command.arrived_ns)
         self._doubt(command, why)
 
     def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
-        """Accept a command that counts, or that will count once the clock of its stamps is proven.
+        """Process a command that was not refused. `verdict` is the verdict on its stamp.
 
-        A zero that arrived before `since_ns`, the time of the last `require_neutral`, does not arm
-        the sender. A zero of an unproven clock arms the sender as soon as that clock is proven,
-        unless `unlearn` is called before that.
+        A command of an unproven clock ("first", "unproven") does not drive the robot yet, but a
+        zero arms the sender until `unlearn` undoes that. A zero that arrived before `since_ns`, the
+        time of the last `require_neutral`, does not arm the sender.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
@@ -118,8 +122,9 @@ class Sender:
             self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
             if zero and unarmed:
-                # When this zero arms the sender, an earlier speed must not count. With a shared
-                # identity, another program may have sent it, and the source keeps its priority.
+                # When this zero arms the sender, an earlier speed must not drive the robot. With a
+                # shared identity, another program may have sent that speed, and the source keeps
+                # its priority.
                 if command.shared:
                     self.twist = REST
                 else:

@@ -47,7 +47,10 @@ TAKEN_BACK = 128
 
 
 class Step(Struct, frozen=True, gc=False):
-    """The motion that one feedback line added to the pose. It is kept to recompute the pose."""
+    """The motion that one feedback line added to the pose.
+
+    The odometry keeps the last steps, to recompute the pose when a wheel proves faulty.
+    """
 
     pose: Pose
     """The pose before the line."""
@@ -60,7 +63,8 @@ class Step(Struct, frozen=True, gc=False):
     turn: float
     """Change of the heading by the line, rad."""
     on_trial: bool
-    """Whether a gyro that is still on trial will correct the turn as soon as it is proven."""
+    """Whether the turn came from the wheels because the gyro was not proven yet. The gyro corrects
+    such turns once it is proven."""
     share: float = 1.0
     """The effective track in use, divided by the configured one."""
 
@@ -89,11 +93,11 @@ class Odometry:
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
-        """Wheel angles at rest that are held back from the pose because the direction of their
-        counts is not clear yet, rad."""
+        """Wheel angles at rest that the pose does not contain yet, because the direction of their
+        encoder counts is not clear, rad."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
-        """Quantization steps of the wheels in the last line, and the largest known one of them,
-        rad/s."""
+        """Quantization steps of the wheel speeds in the last line, and the largest known one of
+        them, rad/s."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -108,9 +112,9 @@ class Odometry:
         self._still = 0.0
         """Time for which all wheel speeds have been zero, s."""
         self.twist = REST
-        """Twist of the last feedback line."""
+        """Twist in the last feedback line, m/s and rad/s."""
         self.speeds = STILL
-        """Wheel speeds of the last feedback line."""
+        """Wheel speeds in the last feedback line, rad/s."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
         """Number of gaps in which the robot moved but the pose stood still, the sum of their
         durations, s, and the sum of the times that gap filling covered, s."""
@@ -125,7 +129,7 @@ class Odometry:
         self._errors.use(odometry)
 
     def turn_by(self, track: Track) -> None:
-        """Use this effective track from now on for the turns that the wheels provide."""
+        """Compute the turns of the wheels with this effective track from now on."""
         if track != self._track:
             self._track = track
             self._errors.turn_by(track)
@@ -148,30 +152,31 @@ class Odometry:
         return self._path.pose
 
     def missed(self) -> dict[str, int]:
-        """Return counters of the time that no feedback line covers, without those that are 0.
+        """Return counters of the gaps in the feedback, without those that are 0.
 
-        The keys are the number of gaps in which the pose stood still, their duration in ms, and the
-        time that gap filling covered in ms.
+        `gaps` is the number of gaps in which the robot moved but the pose stood still, and `gap_ms`
+        is their duration. `gaps_filled_ms` is the time that gap filling covered.
         """
         ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
-        """Do not use the speeds of an impossible line, but keep its counts and its duration.
+        """Ignore the speeds of an impossible feedback line, but remember the time that it covers.
 
-        So the next possible line covers the motion of both. Of a line without counts, only the
-        duration is kept.
+        The next possible line then adds the motion of both lines to the pose. If the impossible
+        line has encoder counts, they are used for its motion.
         """
         self._rolling.skip(feedback)
 
     def fold(self, feedback: Feedback) -> Estimate:
         """Advance the pose by one feedback line, and return the new estimate.
 
-        The wheel angles come from the counts of the line if it has any, otherwise from its speeds
-        times dt. After a gap without counts only the uncertainty grows. At rest a single count is
-        added only when its direction is clear. If a gyro provides the turn since the line before,
-        the wheels provide only the distance. If a wheel proves faulty, the other wheel of its side
-        replaces it, also in the earlier lines in which the faulty wheel was wrong.
+        - The wheel angles come from the encoder counts of the line if it has any, otherwise from
+          its speeds times dt. After a gap without counts, only the uncertainty grows.
+        - At rest, a single count is added only when its direction is clear.
+        - If a gyro provides the turn since the line before, the wheels provide only the distance.
+        - If a wheel proves faulty, the other wheel of its side replaces it, also in the earlier
+          lines in which the faulty wheel was wrong.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
@@ -211,9 +216,9 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles of `rolled` by which to advance the pose, rad.
+        """Return the wheel angles by which to advance the pose, one set for each arc, rad.
 
-        If the robot is at rest, hold counts back until their direction is clear.
+        While the robot is at rest, hold encoder counts back until their direction is clear.
         """
         turned = rolled.turned
         if self._held != NOWHERE:
@@ -230,8 +235,8 @@ class Odometry:
     def _take_back(self) -> None:
         """Recompute the pose from the recent lines in which a wheel, now found faulty, was wrong.
 
-        The pose jumps by the error that this wheel caused, except for the part that a gyro has
-        corrected or will correct.
+        The pose jumps by the error that this wheel caused. If a gyro on trial has already corrected
+        the turns of these lines, the heading keeps that correction.
         """
         was_faulty = self.checks.wheels.was_faulty
         wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
@@ -254,8 +259,9 @@ class Odometry:
     ) -> list[tuple[float, float]]:
         """Return the arcs, each as distance (m) and turn (rad), for these wheel angles in rad.
 
-        Equations (4) to (7) hold for angles because they are linear. If a gyro provides the turn,
-        there is one arc for all pieces. Otherwise the track is `share` of the configured one.
+        If a gyro provides the turn, the result is one arc for all pieces. Otherwise it is one arc
+        for each piece, with an effective track of `share` times the configured one. Equations (4)
+        to (7) also hold for angles, because they are linear.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         moved = [kinematics.moved(believed(one)) for one in pieces]
@@ -270,7 +276,7 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose by wheel angles, and return the turn of the pose, rad.
+        """Advance the pose by the wheel angles of a line, and return the turn of the pose, rad.
 
         Args:
             pieces: The wheel angles, rad, one set for each arc.
@@ -292,10 +298,10 @@ class Odometry:
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Add the uncertainty of a filled gap, or else measure how twists change between lines.
+        """Add the uncertainty of a filled gap. Without a gap, measure how the twist changes.
 
-        `bridged` is the duration of the filled gap, s, and 0 without one. `before` and `twist` are
-        the twists of the line before and of this line.
+        `bridged` is the duration of the filled gap, s, or 0 without one. `before` is the twist of
+        the line before, and `twist` is that of this line.
         """
         if bridged > 0.0:
             self.bridged += bridged
@@ -320,7 +326,7 @@ class Odometry:
         return variances
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
-        """Add the uncertainty of `seconds` s of unknown motion. The pose does not move.
+        """Add the uncertainty of `seconds` s of unknown motion, without moving the pose.
 
         `before` and `after` are the twists before and after this time.
         """

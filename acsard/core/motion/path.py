@@ -1,4 +1,4 @@
-"""Adds arcs to a pose, without an error from rounding over millions of arcs.
+"""Adds arcs to a pose. Rounding errors do not build up, even over millions of arcs.
 
 An arc of length d through the angle a, from a pose with the heading yaw, has a chord of length d
 sin(a / 2) / (a / 2) in the direction yaw + a / 2. The rounding error of each sum is kept and added
@@ -17,7 +17,7 @@ TAU_REST = 2.4492935982947064e-16
 
 
 class Path:
-    """A path of arcs. The object keeps only the last pose of the path."""
+    """The pose at the end of a path of arcs. Earlier poses are not kept."""
 
     def __init__(self) -> None:
         self.set(Pose())

@@ -38,7 +38,7 @@ count in this time looks like a high speed."""
 
 
 class Sanity:
-    """Checks feedback line by line, and remembers the last possible line."""
+    """Compares each feedback line with the last line that was physically possible."""
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
@@ -46,14 +46,13 @@ class Sanity:
         self._since = 0.0
         self._longest = 0.0
         """Longest time that one of the recent lines covers, s. A line after a pause reports the
-        mean speed of the whole pause, and its time is uncertain. It counts as recent until the
-        length of the pause has passed again."""
+        mean speed of the whole pause. Such a line counts as recent until the length of the pause
+        has passed again."""
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
         self.warning: Event | None = None
-        """The warning that too many lines are impossible, if the last line caused it; otherwise
-        None."""
+        """The warning that too many lines are impossible. None unless the last line caused it."""
 
     def forget(self) -> None:
         """Start over, because the link was lost or a fault has been cleared."""
@@ -65,12 +64,12 @@ class Sanity:
         return self._impossible >= REPEATED
 
     def impossible(self, feedback: Feedback) -> str:
-        """Return why this line is impossible for any robot, "" if it is possible.
+        """Return why no wheel can do what this line reports, "" if the line is possible.
 
-        A change of speed is compared with the last possible line and the time since then. Therefore
-        a real jump of the speed is accepted as soon as enough time for it has passed. Each speed is
-        a mean over the time of its line, so the change may have lasted from the middle of one line
-        to the middle of the next.
+        The change of each speed is compared with the time since the last possible line. Therefore a
+        real jump of the speed is accepted as soon as enough time for it has passed. Each speed is a
+        mean over the time of its line, so the change may have lasted from the middle of one line to
+        the middle of the next.
         """
         since = max(feedback.dt, feedback.since)
         self._since += since
@@ -103,7 +102,7 @@ class Sanity:
     def _words(self, why: str) -> str:
         return (
             f"{self._dropped} of {self._lines} lines were dropped, because no wheel can do "
-            f"what they report; the last: {why}. If a wheel really does that, raise the setting. "
+            f"what they report; the last: {why}. If a wheel really does that, raise that setting. "
             "Otherwise lines arrive damaged: check cable and ground; firmware that supports "
             'mcu.link_check = "auto" protects each line with a checksum'
         )
@@ -116,7 +115,7 @@ class Sanity:
         wheels, then_wheels = speeds.as_tuple(), before.as_tuple()
         changes = map(abs, map(sub, wheels, then_wheels))
         if max(map(abs, wheels)) <= fastest and max(changes) <= most:
-            return ""  # possible for any encoder steps, as nearly every line is
+            return ""  # Nearly every line ends here, without regard to quantization steps.
         turned = line.counted if line.turned is None else line.turned
         rows = zip(WHEELS, wheels, then_wheels, line.steps, turned or wheels, strict=True)
         for name, now, then, step, angle in rows:
@@ -131,8 +130,8 @@ class Sanity:
             elif turned is not None and step < math.inf:
                 room = step
             if size > fastest + room:
-                return f"{name} {now:.2f} rad/s is over feedback.wheel_speed"
+                return f"{name} at {now:.2f} rad/s is over feedback.wheel_speed"
             if change > most + STEPS * step:
-                leap = f"{name} from {then:.2f} to {now:.2f} rad/s"
-                return f"{leap} is over feedback.wheel_acceleration"
+                leap = f"{name} jumps from {then:.2f} to {now:.2f} rad/s"
+                return f"{leap}, which is over feedback.wheel_acceleration"
         return ""

@@ -20,25 +20,25 @@ Vector = tuple[float, float, float]
 """x, y (m) and yaw (rad) of an error."""
 
 Planar = tuple[float, float]
-"""x and y of an error whose yaw is 0."""
+"""x and y (m) of an error whose yaw is 0."""
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 def plus(a: Vector, b: Vector) -> Vector:
-    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def bracket(a: Vector, b: Vector) -> Planar:
-    """Return x and y of the Lie bracket [a, b]. Its yaw is always 0."""
+    """Return x and y of the Lie bracket [a, b] of two pose errors. Its yaw is always 0."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
 
 
 def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
-    """Return `times` E[[a, e] e'], where the error e has the covariance `p`.
+    """Return `times` E[[a, e] e'] for a random pose error e with the covariance `p`.
 
-    The result has the rows x and y. The row yaw is always 0.
+    E is the expected value, [a, e] is the Lie bracket, and ' means transposed. The result has the
+    rows x and y, because the row yaw is always 0.
     """
     x, y, yaw = times * a[0], times * a[1], times * a[2]
     return (
@@ -50,7 +50,7 @@ def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector
 def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
     """Return xx, xy and yy of the covariance of the Lie bracket [a, b].
 
-    The errors a and b are independent and have the covariances `p` and `q`.
+    a and b are independent pose errors with the covariances `p` and `q`.
     """
     return (
         p.yy * q.yawyaw - 2 * p.yyaw * q.yyaw + p.yawyaw * q.yy,
@@ -60,9 +60,10 @@ def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
 
 
 def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
-    """Return E[[e, [e, b]] b'] plus its transpose, with Lie brackets of independent errors e and b.
+    """Return E[[e, [e, b]] b'] plus its transpose, for independent random pose errors e and b.
 
-    The error b has the covariance `p`. `a` is the yaw column of the covariance of e.
+    E is the expected value, [e, b] is the Lie bracket, and ' means transposed. b has the covariance
+    `p`, and `a` is the yaw column of the covariance of e.
     """
     x, y, yaw = a
     return PoseCovariance(
@@ -76,15 +77,18 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return the error, in the axes at the robot, after the robot moved by `dx`, `dy` m in odom."""
+    """Return a pose error after the robot has moved by `dx`, `dy` m in odom.
+
+    The axes of the error are parallel to odom, with the origin at the robot.
+    """
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 
 
 def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
-    """Return the covariance of an error after the robot has moved by `dx`, `dy` m in odom.
+    """Return the covariance of a pose error after the robot has moved by `dx`, `dy` m in odom.
 
-    Before the motion the covariance is `p`.
+    `p` is the covariance before the motion.
     """
     return PoseCovariance(
         p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
@@ -99,10 +103,10 @@ def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
 def added(
     p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
 ) -> PoseCovariance:
-    """Return the covariance `p` plus the noise of a step.
+    """Return the covariance `p` of the pose plus the noise of a step.
 
     Args:
-        p: the covariance before the step.
+        p: the covariance without that noise.
         along: the variance of the distance, m2.
         yaw: the variance of the turn, rad2.
         both: the covariance of distance and turn, m rad.
@@ -130,7 +134,7 @@ def stepped(
     c: float,
     s: float,
 ) -> PoseCovariance:
-    """Return the covariance after a step by `dx`, `dy` m, with the noise of the step.
+    """Return the covariance of the pose after a step by `dx`, `dy` m, with the noise of the step.
 
     This is `added(carried(p, dx, dy), along, yaw, both, c, s)` in one function, because it runs for
     each feedback line.
@@ -148,7 +152,6 @@ def stepped(
 
 
 def total(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
-    """Return p + q."""
     return PoseCovariance(
         p.xx + q.xx,
         p.xy + q.xy,
@@ -160,7 +163,6 @@ def total(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
 
 
 def difference(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
-    """Return p - q."""
     return PoseCovariance(
         p.xx - q.xx,
         p.xy - q.xy,

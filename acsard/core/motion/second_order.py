@@ -1,4 +1,4 @@
-"""Adds terms of second order to the covariance of the pose: heading errors bend the position error.
+"""Adds the effects of second order to the covariance of the pose.
 
 If the true heading deviates from the estimated one and returns, the robot ends short of the
 estimated place, and never beyond it. This is an effect of second order. On a straight drive, it
@@ -58,16 +58,17 @@ NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SecondOrder:
-    """The terms of second order in the covariance of x and y."""
+    """Computes the terms of second order in the covariance of x and y (symbols: see the module)."""
 
     def __init__(self, columns: int) -> None:
         self._noise: Vector = ORIGIN
-        """Covariance (xx, xy, yy) of the sum of all [x, n] / 2 and M_i."""
+        """Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and M_i of the module."""
         self._with_x: list[tuple[Vector, Vector]] = []
-        """E[M_i x'] for each parameter i, with the rows x and y."""
+        """Covariance E[M_i x'] of M_i with the noise x (see the module), for each parameter i. It
+        has the rows x and y."""
         self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik for each pair of parameters, m. Each key is a pair of indices, the larger one first.
-        """
+        """C_ik of the module for each pair of parameters, m. The keys are pairs of their indices,
+        the larger one first."""
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
@@ -83,23 +84,23 @@ class SecondOrder:
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
 
     def carry(self, dx: float, dy: float) -> None:
-        """Update E[M_i x'] after the robot has moved by `dx`, `dy` m in odom."""
+        """Transform the stored covariances after the robot has moved by `dx`, `dy` m in odom."""
         self._with_x = [(seen_from(a, dx, dy), seen_from(b, dx, dy)) for a, b in self._with_x]
 
     def compose(
         self, p: PoseCovariance, q: PoseCovariance, j: list[Vector], w: list[Vector]
     ) -> PoseCovariance:
-        """Add a stretch, and return the covariance that the caller must add to p + q.
+        """Add a stretch of the path, and return the covariance that the caller must add to p + q.
 
-        The result is the contribution of the last two terms of the series. All arguments must be
-        expressed at the robot's place at the end of the stretch (`se2.seen_from`). The caller must
-        first call `carry` with the displacement of the stretch.
+        The result is the contribution of the last two terms of the series in the module. All
+        arguments must be expressed at the robot's place at the end of the stretch
+        (`se2.seen_from`). The caller must first call `carry` with the displacement of the stretch.
 
         Args:
-            p: the covariance P of the path before the stretch.
-            q: the covariance Q of the stretch.
-            j: the columns of J.
-            w: the columns of W.
+            p: the covariance of the noise on the path before the stretch.
+            q: the covariance of the noise on the stretch.
+            j: the effects of the parameters on the path before the stretch, one column for each.
+            w: the effects of the parameters on the stretch, one column for each.
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:
@@ -123,11 +124,15 @@ class SecondOrder:
     def _bend_noise(
         self, i: int, p: PoseCovariance, q: PoseCovariance, column: Vector, new: Vector
     ) -> None:
-        """Add ([J_i, n] + [x, W_i]) / 2 to M_i. `column` is J_i, and `new` is W_i."""
+        """Add ([J_i, n] + [x, W_i]) / 2 to M_i of the module.
+
+        `column` is J_i, and `new` is W_i. `p` and `q` are the covariances of x and n.
+        """
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)
-        # [x, W_i] / 2 also correlates with the earlier M_i. This counts twice in the variance.
+        # [x, W_i] / 2 also correlates with the earlier M_i. This covariance counts twice in the
+        # variance of the sum.
         ax, ay = bracket(new, plus(plus(x, x), by_new_x))
         bx, by = bracket(new, plus(plus(y, y), by_new_y))
         cx, cy = bracket(column, by_noise_x)

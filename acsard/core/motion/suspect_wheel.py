@@ -3,9 +3,10 @@
 A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
 opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if an
 independent reference differs more from it than from the other wheel of its side. The reference is
-the turn according to a gyro or, without one, the command: the speed of a healthy wheel lies between
-its command and the speed that a slow wheel would have reached by now. Without a reference nothing
-is decided: a person who pushes the robot may turn one wheel and not the other.
+the turn according to a gyro or, without one, the command. The speed of a healthy wheel lies between
+its command and the speed that a wheel with `feedback.response_time` has reached by now. Without a
+reference, only a stuck wheel is found, because a person who pushes the robot may turn one wheel and
+not the other.
 
 `Suspect` tests a wheel that contradicts the other one of its side. `Stuck` tests every wheel,
 because a stuck encoder agrees with the other wheel until the command changes.
@@ -19,24 +20,24 @@ from typing import Literal
 from acsard.core.motion.wheel_witness import Expected
 
 FAULT_S, FAULT_LINES = 0.025, 2
-"""Time, s, and number of lines for which the sign must last: three lines at 100 Hz, so one bad
-reading is not enough."""
+"""Shortest time, s, and smallest number of lines for which a sign of a fault must last. At 100 Hz
+the time takes three lines, so one bad reading is not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""The two terms, encoder counts and rad, of the angle by which the other wheel must have turned
-further than the suspect wheel while the sign lasted."""
+"""Least difference between the angles of the two wheels for calling one faulty: a number of encoder
+counts plus an angle in rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""The two terms of an angle, encoder counts and rad. When even a slow wheel must have turned by
-this angle more or less than at its old speed, a sound wheel can no longer repeat that speed. If the
-other wheel has followed the command, this one is stuck."""
+"""A number of encoder counts plus an angle in rad. After a change of the command, a wheel is called
+stuck only when a healthy wheel must have turned by this angle more or less than at the old speed.
+"""
 
 LEAVES = 0.05
-"""Least difference, rad/s, of the command from the command at the first repetition of a speed."""
+"""Least change of the command, rad/s, after which a healthy wheel must report another speed."""
 
 VOTE = 1 / 3
-"""A reference decides only if one wheel is further from it than the other wheel by at least this
-share of the difference between the two wheels."""
+"""A reference (a gyro or the command) decides which of two wheels is faulty only if it is nearer to
+one of them by at least this share of the difference between the wheels."""
 
 HAND_S = 0.3
 """Time for which a wheel must repeat one speed without a command before it is called stuck, s. A
@@ -54,14 +55,18 @@ turn. A smaller difference may be slip of the other wheel while this one turns s
 WheelFault = Literal["dead", "reversed", "stuck"]
 
 WORDS: dict[WheelFault, str] = {
-    "dead": "reports that it stands while the other wheel of its side turns",
-    "reversed": "reports the opposite direction of the other wheel of its side",
-    "stuck": "says one and the same speed",
+    "dead": "reports that it stands while the other wheel on its side turns",
+    "reversed": "reports the opposite direction to the other wheel on its side",
+    "stuck": "reports a speed that never changes",
 }
 
 
 class _Ballot:
-    """Sums of the two wheels' turns, and of the range of the true turn by one reference, rad."""
+    """The comparison of two wheels with one reference, which is a gyro or the command.
+
+    It holds the sums, over several lines, of the turns of both wheels and of the range in which the
+    reference says that the true turn lies, rad.
+    """
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
@@ -69,8 +74,8 @@ class _Ballot:
     def add(self, own: float, other: float, low: float, high: float) -> None:
         """Add one line.
 
-        `own` and `other` are the turns of the suspect wheel and the other one, and `low` and `high`
-        are the range of the true turn, all in rad.
+        `own` and `other` are the turns of the suspect wheel and of the other one. `low` and `high`
+        are the bounds of the true turn. All are in rad.
         """
         self._own += own
         self._other += other
@@ -89,7 +94,7 @@ class _Ballot:
 
     @property
     def share(self) -> float:
-        """The difference as a share of the faster wheel's turn."""
+        """Difference between the two wheels, divided by the turn of the faster one."""
         return self.apart / (max(abs(self._own), abs(self._other)) or 1.0)
 
     def _off(self, turned: float) -> float:
@@ -103,16 +108,16 @@ class Suspect:
         self.forget()
 
     def forget(self) -> None:
-        """Start over, without a sign."""
+        """Start a new test, in which the wheel has shown no sign of a fault."""
         self.sign: WheelFault | None = None
         self._lines = 0
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
         self._begun: float | None = None
         """Size of the angle that the wheel turned in the first line of the test, rad; None before
-        it."""
+        that line."""
         self._known = False
-        """Whether the command was a reference in any line of the test."""
+        """Whether the command could serve as a reference in any line of the test."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
         """Add a line, and return whether the wheel shows a sign of a fault.
@@ -136,8 +141,7 @@ class Suspect:
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
         """Return the sign of a fault in this line, None without one.
 
-        The previous sign stays while all signs look alike: at rest, and when the speed crosses
-        zero.
+        At rest and while the speed crosses zero, all signs look alike, so the previous one stays.
         """
         if self.sign == "stuck" and same:
             return "stuck"
@@ -163,8 +167,8 @@ class Suspect:
             other: The angle by which the other wheel of its side turned, rad.
             dt: Duration of the line, s.
             count: Angle of an encoder count, rad.
-            expected: The command, and the speed of a wheel that follows it slowly.
-            gyro: The true angle of this side according to a gyro, rad, or None.
+            expected: The commanded and the expected speed of this side.
+            gyro: The true angle of this side according to a gyro, rad; None without a gyro.
         """
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
@@ -178,7 +182,7 @@ class Suspect:
             self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether this wheel is faulty, rather than the other wheel of its side.
+        """Return whether the test has shown that this wheel, and not the other one, is faulty.
 
         `count` is the angle of an encoder count, rad.
         """
@@ -192,18 +196,17 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return whether slip of the other wheel cannot explain the difference."""
+        """Return whether the difference is too large to be slip of the other wheel."""
         return self.sign != "stuck" or ballot.share >= STUCK
 
 
 class Stuck:
     """The test of one wheel for a speed that stays the same although it must change.
 
-    At a steady speed a stuck encoder reports the same as a sound one. Nothing can detect it then,
-    and it does not harm the pose. When the command changes, a sound wheel must report another
-    speed. Even a slow wheel must do so as soon as its angle differs by a few counts from the angle
-    at the old speed. If the other wheel of the side has followed the new command, the motors obeyed
-    it, so this encoder is stuck.
+    At a steady speed, a stuck encoder reports the same as a sound one. Nothing can detect the fault
+    then, and it does not harm the pose. When the command changes, a healthy wheel must report
+    another speed as soon as its expected angle differs by a few counts from the angle at the old
+    speed. If only the other wheel of the side reports another speed, this encoder is stuck.
     """
 
     def __init__(self) -> None:
@@ -214,7 +217,7 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether `command`, rad/s, differs from the one at the first repetition."""
+        """Return whether `command`, rad/s, changed since the wheel began to repeat its speed."""
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
@@ -222,14 +225,14 @@ class Stuck:
 
         Args:
             same: Whether the wheel turns and repeats the speed of the line before.
-            apart: Angle by which the other wheel turned further in the line, rad.
+            apart: Angle by which the other wheel turned further than this one reports, rad.
             dt: Duration of the line, s.
             count: Angle of an encoder count, rad.
-            expected: The command, and the speed of a wheel that follows it slowly.
+            expected: The commanded and the expected speed of this side.
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
-        if not (same and abs(leaves) >= LEAVES):  # this also holds for the first line
+        if not (same and abs(leaves) >= LEAVES):  # also true in the first line, because of the NaN
             self._begin(slow, command)
             return False
         self._seconds += dt
@@ -245,14 +248,18 @@ class Stuck:
 
 
 def stands(own: float, other: float) -> bool:
-    """Return whether a wheel that turned `own` rad stands, if the other one turned `other` rad."""
+    """Return whether a wheel that turned `own` rad counts as standing.
+
+    `other` is the turn of the other wheel of the same side, rad.
+    """
     return own == 0.0 or abs(own) <= DEAD * abs(other)
 
 
 def reverses(own: float, other: float, count: float) -> bool:
     """Return whether a wheel that turned `own` rad reports about the opposite of the other one.
 
-    `other` is the turn of the other wheel, and `count` the angle of an encoder count, both in rad.
+    `other` is the turn of the other wheel of the same side, and `count` is the angle of an encoder
+    count, both in rad.
     """
     return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
 

@@ -20,9 +20,9 @@ deviation. Each step updates both parts, and their sum is published (' means tra
   (`error_model.columns`).
 
 The covariance in nav_msgs/Odometry is that of x and y in the axes of odom, and of yaw. To first
-order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw it is
-the covariance of e in the axes of base_link. The latter is right even if the heading is so
-uncertain that the possible positions form an arc and not an ellipse.
+order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw, P_total
+is the covariance of e in the axes of base_link. This rotated covariance is right even if the
+heading is so uncertain that the possible positions form an arc and not an ellipse.
 
 The noise of a turn depends on |dyaw|. On a straight drive, the encoder counts of both sides arrive
 at different times, so the heading turns back and forth by one count. The sum of |dyaw| over all
@@ -51,11 +51,11 @@ from acsard.core.motion.second_order import SecondOrder
 from acsard.core.values import PoseCovariance
 
 MAX_VARIANCE = 1e9
-"""Largest variance, m2 or rad2. It means "unknown", and it keeps the numbers finite for years."""
+"""Largest variance of the pose, m2 or rad2. It means "unknown", and keeps the numbers finite."""
 
 COARSE_COUNTS = 400
-"""Encoder counts per wheel turn that are assumed if none are configured. Few encoders have
-fewer."""
+"""Encoder counts per wheel turn that are assumed if the configuration has no number. Few encoders
+have fewer."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
@@ -76,24 +76,27 @@ These terms change slowly, so they need no update in each step.
 
 
 class PoseUncertainty:
-    """The covariance of the pose, in plain floats because it is updated at 100 Hz."""
+    """Computes the covariance of the pose, in plain floats because it is updated at 100 Hz."""
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start at the pose 0, 0, 0. `counts` are encoder counts per wheel turn, 0 if unknown."""
+        """Start at the pose 0, 0, 0.
+
+        `counts` is the number of encoder counts per wheel turn, 0 if unknown.
+        """
         self._model = model
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
-        """Motion along the x and y axes of odom, and distance that the wheels rolled, since the
-        last update of the second-order terms, m."""
+        """Since the last update of the second-order terms: motion along the x and y axes of odom,
+        and distance that the wheels rolled, m."""
         self.set(0.0)
 
     def bend(self) -> None:
-        """Use the present columns and track of the model from now on.
+        """Use the present effective track of the error model, and its columns, from now on.
 
-        The number of columns must not have changed. The effects of earlier steps stay.
+        The number of columns must not have changed. The errors from earlier steps stay.
         """
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns
@@ -103,15 +106,16 @@ class PoseUncertainty:
     def _stand_within(self, angle: float) -> None:
         """Set the angle of one encoder count, rad.
 
-        It determines the dead band and the uncertainty of the position within a count. A side is
-        the mean of two wheels, each of which may stand anywhere within its count.
+        This angle determines the dead band of the heading. It also makes the pose uncertain,
+        because each wheel may stand anywhere between two counts. Each side is the mean of two
+        wheels.
         """
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: float) -> None:
-        """Reset the covariance to its initial value. `yaw` is the heading of the new pose, rad."""
+        """Reset the covariance to that of an initial pose with the heading `yaw`, rad."""
         xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
@@ -119,12 +123,13 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of J: those of the parameters, then those of the gyro's scale and of gaps.
+        """The columns of J: for each parameter, for the gyro's scale and for motion in gaps.
 
-        The last two are added when they have an effect for the first time.
+        Each is the error of the pose if its parameter is off by one standard deviation. The last
+        two are added when they have an effect for the first time.
         """
         self._of_gyro = self._of_gaps = -1
-        """Indices of the columns for the gyro's scale and for motion in gaps; -1 without one."""
+        """Indices in `_columns` for the gyro's scale and for motion in gaps; -1 without one."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
@@ -138,7 +143,7 @@ class PoseUncertainty:
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
         variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE,
     ) -> None:  # fmt: skip
-        """Add a step, which is an arc.
+        """Update the covariance after a step, which is an arc.
 
         Args:
             distance: the length of the arc, m.
@@ -173,7 +178,10 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Add variances to the last step: `along` (distance, m2) and `yaw` (turn, rad2)."""
+        """Make the last step more uncertain.
+
+        `along` is the further variance of its distance, m2, and `yaw` that of its turn, rad2.
+        """
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
@@ -181,12 +189,12 @@ class PoseUncertainty:
     def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
         """Add the uncertainty of a gap in the feedback, during which the pose was not updated.
 
-        The motions that the pose missed in several gaps add up instead of averaging out, so they
-        have a column of J like a parameter.
+        The motions that the pose missed in several gaps add up and do not average out, so they are
+        treated like the error of a parameter.
 
         Args:
             distance: the distance that the robot probably moved in the gap, m.
-            turn: the angle that it probably turned, rad.
+            turn: the angle that the robot probably turned in the gap, rad.
             along: the variance of the distance, m2.
             yaw: the variance of the turn, rad2.
         """
@@ -199,7 +207,8 @@ class PoseUncertainty:
         self._columns = [*self._columns]
         gone_on = plus(self._columns[self._of_gaps], (c * distance, s * distance, turn))
         self._columns[self._of_gaps] = gone_on
-        # The unknown motion may be an arc to the left or to the right, so add a variance sideways.
+        # The unknown motion may be an arc to the left or to the right, so the position also becomes
+        # uncertain sideways.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
         way_along, way_yaw, both = self._model.noise.of(distance, turn, abs(turn))
         p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
@@ -207,7 +216,7 @@ class PoseUncertainty:
         self._publish()
 
     def _widen(self) -> int:
-        """Add a column to J that has had no effect so far, and return its index."""
+        """Add a column of zeros to J, for an error without an effect so far; return its index."""
         self._effects = (*self._effects, NO_EFFECT)
         self._columns = [*self._columns, ORIGIN]
         self._columns_before = [*self._columns_before, ORIGIN]
@@ -215,16 +224,16 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Publish that the pose is unknown, if the robot moves.
+        """Publish that the whole pose is unknown if the robot moves.
 
-        This method is called when the position or the heading is unknown. A motion then makes both
-        of them unknown.
+        Call this when the position or the heading is unknown already. A motion then makes both
+        unknown.
         """
         if distance or turn:
             self.covariance = NOWHERE
 
     def _beyond_play(self, turn: float) -> float:
-        """Return the part of `turn` beyond the dead band of one count, rad."""
+        """Return the part of `turn` that leaves the heading's dead band of one count, rad."""
         self._turned += turn
         off = self._turned - self._middle
         if abs(off) <= self._play:
@@ -236,12 +245,11 @@ class PoseUncertainty:
     def _bend(
         self, distance: float, turn: float, dx: float, dy: float, scale: float | None
     ) -> None:
-        """Update the columns: J <- F J + G_p.
+        """Update the matrix J of the parameters' effects after a step: J <- F J + G_p.
 
         Half of the heading error of the step acts on the displacement of the step itself, because
-        the direction of the chord is the old heading plus half of the turn. `scale` is the relative
-        standard deviation of the scale of the gyro that measured the turn, or None if the wheels
-        measured it.
+        the direction of the chord is the old heading plus half of the turn. If a gyro measured the
+        turn, `scale` is the relative standard deviation of its scale, otherwise None.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
@@ -263,7 +271,7 @@ class PoseUncertainty:
         self._dx = self._dy = self._rolled = 0.0
 
     def _end_stretch(self) -> None:
-        """Add the second-order terms of the path since the last update."""
+        """Add the second-order terms (`second_order.py`) for the path since the last update."""
         dx, dy, p = self._dx, self._dy, self._p
         before = carried(self._before, dx, dy)
         columns_before = [seen_from(column, dx, dy) for column in self._columns_before]

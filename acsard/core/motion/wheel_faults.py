@@ -15,8 +15,8 @@ Every other contradiction counts as slip, and so does a faulty encoder until the
 most one wheel of each side is ignored. A wheel that is blocked or dragged looks like one with a
 dead encoder, so it is ignored too. The other wheel shows the distance driven.
 
-If a wheel turns after a rest without a command, a hand or a slope turns it. This is reported, but
-it is never a fault, because the daemon could only react with the zero that it already sends.
+If a wheel turns after a rest without a command, a hand or a slope turns it. This motion is reported
+but it is never a fault, because the daemon could only react with the zero that it already sends.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ COARSEST, FINEST = math.tau / 16, math.tau / 2000
 that turns slowly reports one count or none per line."""
 
 RECUR, SOUGHT = 3, 1000
-"""Number of times that a small angle must recur to be taken as a count, and number of lines in
-which it must do so. A single small angle may come from a damaged line."""
+"""Number of times that a small wheel angle must occur to be taken as one encoder count, and number
+of lines within which it must do so. A single small angle may come from a damaged line."""
 
 LEAST = 0.005
-"""Smallest speed that a feedback line can report, rad/s. It reports a smaller one as zero."""
+"""A commanded wheel speed below this, rad/s, counts as zero: a line shows it as 0.00."""
 
 ROLLED_S, REPEATED_S = 0.2, 1.0
-"""Time for which wheels must turn without a command before this is reported, and least time between
-two such reports, s. A robot that rocks as it comes to rest is not being pushed."""
+"""Time for which wheels must turn without a command before the daemon reports that, and least time
+between two such reports, s. A robot that rocks as it comes to rest is not being pushed."""
 
 SLIP_S = 0.5
 """Time after the last contradiction for which a side still counts as slipping, s."""
 
 SLIP_REPORTED_S = 0.1
-"""Duration of a contradiction after which a slip is logged, s."""
+"""Duration of a contradiction between two wheels of a side after which it is logged as slip, s."""
 
 BACK_S = 0.5
 """Duration of rolling for which an ignored wheel must agree with the other one before the pose uses
 it again, s."""
 
 Same = tuple[bool, bool, bool, bool]
-"""Whether each wheel repeats the speed of the line before, in `WHEELS` order."""
+"""Whether each wheel reports the same speed as in the line before, in `WHEELS` order."""
 
 NONE: Same = (False, False, False, False)
 
@@ -78,7 +78,7 @@ class _Side:
         self._suspects = (Suspect(), Suspect())
         self._stuck = (Stuck(), Stuck())
         self.out: int | None = None
-        """Index of the ignored wheel: 0 for the front one, 1 for the rear one, None without one."""
+        """Index of the wheel that the pose ignores: 0 front, 1 rear, None if it ignores none."""
         self._fault: WheelFault = "dead"
         self.late = False
         """Whether a wheel that is not ignored turns too slowly."""
@@ -90,12 +90,12 @@ class _Side:
 
     @property
     def left_out(self) -> str:
-        """The name of the ignored wheel, "" without one."""
+        """The name of the wheel that the pose ignores, "" without one."""
         return "" if self.out is None else WHEELS[self.wheels[self.out]]
 
     @property
     def text(self) -> str:
-        """The trouble of the side in words, "" without any."""
+        """Words for the ignored wheel or for the slip of this side, "" without any."""
         if self.out is not None:
             return (
                 f"{self.left_out} wheel is left out of the pose: it {WORDS[self._fault]}; check "
@@ -121,7 +121,7 @@ class _Side:
             part.forget()
 
     def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
-        """Compare both wheels with their command; return whether there is evidence of a fault.
+        """Compare both wheels with their command, and return whether one of them may be faulty.
 
         Args:
             seen: The reported speeds of all wheels, rad/s.
@@ -138,9 +138,9 @@ class _Side:
         return bad or self._out_s > 0.0
 
     def fault(self, seen: Motors, limit: float) -> str:
-        """Return the words for a fault that has lasted longer than `limit` s, "" without one.
+        """Return words for a wheel fault that has lasted longer than `limit` s, "" without one.
 
-        `seen` contains the reported speeds of all wheels, rad/s, for the words.
+        `seen` contains the reported speeds of all wheels, rad/s, which the words quote.
         """
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
@@ -178,7 +178,7 @@ class _Side:
 
         Args:
             turned: The angles of all wheels in this line, rad.
-            same: Whether each wheel repeats the speed of the line before.
+            same: Whether each wheel reports the same speed as in the line before.
             dt: Duration of the line, s.
             count: Angle of an encoder count, rad.
         """
@@ -204,11 +204,11 @@ class _Side:
     ) -> bool:
         """Process a line in which the two wheels contradict each other.
 
-        Return whether the pose now ignores a wheel, or another one than before.
+        Return whether this line has proved a wheel faulty, so that the pose now ignores this wheel.
 
         Args:
             turned: The angles of all wheels in this line, rad.
-            same: Whether the front and the rear wheel repeat the speed of the line before.
+            same: Whether the front and the rear wheel report the same speed as in the line before.
             dt: Duration of the line, s.
             count: Angle of an encoder count, rad.
             by_gyro: The angle of this side according to a gyro, rad; None without a trusted one.
@@ -221,8 +221,8 @@ class _Side:
                 self._out_s = self._out_s + dt if same[self.out] else 0.0
             elif fault == "reversed" and against:
                 self._out_s += dt
-        # On a slow robot, a wheel may be called reversed by mistake, so go on with the test of the
-        # other wheel then.
+        # On a slow robot, a wheel may be called reversed by mistake. In that case, go on with the
+        # test of the other wheel.
         if fault in ("dead", "stuck"):
             return False
         self.suspected = True
@@ -271,7 +271,7 @@ class WheelFaults:
     """Checks all wheels, and decides which to ignore and whether any slips."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
-        """Start.
+        """Create the checks of all wheels of one robot.
 
         Args:
             kinematics: The kinematics of the base.
@@ -288,16 +288,17 @@ class WheelFaults:
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
-        """Whether the wheels of a side contradict each other, or did so in the last half second."""
+        """Whether wheels slip: the two wheels of a side contradict each other, or did so in the
+        last `SLIP_S`."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
         """The message if the last line shows that a hand or a slope turns wheels, otherwise ""."""
         self._late = False
         """Whether a wheel turns too slowly."""
         self._found: _Side | None = None
-        """The side with the wheel that is ignored since the last line, None without one."""
+        """The side whose wheel the last line proved faulty, None without one."""
         self.events: list[Event] = []
-        """Events of the last line."""
+        """Log events of the last line."""
 
     @property
     def status(self) -> WheelsStatus:
@@ -312,9 +313,10 @@ class WheelFaults:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """Return the wheel values, with each ignored wheel replaced by the other one of its side.
+        """Return the wheel values without those of faulty wheels, for the pose.
 
-        The values are angles, rad, or speeds, rad/s, in `WHEELS` order.
+        The value of a faulty wheel is replaced by that of the other wheel of its side, times the
+        learned ratio of the two. The values are angles (rad) or speeds (rad/s) in `WHEELS` order.
         """
         if not self._leaves_out:
             return wheels
@@ -332,10 +334,10 @@ class WheelFaults:
             side.forget()
 
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
-        """Compare a line with the command. Call this before `look`.
+        """Compare the wheel speeds in a line with their commands. Call this before `look`.
 
-        Return a text that names the faulty wheel and its fault if the lines so far prove one,
-        otherwise "".
+        If a wheel has contradicted its command for `feedback.fault_time`, return the reason of the
+        fault, which names the wheel. Otherwise return "".
 
         Args:
             commanded: The commanded speeds, rad/s; None if the motors have no power.
@@ -352,8 +354,8 @@ class WheelFaults:
         left.expected.follow(commanded.front_left, front_left, rear_left, dt, lag)
         right.expected.follow(commanded.front_right, front_right, rear_right, dt, lag)
         still = abs(commanded.front_left) < LEAST and abs(commanded.front_right) < LEAST
-        # After a stall of the host, one line covers the whole stall. It alone must not prove a
-        # fault.
+        # After a time in which this computer did not run the daemon, one line covers that whole
+        # time. This line alone must not prove a fault.
         most, count = limit / LINES_OF_EVIDENCE, self._count
         bad_left = left.watch(speeds, dt, most, count, still)
         bad_right = right.watch(speeds, dt, most, count, still)
@@ -363,7 +365,7 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Set `pushed` if wheels turn after a rest without a command, but not in every line."""
+        """Set `pushed` if wheels turn after a rest without a command, at most each `REPEATED_S`."""
         fastest = 0.0
         if still:
             fastest = max([
@@ -383,15 +385,17 @@ class WheelFaults:
     def look(
         self, turned: Motors, speeds: WheelSpeeds, dt: float, turn: float | None = None
     ) -> bool:
-        """Compare the wheels of each side in a line; return whether the pose now ignores a wheel.
+        """Compare the wheels of each side, and return whether this line proves a wheel faulty.
 
-        If it does, the caller must call `was_faulty` for the earlier lines.
+        The pose then ignores this wheel, and the caller must find the earlier lines in which it was
+        wrong (`was_faulty`).
 
         Args:
             turned: The angles of the wheels in the line, rad.
             speeds: The speeds in the line, rad/s.
             dt: Duration of the line, s.
-            turn: The turn that the wheels should show according to a trusted gyro, rad, or None.
+            turn: The turn that the wheels should show according to a gyro, rad; None without a
+                gyro that is trusted.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -442,8 +446,8 @@ class WheelFaults:
         if not slow:
             return Event("wheel_fault", "every wheel follows its command again", kind="again")
         text = (
-            f"slower than commanded: {', '.join(self.status.slow)} of the expected speed; check "
-            "load and battery, limits.wheel_speed and feedback.response_time"
+            f"wheels slower than commanded: {', '.join(self.status.slow)} of the expected speed; "
+            "check load and battery, limits.wheel_speed and feedback.response_time"
         )
         return Event("wheel_fault", text, "warning", kind="slow")
 
@@ -455,9 +459,9 @@ class WheelFaults:
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of an encoder count.
+        """Learn the angle of an encoder count from the speeds in a line.
 
-        The smallest angle per line that recurs is at least one count.
+        The smallest angle that a wheel repeatedly turns in one line is at least one count.
         """
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
@@ -476,7 +480,7 @@ class WheelFaults:
         The result is valid only while the two wheels of the other side agree.
 
         Args:
-            i: The side whose angle is returned: 0 for the left one, 1 for the right one.
+            i: The side whose angle is needed: 0 for the left one, 1 for the right one.
             turned: The angles of all wheels, rad.
             turn: The turn that the wheels should show according to the gyro, rad.
         """

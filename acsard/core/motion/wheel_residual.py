@@ -3,8 +3,8 @@
 If one wheel turns more than the other, it slips or its encoder is faulty, unless one of these
 harmless effects explains the difference:
 
-- The position of each wheel within an encoder count is unknown. This error does not grow with the
-  angle, because the next count corrects it.
+- The position of each wheel between two encoder counts is unknown. This error does not grow with
+  the angle, because the next count corrects it.
 - The wheels differ, for example in the pressure of their tyres. This difference is a constant
   fraction of the angle, so it is learned.
 - One motor reacts later than the other.
@@ -20,11 +20,11 @@ the side's angles, rad, r is the learned fraction, and c is the angle of an enco
 wheels slip if |D - r A| exceeds this limit by more than LAG_S |v - mean of v|, where v is the speed
 of the side, rad/s. This term is the effect of a motor that reacts later.
 
-Two wheels at unknown positions within a count can differ by two counts without slip. Therefore a
-slip by the fraction s at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per
-turn, a slip of a tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if the tyres may cause
-the fraction SHARE of it. With the limit COUNTS and with sums that forget old angles, such a slip is
-found within 0.2 s above 22 rad/s, and never below 11.5 rad/s.
+Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction s
+at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per turn, a slip of a tenth at
+10 rad/s is certain after 0.13 s, or after 0.26 s if the tyres may cause the fraction SHARE of it.
+With the limit COUNTS, and with sums that forget old angles, a slip of a tenth is found within 0.2 s
+above 22 rad/s, and never below 11.5 rad/s.
 """
 
 from __future__ import annotations
@@ -35,29 +35,31 @@ MEMORY_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Allowed difference as a fraction of the angle: half of 10 %, the slip that must be found."""
+"""Allowed difference of two wheels as a fraction of their angle: half of 10 %, the slip that must
+be found."""
 
 COUNTS = 1.2
-"""Allowed difference in encoder counts. Wheels without slip rarely exceed it."""
+"""Allowed difference of two wheels in encoder counts. Wheels without slip rarely exceed it."""
 
 LAG_S = 0.03
 """Allowed delay of one motor relative to the other, s."""
 
 LEAST = 0.002
-"""Additional allowed difference, rad, for speeds with two decimals and for backlash."""
+"""Further allowed difference of two wheels, rad, for speeds with two decimals and for backlash."""
 
 UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
-"""Time constants of learning the fraction, s: while the wheels agree, and while they do not."""
+"""Time constants, s, of learning by what fraction the wheels differ: while they agree, and while
+they contradict each other."""
 
 SLOWEST = 1.0
-"""Wheel speed below which the fraction is not learned, rad/s."""
+"""Wheel speed, rad/s, below which the difference of the wheels is not learned."""
 
 WILD = 0.1
-"""Fraction towards which the learned fraction moves while the wheels contradict each other. A slip
-ends soon, unlike the effect of a flat tyre."""
+"""Change of the learned fraction in `DOUBTED_S` of contradiction between the wheels. Slip ends
+before that, but the effect of a flat tyre stays and so is learned."""
 
 
 class Residual:
@@ -65,11 +67,11 @@ class Residual:
 
     def __init__(self) -> None:
         self.ratio = 0.0
-        """Learned fraction by which the front wheel turns more than the rear one."""
+        """Learned fraction by which the front wheel turns further than the rear one."""
         self.learns = True
         self.slips = False
-        """Whether the difference is too large for a motor that reacts later. Valid only while the
-        wheels contradict each other."""
+        """Whether the wheels differ by more than a motor that reacts later can cause. Valid only if
+        the last `add` returned False."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
@@ -100,16 +102,16 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the usual ratio of the angles of this side's two wheels.
+        """Return the learned ratio of the wheel angles: front / rear if `front`, else rear / front.
 
-        If `front` is true, the ratio is front / rear, otherwise rear / front.
+        The rear wheel's angle times front / rear replaces the angle of a faulty front wheel.
         """
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
 
     @property
     def rolling(self) -> bool:
-        """Whether the wheels roll fast enough to show a difference."""
+        """Whether the wheels roll fast enough to show a difference (`SLOWEST` on average)."""
         return self._way > SLOWEST * MEMORY_S
 
     def _learn(self, more: float) -> None:

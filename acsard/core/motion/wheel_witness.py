@@ -37,7 +37,8 @@ RATIO_S = 2.0
 """Duration of driving over which a wheel's angle is compared with the expected one, s."""
 
 TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
-"""Ratios below which a wheel is too slow, and above which it no longer is."""
+"""Ratios of measured to expected speed: below the first a wheel is too slow, and above the second
+it no longer is."""
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
 
@@ -46,8 +47,8 @@ FAULTS: dict[FaultKind, str] = {
     "motor d also mcu.trailing_comma",
     "reversed": "turns against its command: check the motor's leads, the A and B lines of its "
     "encoder, and its sign in mcu.wheels",
-    "runaway": "turns faster than commanded: the motor driver or its encoder is at fault",
-    "stuck": "reports one and the same speed: its encoder is stuck",
+    "runaway": "turns faster than commanded: check the motor driver and the encoder",
+    "stuck": "reports a speed that never changes: its encoder is stuck",
 }
 
 
@@ -59,9 +60,9 @@ class Expected:
         self._begins = self.settled = self.clear = False
 
     def forget(self) -> None:
-        """Start over, with the speed in the next line as the expected speed.
+        """Start over, with the speed in the next feedback line as the expected speed.
 
-        The wheels may still coast, so rest is not the right start.
+        The wheels may still coast, so 0 would be a wrong start.
         """
         self.commanded, self._begins, self.clear = 0.0, True, False
 
@@ -89,11 +90,15 @@ class Expected:
 
 
 class Witness:
-    """The evidence that one wheel does not obey its command, and the ratio of the two speeds."""
+    """The evidence that one wheel does not obey its command.
+
+    It also measures whether the wheel is slower than expected.
+    """
 
     def __init__(self) -> None:
         self.driven = False
-        """Whether the wheel turned on command and has not come to rest since the command ended."""
+        """Whether any wheel is commanded to turn, or this wheel still turns since such a command.
+        """
         self.ratio = 1.0
         """Angle that the wheel turned in the right direction during the last `RATIO_S` s of
         driving, divided by the expected angle."""
@@ -102,7 +107,7 @@ class Witness:
         self.forget()
 
     def forget(self) -> None:
-        """Start over, but keep `driven`: whether the wheel must still come to rest."""
+        """Drop the evidence of faults, but keep `driven`, `ratio` and `slow`."""
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
         self._seen, self._begins = 0.0, True
@@ -113,8 +118,8 @@ class Witness:
         # already too fast would never count as slowing down: slow motors latched "runaway" that
         # way.
         self._nearest = math.inf
-        """How far the wheel was from obeying when it last approached the command, rad/s: its speed
-        if it was too fast, otherwise its speed against the direction of the command."""
+        """How far the wheel was from obeying when it last approached the command, rad/s. This is
+        its speed if it was too fast, otherwise its speed against the direction of the command."""
         self._wrong = False
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0
@@ -143,7 +148,8 @@ class Witness:
         moving = size > SLACK and expected.settled
         fast = driven and turns > 1.5 * fastest + SLACK
         against = moving and speed * goal < 0.0 and turns > 0.3 * size
-        # A wheel that slows down to its command sooner than `response_time` says is not dead.
+        # A wheel that slows down sooner than `response_time` says is not dead, so compare its speed
+        # with the smaller one of command and expected speed.
         dead = moving and least > SLACK and abs(seen) < 0.1 * least
         wrong = fast or against or dead
         off = turns if fast else -math.copysign(1.0, command) * speed

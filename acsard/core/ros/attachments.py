@@ -27,7 +27,6 @@ class Attachment(Struct, frozen=True):
     """The 16 bytes that identify the publisher or client."""
 
     def pack(self) -> bytes:
-        """Return the attachment as bytes."""
         return _LAYOUT.pack(self.sequence, self.stamp_ns, GID_BYTES, self.gid)
 
 
@@ -35,7 +34,7 @@ def unpack(data: bytes) -> Attachment:
     """Return the attachment in these bytes. Raises `DecodeError` if it is missing or not valid."""
     if not data:
         raise DecodeError(
-            "no_attachment", "has no attachment, but rmw_zenoh gives every sample one"
+            "no_attachment", "the message has no attachment, but rmw_zenoh adds one to each"
         )
     if len(data) != _LAYOUT.size:
         raise DecodeError(

@@ -1,12 +1,12 @@
 """The table of topics in MCAP files and live viewers: name, ROS type and message definition.
 
-Each topic is encoded as CDR and carries its message definition (`ros2msg` of MCAP), so Foxglove,
+Each topic is encoded as CDR and comes with its message definition (`ros2msg` of MCAP), so Foxglove,
 Lichtblick and PlotJuggler can read it. No topic may have another encoding, because `ros2 bag play`
-refuses such a file.
+refuses a file with one.
 
 ROS has no type for `state`, so this topic has a type of the package `acsard` (`shapes.py`). `ros2
-bag play` skips this topic with a message, but the programs above show it. The names and types
-of all other topics come from `transports.py`. The definitions are those of ROS 2 Jazzy and later.
+bag play` skips this topic with a message, but the viewers show it. The names and types of the
+topics in ROS come from `transports.py`. The definitions are those of ROS 2 Jazzy and later.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from acsard.core.ros.shapes import Log, State, state
 from acsard.core.ros.transports import PUBLISHED
 
 OURS = "acsard/msg/"
-"""Prefix of the types that ROS does not have. An MCAP file contains their definitions too."""
+"""Prefix of the message types that ROS does not have."""
 
 Field = tuple[str, str]
-"""Type and name of a field."""
+"""Type and name of a field of a message."""
 
 _TEXT = """
 builtin_interfaces/msg/Time: int32 sec, uint32 nanosec
@@ -111,7 +111,8 @@ def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
 
 
 _DECLARED = _parsed(_TEXT)
-"""The constants and fields of each type, in order, each as its type and the text after the type."""
+"""The constants and fields of each type, in order. Each is a pair: its type, and the text after
+it."""
 
 DEFINITIONS: dict[str, tuple[Field, ...]] = {
     name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
@@ -158,12 +159,15 @@ SOURCE = "<source>"
 
 
 class Channel(Struct, frozen=True):
-    """A topic. If its name contains `<source>`, there is one such topic for each command source."""
+    """A topic of MCAP files and live viewers.
+
+    If its name contains `<source>`, there is one such topic for each command source.
+    """
 
     name: str
     """Topic name relative to the namespace."""
     native: str
-    """Native key with the same messages."""
+    """Native Zenoh key of the same messages, below the robot's id."""
     schema_name: str
     """ROS type as `pkg/msg/Name`."""
     message: type[Struct]
@@ -176,7 +180,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def schema(self) -> str:
-        """The message definition with the definitions of all nested types."""
+        """The message definition, with the definitions of all nested types, in MCAP's `ros2msg`."""
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
@@ -198,13 +202,13 @@ TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 STATE = Channel("state", "state", OURS + "RobotState", State)
 
 LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
-"""The events, each as one log message."""
+"""The topic of the robot's events. Each event is one log message."""
 
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""The commands of each source. The stamp of a message is the arrival time of the command."""
+"""The topics of the commands of each source. The stamp of a message is the arrival time."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
-"""The channels of the messages that `Report` builds, by native key."""
+"""The channels of the messages that `Report` (`messages/report.py`) builds, by native key."""
 
 CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 

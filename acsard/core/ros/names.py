@@ -1,8 +1,8 @@
 """Makes the Zenoh keys and liveliness tokens of ROS 2 topics and services.
 
-zenoh-bridge-ros2dds uses the name of a topic as its key. rmw_zenoh_cpp adds the domain, the type
-and the hash of the type, so no message arrives if the hash is wrong. The robot's own topics are in
-`core/ros/transports.py`.
+zenoh-bridge-ros2dds uses the name of a topic as its Zenoh key. The key of rmw_zenoh_cpp also
+contains the domain, the type and the hash of the type, so no message arrives if the hash is wrong.
+The robot's own topics are in `core/ros/transports.py`.
 
 A token announces an endpoint to ROS. Messages arrive without it, but `ros2 topic list` and
 `wait_for_service` do not find the endpoint. The formats of tokens, QoS strings and GIDs are those
@@ -69,12 +69,15 @@ def full_name(namespace: str, name: str) -> str:
 
 
 def bridge_key(name: str) -> str:
-    """Return the key of zenoh-bridge-ros2dds for a fully qualified name."""
+    """Return the key of a topic or service with zenoh-bridge-ros2dds. `name` is fully qualified."""
     return name.removeprefix("/")
 
 
 def rmw_key(domain: int, name: str, type_name: str) -> str:
-    """Return the key of rmw_zenoh_cpp for a fully qualified name and its type."""
+    """Return the key of a topic or service with rmw_zenoh_cpp.
+
+    `name` is fully qualified. `type_name` is the type as `pkg/msg/Name`.
+    """
     return f"{domain}/{name.removeprefix('/')}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}"
 
 
@@ -85,13 +88,13 @@ def dds_type(type_name: str) -> str:
 
 
 Kind = Literal["MP", "MS", "SS"]
-"""Kind of an endpoint in a token: publisher, subscription or service server."""
+"""Kind of an endpoint in a token: publisher (MP), subscription (MS) or service server (SS)."""
 
 RMW_DEFAULT_DEPTH = 42
 
 
 class Qos(Struct, frozen=True):
-    """QoS profile of an endpoint."""
+    """QoS profile of a publisher or a subscription in ROS."""
 
     depth: int = 10
     """Number of samples that are kept."""
@@ -148,7 +151,7 @@ def rmw_qos(qos: Qos) -> str:
 
 
 def gid(token: str) -> bytes:
-    """Return the GID of an endpoint: the XXH3-128 hash of its token, low half first, 16 bytes."""
+    """Return the GID of an endpoint, 16 bytes: the XXH3-128 hash of its token, little endian."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 

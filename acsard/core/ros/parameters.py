@@ -1,10 +1,9 @@
 """Offers the configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
 
 A parameter has the name of its key in `acsard.toml`, with dots between table and key. Only the
-settings in `core/config/live.py` can be set. This module only decodes a request to set parameters.
-The robot accepts or refuses it. The description and the range of a parameter come from the types in
-`core/config/settings.py`. The module also contains the types of rcl_interfaces, because no other
-module uses them.
+settings in `core/config/live.py` can be set. This module decodes a request to set parameters, and
+`core/robot.py` accepts or refuses it. The description and the range of a parameter come from the
+types in `core/config/settings.py`. The structs of this module are types of rcl_interfaces.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class IntegerRange(Struct, frozen=True):
 
 
 class ParameterDescriptor(Struct, frozen=True):
-    """Descriptor of a parameter."""
+    """Type, description and range of a parameter, as `ros2 param describe` shows them."""
 
     name: str
     type: Unsigned8
@@ -58,7 +57,10 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """Return the descriptor of a parameter. `type_of` is its ROS type, 0 if it does not exist."""
+    """Return the descriptor of the parameter `name`.
+
+    `type_of` is the number of its type in ROS, 0 if the parameter does not exist.
+    """
     if not type_of:
         return ParameterDescriptor(name, type_of)
     return _described(name, type_of)
@@ -90,8 +92,8 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 def kind_of(name: str) -> inspect.Type:
     """Return the declared type of the setting with the dotted key `name`.
 
-    The key contains the name of a source in place of its index. Raises `KeyError` for the name of a
-    table.
+    For a command source, the key contains the name of the source. Raises `KeyError` for the name of
+    a table.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
@@ -111,16 +113,15 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List of parameters to set.
+"""List of at most 128 parameters to set. A robot has fewer parameters.
 
-The bound is above the number of all parameters. Decoding a longer list would take too much of the
-time of a control step.
+Decoding a longer list would take too much of the time of a control step.
 """
 Many = Annotated[list[T], Meta(max_length=256)]
 """List of names. It may be longer than `Some`, because names take less time to decode."""
 
 MAX_REQUEST_BYTES = 16384
-"""Largest size of a request, bytes. The longest allowed list of names fits."""
+"""Largest size of a request, bytes. A list of all names fits."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
@@ -160,7 +161,7 @@ class SetParametersResult(Struct, frozen=True):
 
 
 class ListRequest(Struct, frozen=True):
-    """Request to list parameters."""
+    """Request of the service `list_parameters`."""
 
     prefixes: Many[str]
     """Prefixes of the names to list. If there are none, all names are listed."""
@@ -169,56 +170,57 @@ class ListRequest(Struct, frozen=True):
 
 
 class ListReply(Struct, frozen=True):
-    """Reply with parameter names, and with their prefixes: the parts before the last dot."""
+    """Reply of `list_parameters`. A prefix is the part of a name before the last dot."""
 
     names: list[str]
     prefixes: list[str]
 
 
 class Names(Struct, frozen=True):
-    """Request of the services that get values, types and descriptors."""
+    """Request of the services that return values, types or descriptors of the named parameters."""
 
     names: Many[str]
 
 
 class Values(Struct, frozen=True):
-    """Reply with values."""
+    """Reply of `get_parameters`."""
 
     values: list[ParameterValue]
 
 
 class Types(Struct, frozen=True):
-    """Reply with types."""
+    """Reply of `get_parameter_types`: the number of the type of each parameter."""
 
     types: list[Unsigned8]
 
 
 class Descriptors(Struct, frozen=True):
-    """Reply with descriptors."""
+    """Reply of `describe_parameters`."""
 
     descriptors: list[ParameterDescriptor]
 
 
 class SetRequest(Struct, frozen=True):
-    """Request of both services that set parameters."""
+    """Request of `set_parameters` and of `set_parameters_atomically`."""
 
     parameters: Some[Parameter]
 
 
 class SetReply(Struct, frozen=True):
-    """Reply with one result for each parameter."""
+    """Reply of `set_parameters`, with one result for each parameter."""
 
     results: list[SetParametersResult]
 
 
 class SetAtomicallyReply(Struct, frozen=True):
-    """Reply with one result for all parameters."""
+    """Reply of `set_parameters_atomically`, with one result for all parameters."""
 
     result: SetParametersResult
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters. `Parameters` cannot answer them, because the robot decides."""
+"""The services that set parameters. The class `Parameters` only reads, so it does not answer
+them."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
@@ -251,7 +253,7 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 class Parameters:
     """Answers the services that only read parameters.
 
-    The values come from `tables`, a configuration as `effective` returns it.
+    `tables` is the configuration: tables with their keys, as `effective` returns it.
     """
 
     def __init__(self, tables: Mapping[str, object]) -> None:
@@ -264,9 +266,9 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """Return the reply to a request. Raises `CdrError` if the request is not valid.
+        """Return the reply to the request `payload`, both in CDR.
 
-        `payload` is the request in CDR, and the reply is in CDR as well.
+        Raises `CdrError` if the request is not valid.
         """
         return self._services[service](payload)
 
@@ -295,7 +297,7 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """Return the values of a request to set parameters, by name.
+    """Return the new values in a request to set parameters, by the name of the parameter.
 
     Raises `CdrError` if the request is not valid.
     """

@@ -1,4 +1,4 @@
-"""Converts native messages to ROS messages with other fields: log messages and `state`.
+"""Converts acsard's messages to ROS messages with other fields: events, commands and `state`.
 
 CDR has no maps, so the counters are a list. Null is encoded as NaN (`cdr_types.py`).
 """
@@ -28,7 +28,7 @@ Natural = Annotated[int, Meta(extra={"cdr": "I"})]
 
 
 class Log(Struct, frozen=True):
-    """The message rcl_interfaces/msg/Log. `name` is the name of the event."""
+    """The ROS message rcl_interfaces/msg/Log for one event. `name` is the name of the event."""
 
     stamp: Time
     level: Byte
@@ -40,7 +40,7 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""Pattern of the beginning of a text in which `event_throttle.py` has combined several events."""
+"""Pattern of an event's text that begins with the number of events, such as "3 x"."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""
@@ -62,7 +62,7 @@ def how_often(text: str, count: int) -> str:
 
 
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
-    """Convert the command of a source to a message of `cmd_vel_in/<source>`.
+    """Convert the command of a source to a message of the topic `cmd_vel_in/<source>`.
 
     The header of the message contains the time `arrived` and the frame id `frame`.
     """

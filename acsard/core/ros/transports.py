@@ -1,8 +1,8 @@
 """The table of the robot's ROS topics and services, with the native key of each.
 
-A message on a ROS key means the same as on its native key, in both directions. The table serves two
-transports: zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw"). The bus declares its ROS
-endpoints from this table.
+A native key is acsard's own Zenoh key. A ROS key is the Zenoh key that a ROS transport uses for the
+same messages. There are two transports: zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw").
+The bus declares its ROS endpoints from this table.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ Transport = Literal["bridge", "rmw"]
 
 
 class RosName(Struct, frozen=True):
-    """A topic or service, and the native key that it stands for."""
+    """A ROS topic or service, and acsard's own (native) key that it stands for."""
 
     name: str
     """Name relative to the namespace."""
     native: str
-    """Native key."""
+    """Native key, below the robot's id."""
     direction: Direction
-    """Direction of the native key. In ROS a query is a service too."""
+    """Direction of the native key. A query is a service in ROS."""
     type: str
     qos: Qos = Qos()
 
@@ -60,7 +60,7 @@ class Endpoint(Struct, frozen=True):
     direction: Direction
     key: str
     token: str
-    """Liveliness token, or "" if the endpoint is not announced. The GID is derived from it."""
+    """Liveliness token, or "" if the endpoint is not announced. The endpoint's GID is its hash."""
     latched: bool
     """True if a new subscriber receives the last message at once."""
     type: str
@@ -93,8 +93,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Prefix of the parameter services in `RosName.native`. They have no native key; `config` is the
-native key with the same content."""
+"""Prefix of the parameter services in `RosName.native`, because they have no native key. The native
+key `config` returns the same settings."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -120,11 +120,11 @@ URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, tr
 """The topic of the robot's URDF. It is not recorded, so it is not in `PUBLISHED`."""
 
 SLOWER = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
-"""Subscription to Nav2's speed filter."""
+"""Subscription to the speed limits of Nav2's speed filter."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
-"""Subscription to a gyro. It is best effort, so that it also accepts gyro drivers that publish with
-SensorDataQoS."""
+"""Subscription to the samples of a gyro. It is best effort, so that it also accepts gyro drivers
+that publish with SensorDataQoS."""
 
 
 def left_out(config: Config) -> frozenset[str]:
@@ -144,9 +144,9 @@ def left_out(config: Config) -> frozenset[str]:
 
 
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
-    """Return the topics and services of a robot.
+    """Return the ROS topics and services of a robot.
 
-    A topic that accepts both types of twists appears twice, once for each type. `silent` contains
+    A topic that accepts Twist and TwistStamped appears twice, once for each type. `silent` contains
     the native keys to leave out, as `left_out` returns them.
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
@@ -177,12 +177,12 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
 
 
 def in_ros_words(text: str, ros: RosConfig) -> str:
-    """Replace native names of services by their ROS names: srv/clear becomes /acsard/clear."""
+    """Return `text` with the ROS names of services: srv/clear becomes /acsard/clear."""
     return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
-    """Return the ROS keys of the transports that are switched on.
+    """Return the endpoints of all ROS transports that are switched on.
 
     Args:
         ros: the table `[ros]` of the configuration.
@@ -217,11 +217,11 @@ def command_keys(ros: RosConfig) -> tuple[str, ...]:
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:
-    """Return the tokens with which this daemon claims the ROS name `cmd_vel`.
+    """Return the tokens with which this daemon claims the ROS name `cmd_vel` for itself.
 
-    Two daemons with the same token would both follow the same `cmd_vel`, so the second one does not
-    start. The tokens are in acsard's own tree, because not every daemon announces itself to ROS,
-    and because other ROS nodes may have the same names.
+    If another daemon has the same token, both would follow the same `cmd_vel`, so the second one
+    does not start. ROS tokens cannot serve for this: not every daemon announces itself to ROS, and
+    other ROS nodes may use the same names. So the keys of these tokens begin with `acsard/@ros/`.
     """
     name = full_name(ros.namespace, "cmd_vel")
     trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))

@@ -12,7 +12,7 @@ BITS = 10
 def garbled(data: bytes, sent: int, received: int) -> bytes:
     """Return the bytes that a receiver at `received` baud reads from `data`, sent at `sent` baud.
 
-    A byte with a wrong stop bit becomes a zero byte, because the kernel delivers it like that.
+    A byte with a wrong stop bit becomes a zero byte, as the Linux kernel delivers it.
     """
     if sent == received or not data:
         return data

@@ -2,11 +2,11 @@
 
 Without faults the simulated board does what the daemon expects of a board. It boots with stopped
 motors, obeys only complete valid lines, stops the motors after 300 ms without a valid line, and
-answers a checked line with a checked one. It shares no parser with the host, so that an error in
-one parser is not hidden by the same error in the other.
+answers a checked line with a checked one. It has its own parser, so that an error in the daemon's
+parser is not hidden by the same error here.
 
-A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The faults in `[sim]
-faults` are always on.
+A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The faults that
+`[sim] faults` lists are always on.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ RESET_NS = 2 * NS_PER_S
 SHORTEST_WINDOW_NS = 4 * MS
 """Shortest time over which the board computes speeds from encoder counts, ns.
 
-A reply within this time repeats the last speeds.
+A reply that follows sooner repeats the last speeds.
 """
 
 OUTPUT_BYTES = 255
@@ -46,13 +46,15 @@ STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
-"""Battery of six cells: voltage when empty, V; additional voltage when full, V; resistance, ohm."""
+"""The battery has six cells. The values are its voltage when empty, V, the additional voltage when
+full, V, and its internal resistance, ohm."""
 
 REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
-"""Current at rest, A, and additional current for each rad/s of each wheel, A."""
+"""Battery current at rest, A, and additional current for each rad/s of each wheel, A."""
 
 START_AMPS, START_NS = 10.0, 300 * MS
-"""Additional current while the motors start, A, and its duration, ns. The voltage drops by 2 V."""
+"""Additional battery current while the motors start, A, and its duration, ns. The battery voltage
+then drops by 2 V."""
 
 NEVER_NS = 2**62
 """Monotonic time that is never reached, ns."""
@@ -104,17 +106,17 @@ class FakeMcu(Faults):
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
         """The faults of the inputs: begin (ns), end (ns), field of the status line, and its value.
 
-        The value `silent` leaves the field out of the line. If several faults of a field are on,
-        the last one decides, except that several bumpers may be pressed at once. The line
-        contains only the fields that a fault names.
+        The status line contains only the fields that a fault names. The value `silent` leaves the
+        field out of the line. If several faults of a field are on, the last one decides, but
+        several bumpers may be pressed at once.
         """
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
         """State of charge of the battery, 0 to 1, and its capacity, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
-        """`_drained_ns` is the time at which the charge was last computed, and `_rested_ns` the
-        last time at which no motor was commanded, both ns."""
+        """`_drained_ns` is the time at which the charge was last computed. `_rested_ns` is the last
+        time at which all set points were zero. Both are ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -123,7 +125,7 @@ class FakeMcu(Faults):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The robot at the time of the last `advance`. It is computed only when it is needed."""
+        """The robot at the time of the last `advance`. Its motion is computed only when needed."""
         self._catch_up()
         return self._vehicle
 
@@ -218,7 +220,7 @@ class FakeMcu(Faults):
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _catch_up(self) -> None:
-        """Move the vehicle up to the present time, and stop the motors when the watchdog trips."""
+        """Simulate the vehicle up to now, and stop the motors when the watchdog trips."""
         vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
         deadline = self._fed_ns + self.watchdog_ns
         if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
@@ -244,7 +246,7 @@ class FakeMcu(Faults):
                 self._catch_up()
                 self._fed_ns = now_ns
             return
-        # `vehicle` moves the robot up to now first, with the set points of the last command.
+        # The property `vehicle` first simulates the robot up to now with the old set points.
         set_points = self.vehicle.set_points
         for motor, value in command.values.items():
             wheel, forward = self._wiring[self.drivers[motor]]
@@ -387,7 +389,7 @@ class FakeMcu(Faults):
     # These faults are here because they need the events of the board.
 
     def estop(self) -> Fault:
-        """Report a released emergency stop, ten times a second and at once when it changes."""
+        """Report ten times a second that the emergency stop is released."""
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
@@ -480,9 +482,10 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return the wheel that each of the motors a to d turns, and its sign.
+    """Return for each of the motors a to d the wheel that it turns, and a sign.
 
-    A wheel is an index in the order of `values.WHEELS`. The sign is -1 for a reversed motor.
+    A wheel is an index in the order of `values.WHEELS`. The sign is -1 for a reversed motor, else
+    1.
     """
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}

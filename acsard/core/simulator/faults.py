@@ -1,5 +1,6 @@
-"""The faults of the simulated board and its wire. Each fault is a method for a `with` statement.
+"""The faults of the simulated board and its wire.
 
+For each fault, a method returns a context manager, and the fault is on inside its `with` block.
 This module contains the switches of the faults, and `fake_mcu.py` implements their effects. No
 fault is random. A fault that affects only some lines affects every n-th line.
 """
@@ -16,7 +17,7 @@ from acsard.core.values import NS_PER_S
 Fault = AbstractContextManager[None]
 
 USB_PACKET = 62
-"""Number of bytes at which an FTDI adapter sends a packet without waiting for its timer."""
+"""Number of bytes at which an FTDI adapter sends a full packet without waiting for its timer."""
 
 WATCHDOG_NS = 300_000_000
 """Silence of the host after which the board stops the motors, ns."""
@@ -55,7 +56,8 @@ class Faults:
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
         self.latency_ns = 0
-        """Interval between two packets of the host's USB adapter, ns; 0 means no adapter."""
+        """Interval at which the host's USB adapter sends a packet that is not full, ns; 0 means
+        that there is no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
         """The numbers n of the faults that affect every n-th reply, command or line; 0 = off."""
@@ -72,13 +74,13 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        """Move the vehicle up to the present time with the old switches, then set the new ones."""
+        """Simulate the vehicle up to now with the old switches, then set the new ones."""
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)
 
     def _catch_up(self) -> None:
-        """Move the vehicle up to the present time. The subclass with a vehicle implements this."""
+        """Simulate the vehicle up to now. `FakeMcu`, which has a vehicle, implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
         """Count an event of kind `what`, and return whether the fault affects this event.
@@ -96,7 +98,7 @@ class Faults:
         return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
 
     def having(self, fault: NamedFault) -> Fault:
-        """Return the context manager of a fault that the configuration or command line names."""
+        """Return the context manager of a fault that `[sim] faults` or `--fault` names."""
         block: Fault = getattr(self, fault.name)(*fault.values)
         return block
 
@@ -113,7 +115,7 @@ class Faults:
         return self._with(cut_replies=True)
 
     def bias(self, wheel: int, gain: float) -> Fault:
-        """Report that motor `wheel` (0 to 3 for a to d) turns `gain` times as fast and as far."""
+        """Report `gain` times the true speed and counts of motor `wheel` (0 to 3 for a to d)."""
         return self._with(gains=[gain if i == wheel else g for i, g in enumerate(self.gains)])
 
     def stuck_encoder(self, wheel: int) -> Fault:
@@ -186,7 +188,10 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Obey each value as soon as its comma arrives, like old firmware; ignore checksums."""
+        """Obey each value as soon as the comma after it arrives, as old firmware does.
+
+        Such firmware ignores checksums.
+        """
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
@@ -236,7 +241,7 @@ class Faults:
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:
-        """Hold back all bytes to the host for `length_s` s, once every `every_s` s."""
+        """Hold back all bytes to the host for `length_s` s at a time, once every `every_s` s."""
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
     def _stalled_until(self, now_ns: int) -> int:

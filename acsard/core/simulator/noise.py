@@ -1,7 +1,7 @@
-"""Repeatable random numbers: the n-th number of a seed is always the same, in any order of calls.
+"""Repeatable random numbers: the n-th number of a seed is the same in any order of calls.
 
-The mixing function is that of SplitMix64 (Steele, Lea & Flood, Fast splittable pseudorandom number
-generators, 2014), applied to a counter, so there is no state.
+The numbers come from the mixing function of SplitMix64 (Steele, Lea & Flood, Fast splittable
+pseudorandom number generators, 2014), applied to n. So the module keeps no state.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ def uniform(seed: int, n: int) -> float:
 
 
 def gauss(seed: int, n: int) -> float:
-    """Return the n-th number of this seed, normally distributed with mean 0 and deviation 1.
+    """Return the n-th number of this seed, normally distributed.
 
-    The method is that of Box and Muller (1958).
+    The mean is 0 and the standard deviation 1. The method is that of Box and Muller (1958).
     """
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, 2 * n)))
     return radius * math.cos(math.tau * uniform(seed, 2 * n + 1))

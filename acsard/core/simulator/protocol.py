@@ -1,8 +1,9 @@
 """The serial protocol as the board implements it: the lines that it obeys, and its answers.
 
-The reference firmware (`whole`) obeys only complete valid lines, plain or with a correct suffix.
-Other firmware does not know the suffix of checked lines: `plain_only` refuses a line with a suffix,
-and `prefix` and `latched` obey its plain part. The module shares no code with the host.
+A checked line is a plain line with a suffix: a sequence number and a checksum. There is a function
+for each kind of firmware. The reference firmware (`whole`) obeys only complete valid lines, plain
+or with a correct suffix. Other firmware does not know the suffix: `plain_only` refuses a line with
+a suffix, and `prefix` and `latched` obey its plain part. The module shares no code with the host.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def prefix(line: bytes) -> Command | None:
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line like old firmware, which obeys each value that a comma follows, in any line."""
+    """Decode a line like old firmware, which obeys every value before a comma in any line."""
     values = {}
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]

@@ -1,6 +1,7 @@
-"""Observes the true state of the simulated robot a hundred times per second, and simulates a gyro.
+"""Observes the true motion of the simulated robot a hundred times per second, and simulates a gyro.
 
-The board does not use these observations. The motion that it reports comes only from its encoders.
+The simulated board does not use these observations. It reports only the motion that its encoders
+measure.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from acsard.core.simulator.noise import gauss
 from acsard.core.values import NS_PER_S, Pose
 
 LOOK_NS = NS_PER_S // 100
-"""Time between two observations, and between two samples of the gyro, ns."""
+"""Time between two observations of the simulated robot, each with a sample of its gyro, ns."""
 
 
 class Sight(Struct, frozen=True):
@@ -43,9 +44,9 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """Pairs of a time (ns) and the angle turned until then (rad).
+        """Pairs of a time (ns) and the angle that the robot has turned until then (rad).
 
-        They go back as far as the delayed samples of the gyro need.
+        The pairs go back as far as the delayed samples of the gyro need.
         """
 
     def next_ns(self) -> int:

@@ -1,4 +1,4 @@
-"""Converts a `Sight` of the simulated robot into the messages that are published."""
+"""Makes the published messages from a `Sight`, an observation of the simulated robot."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@ differ from the configured ones. With `turn_slip` the base turns less than the w
 `load` the motors are slower than their set points. A person who pushes the robot is stronger than
 the motors. Wheels are in the order of `values.WHEELS`.
 
-The true track depends on the turn rate. Let L be the configured effective track, m the setting
-`track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s that the
-wheels would give with the track m L. The base turns at the rate
+The true effective track depends on the turn rate. Let L be the configured effective track, m the
+setting `track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s that
+the wheels would give with the track m L. The base turns at the rate
 
     w / (1 + 2 k |w| / (1 + |w|))
 
@@ -95,7 +95,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the present fraction of a turn that is not lost to skidding wheels, 0 to 1."""
+        """Return the fraction of a turn that skidding wheels leave at present, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

@@ -1,6 +1,6 @@
-"""A serial connection to the simulated board in virtual time, in which waiting costs nothing.
+"""A serial connection to the simulated board in virtual time, in which waiting takes no real time.
 
-It implements the connection that `acsard mcu check` uses (`checkup.board.Wire`). With a wrong baud
+`acsard mcu check` can use it in place of a serial port (`checkup.board.Wire`). With a wrong baud
 rate, the bytes of both directions arrive garbled.
 """
 
@@ -38,7 +38,6 @@ class VirtualWire:
         return 0
 
     def send(self, data: bytes) -> None:
-        """Send bytes to the board."""
         assert self.is_open, "the connection is closed"
         self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.baud_rate))
 

@@ -66,8 +66,8 @@ DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_RO
 def _grants(role: Role) -> tuple[str, ...]:
     """Return the names of a role's rules: those for its own keys and for those of lower roles.
 
-    Only the maintainer may forward the liveliness tokens of other daemons, because a router has
-    this role.
+    Only a maintainer may forward the liveliness tokens of other daemons. Routers do so, and they
+    have this role.
     """
     own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
     return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))

@@ -90,8 +90,8 @@ def require_id(robot_id: str) -> None:
         convert(robot_id, Name)
     except ValidationError:
         raise UsageError(
-            f"{robot_id!r} is not a robot's id: write 1 to 32 of A-Z a-z 0-9 _ -, like robot.id "
-            "in its acsard.toml"
+            f"{robot_id!r} is not a robot's id: write 1 to 32 characters of A-Z a-z 0-9 _ -, like "
+            "robot.id in its acsard.toml"
         ) from None
 
 

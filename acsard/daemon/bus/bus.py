@@ -95,7 +95,7 @@ class ZenohBus:
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
-        """End the query of this ticket. It gets no more replies."""
+        """End the query of this ticket, so that it gets no more replies."""
         self._replies.retire(ticket)
 
     # Opening the session.
@@ -145,7 +145,7 @@ class ZenohBus:
             return (
                 "another robot on this bus already has ros.namespace = "
                 f'"{self._config.ros.namespace}": '
-                f"one cmd_vel of ROS over {' or '.join(transports)} would drive both; give this "
+                f"a ROS cmd_vel over {' or '.join(transports)} would drive both robots; give this "
                 "robot its own namespace, with [ros] namespace or `acsard run --namespace NAME`, "
                 f"or set {off}"
             )

@@ -1,7 +1,7 @@
-"""A thread of the bus. If an exception ends it, the daemon ends too.
+"""A thread of the bus. If an exception ends the thread, the daemon ends too.
 
-If such a thread were missing, the robot would drive on, but would no longer publish or answer. An
-exception in the thread is a bug, like one in a control step.
+Otherwise the robot would drive on, but would no longer publish or answer. An exception in the
+thread is a bug, like one in a control step.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ class BusThread(Thread):
     """A thread that stores the exception that has ended it. The control loop calls `check`."""
 
     def __init__(self, name: str, work: Callable[[], None]) -> None:
-        """Prepare the thread, which runs `work`."""
         super().__init__(name=name, daemon=True)
         self._work = work
         self._error: BaseException | None = None
@@ -22,7 +21,7 @@ class BusThread(Thread):
     def run(self) -> None:
         try:
             self._work()
-        except BaseException as error:  # noqa: BLE001 - raised again by `check`, so it ends the process
+        except BaseException as error:  # noqa: BLE001 - `check` raises it again
             self._error = error
 
     def check(self) -> None:

@@ -6,7 +6,7 @@ been replaced. `CertificateFiles.renewed` reports this. Three files cannot be re
 moment. So new files are reported only when they belong together and no longer change.
 
 The watched expiry times are those of three kinds of certificates: the robot's own, its authority's
-and the routers'. A thread reads them again and again, because a disk or a router may not answer.
+and the routers'. They are read in a thread, because a disk or a router may not answer.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class Identity(Struct, frozen=True):
             return self.silence
         if has(self.role, least):
             return ""
-        return f"{self.words()}; {key} is for a certificate that is {least}"
+        return f"{self.words()}; {key} needs at least the role {least}"
 
     @property
     def silence(self) -> str:
@@ -87,9 +87,9 @@ class Identity(Struct, frozen=True):
         if not self.role:
             return self._nobody()
         owner = (
-            f"your certificate {self.certificate} is"
+            f"your certificate {self.certificate} has the role"
             if self.certificate
-            else "you have no certificate for this link and are"
+            else "you have no certificate for this link and have the role"
         )
         return f"{owner} {self.role}: {MAY[self.role]}"
 

@@ -62,7 +62,6 @@ class Replies:
         return ticket
 
     def send(self, reply: Reply) -> None:
-        """Queue a reply to a query."""
         self._queue.put(reply)
 
     def retire(self, ticket: int) -> None:
@@ -141,8 +140,8 @@ STOPS = 16
 QUERIES = 256
 """Size of each of the three queues: services, other native queries, and slow queries.
 
-One slow query is answered per step, so the last of 256 waits 2.6 s. If a queue is full, further
-queries are refused with `BUSY`.
+One slow query is answered per step, so the last of 256 waits 2.6 s at 100 Hz. If a queue is full,
+further queries are refused with `BUSY`.
 """
 
 ATTACHMENT_BYTES = 256
@@ -204,8 +203,9 @@ class Inbox:
     def take(self, queries: int) -> BusInput:
         """Return the samples since the last call, and some of the waiting queries.
 
-        The stops come first, then the other samples in the order of their arrival. There are at
-        most `queries` queries, or one more if all of these are services and a slow query waits.
+        The stops come first, then the other samples in the order of their arrival. The queries are
+        at most `queries` service calls, one slow query even beyond that number, and other queries
+        for the rest of the number.
         """
         if not self._any:
             return NOTHING

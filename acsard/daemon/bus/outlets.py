@@ -77,7 +77,7 @@ class _Outlet:
 
 
 class Outlets:
-    """The publishers of one session."""
+    """The publishers of the daemon's session, and the thread that sends their messages."""
 
     def __init__(self) -> None:
         self._outlets: dict[str, list[_Outlet]] = {}
@@ -125,7 +125,7 @@ class Outlets:
 
     @property
     def behind(self) -> bool:
-        """True if `losses` may have losses to report."""
+        """True if `losses` may have dropped messages or a blocked bus to report."""
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:

@@ -93,10 +93,7 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
 
 
 def seen(endpoint: str, robots: int) -> str:
-    """Return a text that gives the number of robots that are visible at an endpoint.
-
-    `robots` is that number.
-    """
+    """Return a text that says that `robots` robots are visible at `endpoint`."""
     return f"all robots visible at {endpoint}: {many(robots, 'robot')}"
 
 
@@ -104,9 +101,9 @@ def nobody(endpoint: str) -> str:
     """Return a message that explains why no robot is visible at an endpoint."""
     if endpoint.startswith(TLS):
         return (
-            "no robot is visible: over TLS you must name the robots, --id robot1,robot2 (or set "
-            "[access] wildcards = true on the robot); or your certificate has no role at any "
-            "robot: `acsard whoami --id robot1` shows the role"
+            "no robot is visible. Over TLS, name the robots (--id robot1,robot2), or set [access] "
+            "wildcards = true on the robots. If that does not help, your certificate has no role "
+            "at any robot: `acsard whoami --id robot1` shows its role"
         )
     return f"no robot is visible at {endpoint}; does a daemon run there, or behind that router?"
 
@@ -164,7 +161,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
         near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
         more = len(presence.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet`)" if more else "")
-        return f"there is no robot {robot_id}, but there is {named}; use --id {near[0]}"
+        return f"there is no robot {robot_id}. The robots here are {named}; use --id {near[0]}"
     if endpoint.startswith(TLS):
         return (
             f"robot {robot_id} is not visible: no robot at {endpoint} has this robot.id, or your "
@@ -200,10 +197,10 @@ def _unpublished(key: str, row: Topic) -> str:
             )
         case "every feedback" | "with odom":
             return (
-                f"{key} is published only with answers of the microcontroller: `acsard echo "
-                "state -n 1 --short` says whether the microcontroller answers"
+                f"{key} is published only while the microcontroller answers: `acsard echo "
+                "state -n 1 --short` shows whether it does"
             )
     return (
-        f"{key} does not arrive: may you follow it (`acsard whoami` shows your role)? On the "
+        f"{key} does not arrive: may you read it (`acsard whoami` shows your role)? On the "
         "robot, `acsard doctor` checks the daemon"
     )

@@ -34,7 +34,6 @@ class Arrivals(Mailbox[zenoh.Sample]):
         return sample
 
     def undeclare(self) -> None:
-        """Undeclare the subscribers."""
         for subscriber in self.declared:
             subscriber.undeclare()
 
@@ -117,12 +116,11 @@ class Subscription:
             self.undeclare()
 
     def undeclare(self) -> None:
-        """Undeclare the subscribers."""
+        """Undeclare the Zenoh subscribers. Do nothing if the session has closed."""
         try:
             self._queue.undeclare()
         except zenoh.ZError:
-            # The session has closed, which undeclared the subscribers.
-            pass
+            pass  # closing the session has undeclared them
 
 
 def on(key: str, sample: zenoh.Sample) -> bool:

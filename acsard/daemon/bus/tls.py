@@ -302,7 +302,7 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
                 f"({now}); if the clock is right, run `acsard tls renew` on the machine that has "
-                "ca-key.pem (`--name NAME` for one of a fleet), which says what to do next"
+                "ca-key.pem (with `--name NAME` for a robot of a fleet); it says what to do next"
             )
         case code if code == NOT_YET:
             return (
@@ -314,7 +314,7 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
             return (
                 f"the certificate of the server is not for {host}; connect to a name or address "
                 f"that the certificate contains, or run `acsard tls renew --address {host}` on the "
-                "robot, which says what to do next"
+                "robot; the command says what to do next"
             )
     return (
         f"the certificate of {host} comes from another authority than {directory}/{CA} "

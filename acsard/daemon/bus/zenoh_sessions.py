@@ -110,9 +110,9 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint to which a program on this machine connects to reach a listening one.
+    """Return the endpoint with which a program on this machine connects to `endpoint`.
 
-    If `endpoint` listens on all addresses, the result names the loopback address.
+    If `endpoint` listens on all addresses, the result names the loopback address instead.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
@@ -204,7 +204,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
             f"no daemon answers at {endpoint}: "
             + (
                 reason
-                or "does `acsard run` run, does its bus.listen have this address, are fewer "
+                or "is `acsard run` running, does its bus.listen have this address, are fewer "
                 f"than {MAX_SESSIONS} clients connected? ({first_line(error)})"
             )
         ) from None

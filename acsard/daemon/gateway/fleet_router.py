@@ -138,7 +138,9 @@ class Router(Listener):
             # Read the file here, because Zenoh would not say why it cannot open it.
             file.read_bytes()
         except OSError as error:
-            raise RouterFileError(f"cannot read {file}: {error.strerror}; correct it") from None
+            raise RouterFileError(
+                f"cannot read {file}: {error.strerror}; name a file that this user may read"
+            ) from None
         try:
             self._config = zenoh.Config.from_file(str(file))
             mode = json.loads(self._config.get_json("mode"))

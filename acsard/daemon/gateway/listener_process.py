@@ -37,13 +37,13 @@ An observation takes a millisecond.
 """
 
 FIRST_NS = 5 * NS_PER_S
-"""Longest time from the opening of the session to the connection of the daemon, ns.
+"""Time within which the daemon must connect after the opening, ns. Otherwise the process restarts.
 
 It is longer than `ALONE_NS`, because the other clients connect at the same time.
 """
 
 ALONE_NS = NS_PER_S
-"""Longest time without a connection to the daemon after an earlier connection, ns."""
+"""Time within which a lost daemon must connect again, ns. Otherwise the process restarts."""
 
 REPORTS = Rate(1 / 60)
 """Largest rate of events that report that all connections are taken: one a minute."""
@@ -62,7 +62,11 @@ connections."""
 Incident = Literal["open", "full", "stuck", "alone"]
 
 Events = dict[Incident, EventName]
-"""Name of the log event for each incident."""
+"""Name of the log event for each incident.
+
+The incidents are: the session listens (`open`), all connections are taken (`full`), Zenoh hangs
+(`stuck`), and the daemon is not connected (`alone`).
+"""
 
 GATEWAY_EVENTS: Events = {
     "open": "gateway_open",
@@ -127,15 +131,21 @@ class SessionHealth:
         if observed.linked:
             self._linked_ns, self._patience_ns = observed.at_ns, ALONE_NS
         if stuck:
-            text = "Zenoh hangs, because a client takes all its time; all clients are disconnected"
+            text = (
+                "a client keeps Zenoh so busy that it does not respond; this process restarts, "
+                "which disconnects all clients"
+            )
             return Event(self._events["stuck"], text, "error")
         if observed.at_ns - self._linked_ns > self._patience_ns:
-            text = "the daemon is not connected any more; all clients are disconnected"
+            text = (
+                "the daemon is not connected any more; this process restarts, which disconnects "
+                "all clients"
+            )
             return Event(self._events["alone"], text, "warning")
         if observed.unanswered >= MAX_UNANSWERED:
             text = (
                 f"the daemon is connected, but has left {observed.unanswered} queries unanswered; "
-                "all clients are disconnected"
+                "this process restarts, which disconnects all clients"
             )
             return Event(self._events["alone"], text, "warning")
         return None
@@ -237,7 +247,7 @@ class ListenerProcess:
                 self._log.event(event)
                 return Exit.FAILURE
             if self._renewed():
-                text = "opens again with its new certificate; all clients are disconnected"
+                text = "restarts with its new certificate, which disconnects all clients"
                 self._log.info(self._listener.events["open"], text=text)
                 return Exit.FAILURE
             before_ns = now_ns

@@ -26,7 +26,7 @@ _left_open: list[int] = []
 """Descriptors that could not be closed because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
-"""Time between two checks for unsent bytes, s: a tenth of the time that a line takes."""
+"""Time between two checks for unsent bytes, s. A line takes longer at every baud rate."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
@@ -171,10 +171,10 @@ def refusal(path: str, error: OSError) -> MendableError:
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
             return NoPortError(
-                f"{path} does not exist; plug the device in, or name another ({_LISTED})"
+                f"{path} does not exist; plug the device in, or name another port ({_LISTED})"
             )
         case errno.ENOTTY | errno.EISDIR:
-            return NoPortError(f"{path} is not a serial port; name another ({_LISTED})")
+            return NoPortError(f"{path} is not a serial port; name another port ({_LISTED})")
         case errno.EACCES | errno.EPERM:
             return NotPermittedError(f"no permission to open {path}; {_JOIN}")
         case errno.EBUSY | errno.EAGAIN:

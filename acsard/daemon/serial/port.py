@@ -115,7 +115,8 @@ class SerialPort:
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Write a line that was made at `now`, and return "sent".
 
-        Otherwise drop the line, and return "down" if the port is closed, else "superseded".
+        If the port is closed, return "down". If it cannot take the line now, drop the line and
+        return "superseded".
         """
         if not self.is_open:
             return "down"

@@ -3,7 +3,7 @@
 A pty itself carries data at any baud rate. If the host sets another baud rate than the board's,
 this module garbles the data in both directions, as a real wire would. `PtyEnd` is the board's end
 of any serial line that is a pty. `Simulated` is the board that runs in the daemon's process, and
-also publishes its true state on the bus. The control loop uses its pty like a real device.
+also publishes the robot's true pose on the bus. The control loop uses its pty like a real device.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ POSE = "sim/pose"
 
 
 class Simulated(SimPty):
-    """The simulator of a daemon. It also publishes the board's true state on the bus."""
+    """The simulated board of a daemon, which also publishes the robot's true pose on the bus."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))
@@ -150,7 +150,7 @@ class Simulated(SimPty):
         self._last: tuple[Sight, int] | None = None
 
     def tell(self, bus: Bus) -> None:
-        """Publish the true state of the board on this bus from now on."""
+        """Publish the robot's true pose and the gyro's samples on this bus from now on."""
         self._bus = bus
 
     def current(self, key: str) -> Message | None:

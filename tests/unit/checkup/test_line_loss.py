@@ -76,7 +76,7 @@ def test_plain_lines_that_come_damaged_turn_no_motor() -> None:
         known(board)
         with pytest.raises(StoppedError) as end:
             line_loss.finding(board)
-    assert "arrived damaged from the board, the last `" in end.value.finding.text
+    assert "arrived damaged from the board, the last one is `" in end.value.finding.text
     assert "ground" in end.value.finding.mend
     assert robot.mcu.vehicle.angles == [0.0] * 4
 

@@ -45,9 +45,9 @@ class Restarting(Robot):
 
 
 MOMENTS = [
-    (1.0, "everything stood"),
-    pytest.param(3.5, "everything stood", marks=pytest.mark.slow),
-    (6.0, "everything stood"),
+    (1.0, "no motor turned"),
+    pytest.param(3.5, "no motor turned", marks=pytest.mark.slow),
+    (6.0, "no motor turned"),
     (9.0, "motor "),
     pytest.param(11.0, "motor ", marks=pytest.mark.slow),
     pytest.param(15.0, "motor ", marks=pytest.mark.slow),
@@ -80,7 +80,7 @@ def test_new_starts_are_counted_and_told_with_what_was_going_on(faults: tuple[st
     checked = Checked(Restarting([1.0, 9.0, 20.0], *faults))
     assert checked.failed == ["restarts"]
     assert checked["restarts"].figure == "restarted, 3 times"
-    assert "everything stood" in checked["restarts"].text
+    assert "no motor turned" in checked["restarts"].text
     assert "motor " in checked["restarts"].text
     assert not checked.left_turning
 
@@ -119,7 +119,7 @@ def test_a_supply_that_gives_in_each_time_a_motor_turns_is_named_and_not_tried_f
     found = checked["restarts"]
     assert found.figure == "restarted, twice"
     assert "while motor b (front left) turned, twice" in found.text
-    assert found.mend.startswith("use a supply for the board alone")
+    assert found.mend.startswith("use a separate supply for the board")
 
 
 class Resetting(Robot):
@@ -165,8 +165,8 @@ def test_a_board_that_does_not_come_back_is_reported() -> None:
 @each(
     ("cause", "mend"),
     [
-        ("brown-out", "use a supply for the board alone"),
-        ("power", "use a supply for the board alone"),
+        ("brown-out", "use a separate supply for the board"),
+        ("power", "use a separate supply for the board"),
         ("watchdog", "where does the firmware wait"),
         ("pin", "does a second program open the port"),
         ("unknown", "is the supply weak"),
@@ -212,7 +212,10 @@ def test_its_name_is_a_restart_unless_it_was_asked_for() -> None:
     restarts = heard(reply(0.0, 0))
     restarts.asked(1.0)
     assert restarts.look(NAME, 1.0 + ASKED_S, None) is None
-    assert sign(restarts.look(NAME, 1.1 + ASKED_S, None)) == "it sent its name without a request"
+    assert (
+        sign(restarts.look(NAME, 1.1 + ASKED_S, None))
+        == "the board sent its name without a request"
+    )
 
 
 def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_before_one() -> None:

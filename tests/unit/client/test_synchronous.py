@@ -191,7 +191,7 @@ def test_over_tls_the_role_is_named_only_if_no_command_arrives(
     found = ours.unheard(UnheardError(objection))
     assert type(found) is client.NotDrivenError
     assert str(found).startswith(objection)
-    assert ("your certificate anna is operator" in str(found)) == names_role
+    assert ("your certificate anna has the role operator" in str(found)) == names_role
 
 
 def test_over_tls_a_viewer_is_refused_whatever_the_robot_objects(

@@ -269,7 +269,7 @@ def test_clear_is_refused_while_pressed_and_a_sender_needs_a_zero_after_it() -> 
     answer = bench.answer("clear")
     assert not answer.success
     assert answer.message == (
-        "emergency stop pressed at the robot: release it there, then call srv/clear again"
+        "emergency stop pressed at the robot: release it at the robot, then call srv/clear again"
     )
     assert bench.mode() == "stopped"
     bench.status(OK_LINE).step(GO)
@@ -297,7 +297,7 @@ def test_a_press_is_latched_in_every_mode(before: str) -> None:
         case "stopped":
             bench.step(ask="stop")
         case "fault":
-            bench.step(guard_trip="it is not a whole line of four wheels")
+            bench.step(guard_trip="it is not a complete line with four wheel speeds")
         case "inactive":
             bench.step(ask="deactivate")
         case "waiting":
@@ -391,8 +391,8 @@ def test_a_board_that_sends_only_status_lines_is_diagnosed() -> None:
     for _ in range(400):
         bench.step()
     assert bench.out.reason == (
-        "the microcontroller: only status lines were received; does the line from this computer "
-        "(TX) reach the board's RX? `acsard mcu check` finds out more"
+        "no link to the microcontroller: only status lines were received; is TX of this computer "
+        "connected to RX of the board? `acsard mcu check` finds out more"
     )
 
 
@@ -419,13 +419,13 @@ def test_a_bumper_stops_the_robot_at_once_until_a_clear_after_the_release() -> N
     out = bench.status(FRONT).step(GO)
     assert (out.mode, out.line, out.speeds) == ("stopped", ZERO_LINE, STILL)
     assert out.reason.startswith("bumper 1 pressed (latched at ")
-    assert out.reason.endswith("; release it there, then call srv/clear")
+    assert out.reason.endswith("; release it at the robot, then call srv/clear")
     assert {"bumper_pressed", "mode"} <= set(names(out))
     assert bench.counters()["bumper_presses"] == 1
     snapshot = bench.robot.snapshot(bench.now_ns)
     assert (snapshot.bumpers, snapshot.bumper) == ((True, False), "bumper 1 pressed")
     answer = bench.answer("clear")
-    assert answer.message == "bumper 1 pressed: release it there, then call srv/clear again"
+    assert answer.message == "bumper 1 pressed: release it at the robot, then call srv/clear again"
     bench.status(FREE).step(GO)
     assert bench.mode() == "stopped"
     assert bench.answer("clear").success
@@ -439,7 +439,9 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
     bench.driving()
     out = bench.status(FRONT).step(GO)
     assert (out.mode, out.line, out.latches.in_force) == ("ready", ZERO_LINE, None)
-    assert out.reason.startswith("front bumper pressed: only straight backwards, at most 0.1 m/s; ")
+    assert out.reason.startswith(
+        "front bumper pressed: the robot drives only straight backwards, at most 0.1 m/s; "
+    )
     for _ in range(50):
         assert bench.step(BACK).line == ZERO_LINE
     bench.step(REST)
@@ -449,7 +451,8 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
         assert out.applied.angular == 0.0
     assert (out.mode, out.applied.linear) == ("driving", -0.1)
     assert out.reason == (
-        "driving: commanded by app; front bumper pressed: only straight backwards, at most 0.1 m/s"
+        "driving: commanded by app; front bumper pressed: the robot drives only straight "
+        "backwards, at most 0.1 m/s"
     )
 
 
@@ -561,7 +564,9 @@ def test_a_motor_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
     out = bench.status(DRIVER_FAULT).step(GO)
     assert out.mode == "fault"
     assert out.reason.startswith("the board reports a fault of a motor driver, latched at ")
-    assert out.reason.endswith("; mend it, or switch the robot off and on, then call srv/clear")
+    assert out.reason.endswith(
+        "; repair the driver, or switch the robot off and on, then call srv/clear"
+    )
     assert not bench.answer("clear").success
     bench.status(DRIVER_OK).step(GO)
     assert bench.mode() == "fault"
@@ -582,8 +587,10 @@ def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_it() ->
 def test_a_clear_in_the_step_of_a_repeated_guard_trip_does_not_release_the_fault() -> None:
     bench = Bench()
     bench.driving()
-    bench.step(guard_trip="it is not a whole line of four wheels")
-    (answer,) = bench.step(guard_trip="it is not a whole line of four wheels", ask="clear").answers
+    bench.step(guard_trip="it is not a complete line with four wheel speeds")
+    (answer,) = bench.step(
+        guard_trip="it is not a complete line with four wheel speeds", ask="clear"
+    ).answers
     assert not answer.success
     assert bench.mode() == "fault"
     assert bench.answer("clear").success
@@ -1067,7 +1074,9 @@ def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> Non
 def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
     bench = Bench().driving()
     answer = bench.answer("deactivate")
-    assert answer == Answer(7, True, "inactive: ramping to zero; srv/activate switches it on")
+    assert answer == Answer(
+        7, True, "inactive: the robot ramps to zero; srv/activate switches it on"
+    )
     assert bench.out.applied.linear == pytest.approx(0.49)
     for _ in range(50):
         bench.step(GO)
@@ -1205,7 +1214,7 @@ def test_missed_periods_are_reported_with_their_number() -> None:
     bench.now_ns += 50 * MS
     out = bench.robot.step(Inputs(bench.now, True, True, 1, missed=4))
     (event,) = (event for event in out.events if event.name == "missed_periods")
-    assert (event.text, event.count) == ("4 x missed: 4 in a row", 4)
+    assert (event.text, event.count) == ("4 x missed: 4 control periods in a row", 4)
     assert bench.counters()["missed_periods"] == 4
 
 
@@ -1245,10 +1254,13 @@ def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
     out = bench.step(GO, guard_trip="a wheel is too fast")
     assert out.mode == "fault"
     at = "latched at 2027-01-15 08:00:50 UTC"
-    assert out.reason == f"the guard replaced a line: a wheel is too fast, {at}; call srv/clear"
+    trip = "the guard replaced a line to the board by zeros: a wheel is too fast"
+    assert out.reason == f"{trip}, {at}; call srv/clear"
     event, mode = out.events
     assert (event.name, event.level) == ("fault", "error")
-    assert mode.text.startswith("driving -> fault: the guard replaced a line: a wheel is too fast")
+    assert mode.text.startswith(
+        "driving -> fault: the guard replaced a line to the board by zeros: a wheel is too fast"
+    )
     for _ in range(50):
         bench.step(REST)
         bench.step(GO)
@@ -1274,7 +1286,9 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     assert (bench.mode(), bench.out.applied) == ("driving", GO)
     impossible(bench, 1)
     assert bench.mode() == "fault"
-    assert bench.out.reason.startswith("impossible feedback: front_right 99.00 rad/s")
+    assert bench.out.reason.startswith(
+        "the board reports impossible speeds: front_right at 99.00 rad/s"
+    )
     # Each step removes 3 m/s2 x 10 ms.
     assert bench.out.applied.linear == pytest.approx(0.47)
     assert bench.step(GO).applied.linear == pytest.approx(0.44)
@@ -1556,7 +1570,8 @@ def test_a_lowered_limit_holds_after_a_restart_and_an_event_says_so() -> None:
     bench = Bench(latches=Latches(lowered=SLOW))
     (event,) = bench.out.events
     assert (event.name, event.level) == ("set", "warning")
-    assert event.text == "limits.linear_speed = 0.3 (was 1.0): lowered before the restart"
+    text = "limits.linear_speed = 0.3 (was 1.0): lowered before the restart, still in force"
+    assert event.text == text
     bench.driving(Twist(1.0, 0.0), steps=100)
     assert bench.out.applied == Twist(0.3, 0.0)
     assert bench.out.latches.lowered == SLOW
@@ -1619,7 +1634,7 @@ def test_the_track_that_a_gyro_taught_is_an_event_and_is_used_from_then_on() -> 
                 one for one in bench.step(gyro=rate / 1.6).events if one.name == "learned_track"
             ]
     (event,) = told
-    assert event.text.endswith(" in use, configured 1.000")
+    assert event.text.endswith(" (in use), configured 1.000")
     assert bench.robot.snapshot(bench.now_ns).gyro.track_use == "used"
 
 

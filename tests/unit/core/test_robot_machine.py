@@ -606,7 +606,10 @@ class RobotMachine(RuleBasedStateMachine):
             assert mode in ("fault", "shutdown")
         if mode == "ready" and outputs.due:
             begins = ("send a zero first: ", "waiting for a command: ", "commands of ")
-            assert outputs.reason.startswith(begins) or "is new: it drives" in outputs.reason
+            assert (
+                outputs.reason.startswith(begins)
+                or "is new: the robot follows it" in outputs.reason
+            )
         if mode == "driving":
             assert outputs.reason.startswith("driving: ")
             assert outputs.linked

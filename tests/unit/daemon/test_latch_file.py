@@ -147,7 +147,7 @@ def test_a_directory_that_cannot_be_written_starts_the_robot_stopped(
     file, latches = started(tmp_path / "file")
     assert latches.stop
     assert latches.stop.why.startswith("stopped when the daemon started, because ")
-    assert file.trouble.startswith("a stop cannot be kept over a restart: ")
+    assert file.trouble.startswith("a stop would not survive a restart: ")
 
 
 def same(one: Latches, other: Latches) -> bool:
@@ -418,7 +418,7 @@ def test_a_disk_that_does_not_write_at_the_start_loses_no_latch_that_was_read(
     monkeypatch.setattr(module, "replace", stuck.replace)
     file, latches = started(tmp_path)
     assert latches.stop
-    assert "a stop cannot be kept over a restart" in latches.stop.why
+    assert "a stop would not survive a restart" in latches.stop.why
     assert "the disk did not answer" in latches.stop.why
     assert "the disk did not answer" in file.trouble
     assert same(replace(latches, stop=None), OFF.after_restart())
@@ -563,7 +563,7 @@ def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
 
 def test_a_thread_that_has_ended_is_reported(file: LatchFile) -> None:
     file.close()
-    assert file.trouble.startswith("the thread that keeps a stop over a restart has ended")
+    assert file.trouble.startswith("the thread that stores stops for the next start has ended")
 
 
 def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
@@ -642,14 +642,16 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
     file.keep(STOP)
     until(lambda: file.trouble)
     path = tmp_path / NAME
-    assert file.trouble == f"a stop cannot be kept over a restart: {path}: {module.HANGS}"
+    assert file.trouble == f"a stop would not survive a restart: {path}: {module.HANGS}"
     (event,) = file.news()
     assert (event.name, event.level) == ("latch_file", "warning")
     assert module.HANGS in event.text
     assert file.news() == []
     stuck.goes.set()
     until(lambda: file.trouble == "")
-    assert file.news() == [Event("latch_file", f"a stop is kept again in {path}")]
+    assert file.news() == [
+        Event("latch_file", f"a stop survives a restart again; it is stored in {path}")
+    ]
 
 
 def test_a_disk_that_hangs_and_then_fails_is_not_said_to_keep_again(
@@ -690,11 +692,13 @@ def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
     until(lambda: len(tries) > 3)
     news = file.news()
     path = tmp_path / NAME
-    said = f"a stop cannot be kept over a restart: {path}: No space left on device"
+    said = f"a stop would not survive a restart: {path}: No space left on device"
     assert file.trouble == said
     again = f"{said}; the daemon tries again every {module.RETRY_S:g} s"
     assert news == [Event("latch_file", again, "warning")]
     monkeypatch.setattr(module, "replace", replace_file)
     until(lambda: file.trouble == "")
-    assert file.news() == [Event("latch_file", f"a stop is kept again in {path}")]
+    assert file.news() == [
+        Event("latch_file", f"a stop survives a restart again; it is stored in {path}")
+    ]
     assert path.read_bytes() == encode("acsar", STOP)

@@ -215,6 +215,6 @@ def test_the_causes_that_are_present_need_no_lateness() -> None:
         "the processor is too hot and runs slower",
     ]
     ((clause, advice),) = present(before, replace(before, steal_ns=(0, 30 * MS)), second)
-    assert "its host gave this virtual machine" in clause
+    assert "the host gave this virtual machine" in clause
     assert "processor of its own" in advice
     assert present(before, replace(before, steal_ns=(0, 10 * MS)), second) == []

@@ -107,7 +107,7 @@ def test_a_daemon_without_a_file_is_compared_with_its_start(started: Started) ->
             b"[limits]\nlinear_sped = 1\n",
             "the daemon could not start with the file as it is now: limits.",
         ),
-        (None, "the file cannot be read: No such file or directory"),
+        (None, "the configuration file cannot be read: No such file or directory"),
     ],
 )
 def test_a_file_with_which_the_daemon_cannot_start_is_reported(
@@ -292,7 +292,7 @@ def test_a_failure_after_the_robot_has_obeyed_is_no_success(file: Path, made: Se
     read_only(file)
     assert made.obeyed(OBEYED)
     message = refusal(made)
-    assert message.startswith(f"{OBEYED.message}; until the next start: {file} was not")
+    assert message.startswith(f"{OBEYED.message}, but only until the next start: {file} was not")
 
 
 @pytest.mark.parametrize("obeyed", [False, True])
@@ -359,7 +359,7 @@ def test_keep_is_recognized_in_every_notation() -> None:
 def test_a_pipe_in_place_of_the_file_is_not_read(file: Path, made: SettingsFile) -> None:
     file.unlink()
     os.mkfifo(file)
-    until(lambda: made.differ == "the file cannot be read: it is not a regular file")
+    until(lambda: made.differ == "the configuration file cannot be read: it is not a regular file")
     made.keep(REQUEST, 0)
     answer = result(made)
     assert isinstance(answer, Answer)

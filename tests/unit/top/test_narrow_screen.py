@@ -20,7 +20,7 @@ FULL = of(
     refused="source nav: NaN or infinity in its twist",
     certificate_expiry="ends in 12 days",
     gyro="used",
-    effective_track="learned 1.603 ± 0.032 in use, configured 1.000",
+    effective_track="learned 1.603 ± 0.032 (in use), configured 1.000",
     counters=STATE.counters
     | {"lines_superseded": 12_345, "bus_overrun": 7, "line_malformed": 30, "command_stale": 4},
 )
@@ -40,7 +40,7 @@ def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
         "ends in 12 days", "in 100.0/s of 1,300", "out 100.0/s of 1,301", "superseded 12,345",
         "20.0/s of 220", "missed periods 3", "bus overrun 7", "malformed 30", "stale 4",
         "NaN or infinity in its twist", "gyro used",
-        "track learned 1.603 ± 0.032 in use, configured 1.000",
+        "track learned 1.603 ± 0.032 (in use), configured 1.000",
     ):  # fmt: skip
         assert figure in told, figure
     assert told.count("63 µs 891 µs 9.7 ms") == told.count("56 µs 112 µs 8.0 ms") == 6

@@ -48,7 +48,7 @@ FULL = "the disk is full: nothing is recorded"
         ({"latch_file_error": "no room"}, "latch file fails"),
         ({"wheel_fault": "rear left wheel is left out"}, "wheel fault"),
         ({"settings_differ": DIFFER}, "settings differ"),
-        ({"emergency_stop": "silent"}, "emergency stop silent"),
+        ({"emergency_stop": "silent"}, "emergency stop not reported"),
         ({"bumpers": [False, True, True]}, "bumpers 2 and 3 pressed"),
         ({"battery": BatterySummary(22.0, 21.4, None, "return")}, "battery low, return (21 %)"),
         ({"battery": BatterySummary(20.0, None, None, "stop")}, "battery empty (20.0 V)"),
@@ -79,12 +79,13 @@ def test_the_column_of_the_battery_is_there_if_a_robot_has_one() -> None:
 
 
 def test_the_words_of_each_warning_follow_all_of_them() -> None:
-    expiry = "ends in 10 days (that of the authority)"
+    expiry = "ends in 10 days (certificate of the authority)"
     state = replace(READY, recording_error=FULL, certificate_expiry=expiry, settings_differ=DIFFER)
     (_, line) = table([replace(ROW, state=state)], 300)
     assert line.endswith(
         "WARNING: certificate ends in 10 days, recording fails, settings differ; waiting for a "
-        f"command; certificate: (that of the authority); recording: {FULL}; settings: {DIFFER}"
+        "command; certificate: (certificate of the authority); "
+        f"recording: {FULL}; settings: {DIFFER}"
     )
 
 
@@ -95,7 +96,7 @@ def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
 
 
 def test_a_warning_that_the_reason_says_is_not_repeated() -> None:
-    why = "emergency stop pressed at the robot; release it there, then call srv/clear"
+    why = "emergency stop pressed at the robot; release it at the robot, then call srv/clear"
     state = replace(STATE, mode="stopped", reason=why, emergency_stop="pressed")
     (_, line) = table([replace(ROW, state=state)], 200)
     assert line.endswith(f"  {why}")

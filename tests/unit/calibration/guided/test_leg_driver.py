@@ -145,7 +145,11 @@ def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
     assert set(world.run(3.0).said[stopped:]) == {REST}
 
 
-TWO = [SourceState("app", 50, 0.01, "1 more of its senders: wait until the first one is silent")]
+TWO = [
+    SourceState(
+        "app", 50, 0.01, "1 more of this source's senders must wait until the first one is silent"
+    )
+]
 
 
 def of_two(leg: Leg, sender: str) -> World:

@@ -47,8 +47,8 @@ def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
 def test_the_gateway_needs_a_way_to_the_daemon() -> None:
     (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
     assert line == (
-        'bus.listen = ["tls/0.0.0.0:7449"]: clients that connect by TLS reach the daemon '
-        f'through an address on this machine; add "{HERE}"'
+        'bus.listen = ["tls/0.0.0.0:7449"]: the TLS gateway reaches the daemon through a tcp '
+        f'address on this machine, and none is listed; add "{HERE}"'
     )
 
 
@@ -85,7 +85,7 @@ def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
 
 def test_a_certificate_has_one_role() -> None:
     (line,) = problems(access=AccessConfig(viewers=("a", "b"), maintainers=("b",)))
-    assert line.startswith('access.maintainers[0] = "b": access.viewers[1] is the same')
+    assert line.startswith('access.maintainers[0] = "b": access.viewers[1] already has this')
 
 
 def test_a_namespace_may_not_begin_like_the_native_keys() -> None:
@@ -119,7 +119,8 @@ def test_checked_lines_take_more_of_the_wire() -> None:
     mcu = McuConfig(baud_rate=9600, link_check="auto")
     (line,) = problems(mcu=mcu, control=ControlConfig(rate=25))
     assert line == (
-        "control.rate = 25: 41 B at 9600 baud = 42.7 ms per line, at most 23 Hz, 18 Hz at 80 %; "
+        "control.rate = 25: a line of 41 B at 9600 baud takes 42.7 ms, so at most 23 Hz is "
+        "possible, and 18 Hz uses 80 % of the wire; "
         'write mcu.baud_rate = 19200 or more, or control.rate = 18 or "auto", or '
         'mcu.link_check = "off" (lines of 33 B)'
     )
@@ -130,7 +131,8 @@ def test_the_sample_fields_take_more_still() -> None:
     mcu = McuConfig(baud_rate=57600, link_check="require", encoder_counts=3200)
     (line,) = problems(mcu=mcu)
     assert line == (
-        "control.rate = 100: 62 B at 57600 baud = 10.8 ms per line, at most 92 Hz, 74 Hz at 80 %; "
+        "control.rate = 100: a line of 62 B at 57600 baud takes 10.8 ms, so at most 92 Hz is "
+        "possible, and 74 Hz uses 80 % of the wire; "
         'write mcu.baud_rate = 115200 or more, or control.rate = 74 or "auto", or '
         "mcu.encoder_counts = 0 (lines of 41 B)"
     )
@@ -183,10 +185,10 @@ def test_counts_that_wrap_within_two_periods_are_refused_with_the_most_that_do_n
     control = ControlConfig(rate=10)
     (line,) = problems(mcu=McuConfig(encoder_counts=20_000), control=control)
     assert line.startswith(
-        "mcu.encoder_counts = 20000: at feedback.wheel_speed = 80 rad/s the counts "
+        "mcu.encoder_counts = 20000: at feedback.wheel_speed = 80 rad/s a wheel's counter "
     )
-    assert "could wrap in 129 ms, but they must last 2 control periods (200 ms)" in line
-    assert "write 12867 at most" in line
+    assert "wrap round within 129 ms, which is less than 2 control periods (200 ms)" in line
+    assert "write mcu.encoder_counts = 12867 or less" in line
     assert problems(mcu=McuConfig(encoder_counts=12_867), control=control) == []
     assert problems(mcu=McuConfig(encoder_counts=12_868), control=control) != []
     slower = FeedbackConfig(wheel_speed=50.0)
@@ -238,13 +240,13 @@ def test_motion_away_from_a_bumper_needs_its_place() -> None:
         ),
         (
             BatteryConfig("percent", warning_below=99.8),
-            "battery.warning_below = 99.8: with battery.hysteresis = 0.5 this level would end "
-            "above 100, which no board reports; write lower values",
+            "battery.warning_below = 99.8: with battery.hysteresis = 0.5 the level would end "
+            "only above 100, which no board reports; lower one of the two",
         ),
         (
             BatteryConfig(stop_below=60.0, hysteresis=40.0),
-            "battery.stop_below = 60: with battery.hysteresis = 40 this level would end above "
-            "99.99, which no board reports; write lower values",
+            "battery.stop_below = 60: with battery.hysteresis = 40 the level would end only above "
+            "99.99, which no board reports; lower one of the two",
         ),
     ],
 )
@@ -269,12 +271,15 @@ def test_a_required_emergency_stop_needs_room_on_a_slow_wire() -> None:
     assert warnings(config) == []
     (warning,) = warnings(replace(config, safety=SafetyConfig(estop="required")))
     assert warning == (
-        'safety.estop = "required": status lines take 29% of the wire at 9600 baud, and replies at '
-        "control.rate = 23 do not fit beside them; 14 Hz is comfortable"
+        'safety.estop = "required" needs status lines, which take 29% of the wire at 9600 '
+        "baud. The replies at control.rate = 23 do not fit beside them; write "
+        "control.rate = 14 or less"
     )
     bumpers = SafetyConfig(bumpers=("front", "rear"))
     (warning,) = warnings(replace(config, safety=bumpers))
-    assert warning.startswith('safety.bumpers = ["front", "rear"]: status lines take 29% of the')
+    assert warning.startswith(
+        'safety.bumpers = ["front", "rear"] needs status lines, which take 29%'
+    )
     assert len(warnings(replace(config, safety=replace(bumpers, bumper="off")))) == 1
     safe = SafetyConfig(estop="required")
     assert warnings(Config(mcu=slow, control=ControlConfig(rate=14.0), safety=safe)) == []

@@ -65,6 +65,9 @@ def test_a_limit_that_contradicts_the_rest_is_dropped_and_an_event_names_it() ->
     dropped, used = events
     assert (dropped.name, dropped.level) == ("set", "warning")
     assert dropped.text.startswith(
-        "limits.linear_acceleration = 0.001 was lowered before the restart, and is dropped now: "
+        "limits.linear_acceleration was lowered to 0.001 before the restart. "
     )
-    assert used.text == "limits.angular_speed = 2.0 (was 4.0): lowered before the restart"
+    assert (
+        used.text
+        == "limits.angular_speed = 2.0 (was 4.0): lowered before the restart, still in force"
+    )

@@ -32,7 +32,7 @@ def test_a_fault_is_read_with_its_numbers(text: str, values: tuple[float, ...]) 
 
 
 REFUSED = [
-    ("x", "not a known fault; there are mute, noise, "),
+    ("x", "not a known fault; the known faults are mute, noise, "),
     ("mut", "not a known fault; did you mean mute?"),
     ("stall=5:0.15", "not a known fault; did you mean stalls=NUMBER:NUMBER?"),
     ("mute=1", "write it as mute"),
@@ -46,17 +46,17 @@ REFUSED = [
     ("pushed=nan", "write a number like"),
     ("pushed=-inf", "write a number like"),
     ("pushed=1000001", "up to 1e+06"),
-    ("wrong_baud=300", "the rate must be one of 9600"),
+    ("wrong_baud=300", "the baud rate must be one of 9600"),
     ("stalls=0.1:0.2", "fewer seconds for each"),
     ("stalls=0.2:0.2", "fewer seconds for each"),
-    ("estop_pressed=-1:2", "give the seconds from the start until it begins"),
-    ("estop_silent=1:-2", "give the seconds from the start until it begins"),
+    ("estop_pressed=-1:2", "give the seconds from the start to the fault"),
+    ("estop_silent=1:-2", "give the seconds from the start to the fault"),
     (
         "bumper_pressed=5:1:2",
         "the bumpers have the numbers 1 to 4, in the order in which the board",
     ),
-    ("bumper_pressed=1:-1:2", "give the seconds from the start until it begins"),
-    ("driver_fault=1:-2", "give the seconds from the start until it begins"),
+    ("bumper_pressed=1:-1:2", "give the seconds from the start to the fault"),
+    ("driver_fault=1:-2", "give the seconds from the start to the fault"),
     ("stalls=5:0", "both at least 0.001"),
     ("stalls=5:0.0009", "both at least 0.001"),
 ]
@@ -122,6 +122,7 @@ def test_a_simulator_with_faults_is_a_surprise_and_a_device_has_none() -> None:
     sim = SimConfig(faults=("ftdi",))
     (warning,) = warnings(Config(sim=sim))
     assert (
-        warning == 'sim.faults = ["ftdi"]: the simulator has these faults on purpose; [] ends them'
+        warning
+        == 'sim.faults = ["ftdi"]: the simulator has these faults on purpose; write [] for none'
     )
     assert warnings(Config(sim=sim, mcu=McuConfig(port="/dev/x"))) == []

@@ -101,7 +101,7 @@ def test_what_is_refused_is_counted_and_told_by_its_reason(reason: str) -> None:
 
 
 def test_a_negative_variance_is_none() -> None:
-    with pytest.raises(DecodeError, match="a variance of -1"):
+    with pytest.raises(DecodeError, match="the turn rate is below zero: -1"):
         reading(said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[0.0] * 8 + [-1.0]))
 
 

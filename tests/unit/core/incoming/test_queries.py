@@ -31,7 +31,9 @@ NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics
 
 CONFIG = Config(robot=RobotConfig("r7"))
 WALL_NS = 1_700_000_000_000_000_000
-NO = rcl.SetParametersResult(False, "needs the header of plain CDR, but has 00")
+NO = rcl.SetParametersResult(
+    False, "the payload must begin with the header of plain CDR, not with 00"
+)
 INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
 
 WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
@@ -401,15 +403,15 @@ def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> Non
 @each(
     ("payload", "words"),
     [
-        (b"", "neither a JSON object, a msgpack map nor CDR"),
-        (b"nonsense", "neither a JSON object, a msgpack map nor CDR"),
+        (b"", "not a JSON object, a msgpack map or CDR"),
+        (b"nonsense", "not a JSON object, a msgpack map or CDR"),
         (b"{", "Input data was truncated"),
         (b"{}", "missing required field `x`"),
         (b'{"x": 1, "y": 2}', "missing required field `yaw`"),
         (b'{"x": 1, "y": 2, "yaw": "3"}', "Expected `float`"),
         (b'{"x": 1, "y": 2, "yaw": 3, "z": 4}', "unknown field `z`"),
         (b'{"x": 1e7, "y": 2, "yaw": 3}', "x and y must be within 1000 km"),
-        (encode({"x": 1.0, "y": 2.0, "yaw": math.nan}, "msgpack"), "yaw finite"),
+        (encode({"x": 1.0, "y": 2.0, "yaw": math.nan}, "msgpack"), "yaw must be finite"),
     ],
 )
 def test_a_pose_that_is_none_is_answered_in_words_and_asks_nothing_of_the_robot(

@@ -153,7 +153,9 @@ def test_a_limit_lowers_the_setting_and_its_end_brings_the_setting_back() -> Non
     robot.limit(0.3)
     robot.step()
     assert robot.speed == 0.3
-    assert robot.limiter.text == "0.3 m/s by speed_limit, unnamed (native); 1 m/s without it"
+    assert (
+        robot.limiter.text == "0.3 m/s by speed_limit, unnamed (native); 1 m/s when this limit ends"
+    )
     robot.limit(0.0)
     robot.step()
     assert (robot.speed, robot.limiter.text) == (1.0, "")
@@ -185,7 +187,8 @@ def test_a_set_above_the_limit_waits_for_its_end_and_the_answer_says_so() -> Non
     robot.step()
     answer = robot.step({SETTING: 0.8})[1]
     text = (
-        "limits.linear_speed = 0.8 once the limit of 0.3 m/s ends (speed_limit, unnamed (native))"
+        "limits.linear_speed = 0.8 will apply when the limit of 0.3 m/s ends "
+        "(speed_limit, unnamed (native))"
     )
     assert answer == Answer(1, True, text)
     assert [(event.name, event.text) for event in robot.events] == [("set", text)]
@@ -200,9 +203,8 @@ def test_the_answer_names_also_the_settings_that_need_not_wait() -> None:
     robot.limit(0.3)
     robot.step()
     answer = robot.step({SETTING: 0.8, "limits.linear_acceleration": 0.5})[1]
-    assert "limits.linear_acceleration = 0.5 (was 1.0); limits.linear_speed = 0.8 once" in (
-        answer.message
-    )
+    told = "limits.linear_acceleration = 0.5 (was 1.0); limits.linear_speed = 0.8 will apply when"
+    assert told in answer.message
 
 
 def test_a_limit_and_a_higher_set_in_one_step_leave_the_limit_in_force() -> None:

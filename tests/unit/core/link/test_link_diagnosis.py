@@ -36,17 +36,19 @@ HEARD: dict[str, tuple[bytes, Look, str]] = {
         "cut",
         "153 bytes received but no line end; the last bytes are `",
     ),
-    "cut lines": (b"ap00.00,bp0\r\n" * 4, "cut", "none good, the last `ap00.00,bp0`"),
+    "cut lines": (b"ap00.00,bp0\r\n" * 4, "cut", "none good, the last one is `ap00.00,bp0`"),
     "noise": (
         (b"\x00\xff~" + STILL) * 144,
         "foreign",
-        r"144 lines received, none good, the last `\x00\xff~ap00.00,bp00.00,cp00.00,dp00.00`",
+        r"lines received, none good, the last one is `\x00\xff~ap00.00,bp00.00,cp00.00,dp00.00`",
     ),
     "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines received, none good"),
     "no end": (
         b"\xf8\x00\xe6" * 3, "garbage", r"the last bytes are `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"
     ),
-    "some good": (STILL + b"ap?\r\n", "few", "2 lines received, only 1 good, the last other `ap?`"),
+    "some good": (
+        STILL + b"ap?\r\n", "few", "2 lines received, only 1 good, the last bad one is `ap?`"
+    ),
     "all good": (STILL * 2, "sparse", "2 lines received, all of them good, but too few"),
 }  # fmt: skip
 
@@ -59,7 +61,7 @@ def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
         texts += [event.text for event in bench.session.events if event.name == "link_booting"]
     told = [text for text in texts if "none good" in text]
     assert len(told) == 1
-    assert "150 lines received, none good, the last `" in told[0]
+    assert "150 lines received, none good, the last one is `" in told[0]
     assert bench.session.words() == told[0]
     bench.wait(10, GOOD * 3)
     assert bench.session.words() == "linked"
@@ -182,7 +184,8 @@ def test_it_says_what_was_heard_how_that_looks_and_what_to_do(
     found = heard(data)
     assert found.looks == looks
     assert counted in found.counted
-    assert found.words.startswith(f"the microcontroller: {found.counted}; {LOOK_MENDS[looks]}")
+    told = f"no link to the microcontroller: {found.counted}; {LOOK_MENDS[looks]}"
+    assert found.words.startswith(told)
     assert "`acsard mcu check`" in found.words
 
 
@@ -213,7 +216,7 @@ def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = 
 
 def test_a_fifth_lost_is_reported_once_with_its_figures() -> None:
     (text,) = events_of(5)
-    assert f"only {WINDOW * 4 // 5} of {WINDOW} lines were answered" in text
+    assert f"answered only {WINDOW * 4 // 5} of {WINDOW} lines" in text
     assert "`acsard mcu check`" in text
 
 

@@ -216,7 +216,7 @@ def test_a_slow_wire_is_given_time_to_answer() -> None:
     bench = Bench(McuConfig(link_check="auto", baud_rate=9600))
     bench.check.heard_plain()
     bench.ask(4 * 190)
-    assert bench.check.in_force == "being asked for"
+    assert bench.check.in_force == "not checked yet"
     bench.ask(100)
     assert bench.check.in_force == "plain"
 
@@ -378,7 +378,7 @@ def test_samples_that_stop_coming_are_asked_for_no_more() -> None:
 
 @pytest.mark.parametrize("mcu", [AUTO, SAMPLES, REQUIRE])
 def test_while_it_is_asked_nothing_is_in_force(mcu: McuConfig) -> None:
-    assert Bench(mcu).check.in_force == "being asked for"
+    assert Bench(mcu).check.in_force == "not checked yet"
 
 
 def test_the_pace_of_questions_is_bounded() -> None:

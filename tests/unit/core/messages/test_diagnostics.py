@@ -219,7 +219,10 @@ def test_a_link_that_is_not_up_is_an_error(link: str, level: int) -> None:
 @pytest.mark.parametrize(("link", "level"), [("up", WARN), ("down", ERROR)])
 def test_the_simulator_is_never_taken_for_a_robot(link: str, level: int) -> None:
     one = row("serial link", Config(), replace(OUTPUTS, link=link))
-    assert (one.level, one.message) == (level, f"{link}: the simulator; no real wheel turns")
+    assert (one.level, one.message) == (
+        level,
+        f"{link}: this is the simulator, no real wheel turns",
+    )
 
 
 def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> None:
@@ -297,7 +300,10 @@ def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> Non
         "commanded by app; 2 programs send as nav, and the robot follows one of them: end the "
         "others, or give each a source of its own",
     )
-    assert values(one)["nav"] == "1 more of its senders: wait until the first one is silent"
+    assert (
+        values(one)["nav"]
+        == "1 more of this source's senders must wait until the first one is silent"
+    )
     assert row("commands", snapshot=seen(sources=(alone,))).level == OK
 
 

@@ -28,14 +28,17 @@ def test_the_certificate_that_ends_first_is_named_unless_it_is_the_robot_s_own()
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 400 * DAY_NS}
     assert expiry(ends, NOW_NS)[1] == "ends in 10 days"
     ends["the router tls/router.local:7447"] = NOW_NS - 3 * DAY_NS
-    told = "expired 3 days ago (that of the router tls/router.local:7447): TLS refuses every client"
+    told = (
+        "expired 3 days ago (certificate of the router tls/router.local:7447): TLS refuses every "
+        "client"
+    )
     assert expiry(ends, NOW_NS) == (2, told)
 
 
 def test_an_authority_that_ends_with_the_certificates_of_a_gateway_is_named() -> None:
     """The gateway reports the earlier end of its own certificate and of its authority's."""
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 10 * DAY_NS}
-    assert expiry(ends, NOW_NS) == (1, "ends in 10 days (that of the authority)")
+    assert expiry(ends, NOW_NS) == (1, "ends in 10 days (certificate of the authority)")
 
 
 def test_an_end_that_nobody_can_read_is_a_warning_with_its_mend() -> None:

@@ -36,7 +36,7 @@ def test_a_fault_is_still_there_after_an_hour_of_missed_periods() -> None:
     fault, others = told(happened).events
     assert (fault.name, fault.stamp) == ("fault", Time.from_ns(at(0).wall_ns))
     assert (others.name, others.count) == ("missed_periods", 3 * 3599)
-    assert others.text == f"{3 * 3599} times; the last: 3 in a row"
+    assert others.text == f"{3 * 3599} times; the last: 3 control periods in a row"
     assert others.stamp == told(happened).stamp == Time.from_ns(at(3599).wall_ns)
     assert told(happened).total == 3600
 

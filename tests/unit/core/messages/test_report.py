@@ -702,11 +702,11 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
         "learned_multiplier_std": "0.090",
     }
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.500"}
-    assert state.effective_track == "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"
+    assert state.effective_track == "learned 1.800 ± 0.090 (only shown), configured 1.500 (in use)"
     assert row.message == f"{WORDS['used']}; effective track: {state.effective_track}"
     state, (row,) = with_gyro(replace(learned, track_use="used"))
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
-    assert state.effective_track == "learned 1.800 ± 0.090 in use, configured 1.500"
+    assert state.effective_track == "learned 1.800 ± 0.090 (in use), configured 1.500"
     assert with_gyro(GyroStatus("used"))[0].effective_track == ""
 
 
@@ -725,7 +725,11 @@ def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
         assert isinstance(array, DiagnosticArray)
         (row,) = [one for one in array.status if one.name == "acsard: wheels"]
         assert (state.wheel_fault, row.level) == (said.text, level)
-        calm = "slower than commanded: front_right 60%" if said.slow else "front and rear agree"
+        calm = (
+            "wheels slower than commanded: front_right 60%"
+            if said.slow
+            else "front and rear wheels agree"
+        )
         assert row.message == (said.text or calm)
     assert {pair.key: pair.value for pair in row.values} == {
         "left_out": "rear_left",

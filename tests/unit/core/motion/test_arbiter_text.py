@@ -35,19 +35,20 @@ SENTENCES = [
     (
         Wait("neutral", "nav", 1.0, lasts=3.0, ros=True),
         "send a zero first: nav must send a zero before it can drive; it has sent speeds for over "
-        '3 s (`ros2 topic pub` of a speed never sends one; "After a clear" in '
+        '3 s (`ros2 topic pub` of a speed never sends a zero; "After a clear" in '
         "deploy/ros2/README.md lists tools that do)",
     ),
-    (Wait("zeros", "app", lasts=3.0), "held by app, which sends only zeros for over 3 s"),
+    (Wait("zeros", "app", lasts=3.0), "held by app, which has sent only zeros for over 3 s"),
     (
         Wait("zeros", "ros2_control", lasts=600.0, kept="nav"),
-        "held by ros2_control, which sends only zeros for over 10 min; nav sends speeds "
+        "held by ros2_control, which has sent only zeros for over 10 min; nav sends speeds "
         "and must wait",
     ),
-    (Wait("zeros", "app", lasts=3600.0), "held by app, which sends only zeros for over 1 h"),
+    (Wait("zeros", "app", lasts=3600.0), "held by app, which has sent only zeros for over 1 h"),
     (
         Wait("proof", "high", 0.25),
-        "high is new: it drives once its delays have been steady for 0.25 s",
+        "high is new: the robot follows it when its commands have arrived with steady delays for "
+        "0.25 s",
     ),
     (
         Wait("late", "high", 0.25),
@@ -56,7 +57,10 @@ SENTENCES = [
     ),
     (Wait("higher", "high"), "high has priority: wait until it is silent"),
     (Wait("equal", "right"), "right has the same priority and came first: wait until it is silent"),
-    (Wait("senders", senders=15), "15 more of its senders: wait until the first one is silent"),
+    (
+        Wait("senders", senders=15),
+        "15 more of this source's senders must wait until the first one is silent",
+    ),
 ]
 
 
@@ -76,7 +80,8 @@ def test_every_wait_has_its_sentence_above() -> None:
         (Choice(), "waiting for a command: no source has sent one within its timeout"),
         (
             Choice(wait=Wait("proof", "app", 2.0)),
-            "app is new: it drives once its delays have been steady for 2 s",
+            "app is new: the robot follows it when its commands have arrived with steady delays "
+            "for 2 s",
         ),
         (Choice("app", REST, Wait("nothing"), 1), "commanded by app"),
         (
@@ -91,7 +96,9 @@ def test_whose_command_is_followed_or_why_nobody_s_is_a_sentence(choice: Choice,
 
 def test_whatever_a_command_is_refused_for_is_said_in_words() -> None:
     assert {"", *REFUSED} == {*get_args(Objection)}
-    assert REFUSED["too_many_senders"] == "16 other senders of this source are active"
+    assert (
+        REFUSED["too_many_senders"] == "16 other senders of this source are active; end one first"
+    )
 
 
 NOBODY = Choice()
@@ -173,7 +180,7 @@ def test_a_source_held_up_by_zeros_is_reported_once_however_often_it_pauses() ->
     assert zeros("") == []
     (event,) = zeros("nav")
     assert (event.name, event.by, event.kind) == ("commands_without_effect", "app (joe)", "nav")
-    assert event.text.startswith("held by app, which sends only zeros for over 3 s; nav")
+    assert event.text.startswith("held by app, which has sent only zeros for over 3 s; nav")
     assert zeros("") + zeros("nav") == []
     assert [event.kind for event in zeros("teleop")] == ["teleop"]
 
@@ -197,5 +204,10 @@ def test_a_refusal_is_its_reason_its_words_and_its_sender() -> None:
 
 def test_missed_periods_are_counted_each() -> None:
     assert missed(3) == Event(
-        "missed_periods", "3 in a row", "warning", kind="missed", count=3, news=False
+        "missed_periods",
+        "3 control periods in a row",
+        "warning",
+        kind="missed",
+        count=3,
+        news=False,
     )

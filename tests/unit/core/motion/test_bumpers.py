@@ -82,7 +82,7 @@ def test_two_bumpers_at_one_place_allow_what_one_allows() -> None:
         pins.step(pressed)
         assert pins.bumpers.away(Twist(-0.5, 1.0)) == Twist(-0.1, 0.0)
         assert pins.bumpers.note() == (
-            "front bumper pressed: only straight backwards, at most 0.1 m/s"
+            "front bumper pressed: the robot drives only straight backwards, at most 0.1 m/s"
         )
 
 
@@ -93,12 +93,12 @@ def test_every_place_has_a_direction() -> None:
 @pytest.mark.parametrize(
     ("pressed", "note"),
     [
-        ("X...", "front bumper pressed: only straight backwards, at most 0.1 m/s"),
-        (".X..", "rear bumper pressed: only straight forwards, at most 0.1 m/s"),
-        ("..X.", "left bumper pressed: no motion leads away, so the robot stands until the "
-         "release"),
-        ("XX..", "front and rear bumpers pressed: no motion leads away, so the robot stands until "
-         "the release"),
+        ("X...", "front bumper pressed: the robot drives only straight backwards, at most 0.1 m/s"),
+        (".X..", "rear bumper pressed: the robot drives only straight forwards, at most 0.1 m/s"),
+        ("..X.", "left bumper pressed: no straight motion leads away from the pressed bumpers, so "
+         "the robot stands until they are released"),
+        ("XX..", "front and rear bumpers pressed: no straight motion leads away from the pressed "
+         "bumpers, so the robot stands until they are released"),
     ],
 )  # fmt: skip
 def test_a_pressed_bumper_that_limits_says_which_motion_it_allows(pressed: str, note: str) -> None:
@@ -132,7 +132,8 @@ def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
     assert (pins.bumpers.held, pins.bumpers.pressed) == ("", (False, False))
     assert pins.events == [
         Event("bumper_released", "the board reports 2 bumpers, and none is pressed"),
-        Event("bumper_pressed", "front bumper pressed; release it there, then call srv/clear",
+        Event("bumper_pressed",
+              "front bumper pressed; release it at the robot, then call srv/clear",
               "error"),
         Event("bumper_released", "released; a stop stays latched until srv/clear"),
     ]  # fmt: skip

@@ -42,7 +42,7 @@ def test_once_it_is_certain_the_learned_one_is_used_and_told_once() -> None:
         "used",
         "info",
     )
-    assert track.event.text.endswith(": learned 1.800 ± 0.180 in use, configured 1.500")
+    assert track.event.text.endswith(": learned 1.800 ± 0.180 (in use), configured 1.500")
     track.look(Track(1.25, SURE))
     assert track.used == Track(1.25, SURE)
     assert told(track) is None
@@ -66,7 +66,7 @@ def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share
     assert track.used == CONFIGURED
     assert track.event is not None
     assert track.event.level == "warning"
-    assert "(too far off), configured 1.000 in use" in track.event.text
+    assert "(too far off), configured 1.000 (in use)" in track.event.text
     track.look(Track(share, SURE))
     assert told(track) is None
 
@@ -104,9 +104,9 @@ def test_one_that_is_too_far_off_is_known_until_it_is_doubted_by_far() -> None:
 @pytest.mark.parametrize(
     ("use", "says"),
     [
-        ("shown", "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"),
-        ("uncertain", "learned 1.800 ± 0.090 (uncertain), configured 1.500 in use"),
-        ("used", "learned 1.800 ± 0.090 in use, configured 1.500"),
+        ("shown", "learned 1.800 ± 0.090 (only shown), configured 1.500 (in use)"),
+        ("uncertain", "learned 1.800 ± 0.090 (uncertain), configured 1.500 (in use)"),
+        ("used", "learned 1.800 ± 0.090 (in use), configured 1.500"),
     ],
 )
 def test_both_stand_beside_each_other_as_multipliers(use: TrackUse, says: str) -> None:

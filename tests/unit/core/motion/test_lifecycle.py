@@ -240,7 +240,7 @@ def test_a_release_that_arrived_before_the_latch_is_refused(
 def test_a_release_of_the_same_step_as_the_latch_is_refused(held: Held) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
-    with pytest.raises(RefusedError, match="at the same time or later"):
+    with pytest.raises(RefusedError, match="at the time of this call or later"):
         getattr(life, held.verb)(number(life), ns(1.001), at(1.0))
 
 
@@ -256,7 +256,8 @@ def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch
         release(life, 1.0 + since_s)
     assert str(caught.value) == (
         f"the robot was {held.said} by ann {age} s ago: look at the robot, then call "
-        f"srv/{held.verb} again 2 s after that, or with the number of the latch that you have seen"
+        f"srv/{held.verb} again when 2 s have passed since then, or name the number of the latch "
+        "that you have seen"
     )
     assert mode(life) is held.mode
     assert release(life, 1.0 + LOOK_FIRST_S)
@@ -309,8 +310,8 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
             life.clear(None, ns(asked_s), Instant(ns(11.5), WALL_NS + ns(wall_s)))
         assert str(caught.value) == (
             f"the daemon started {age} s ago and the robot is still stopped by ann: look at the "
-            "robot, then call srv/clear again 2 s after that, or with the number of the latch that "
-            "you have seen"
+            "robot, then call srv/clear again when 2 s have passed since then, or name the number "
+            "of the latch that you have seen"
         )
     assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
 
@@ -354,7 +355,10 @@ def test_a_fault_keeps_the_stop_and_each_is_cleared_by_itself() -> None:
         f"a wheel is dead, latched at {AT}:02 UTC; also stopped by ann at {AT}:01 UTC; "
         "call srv/clear twice"
     )
-    assert clear(life, 5.0) == "fault cleared; still stopped by ann: call srv/clear again"
+    assert (
+        clear(life, 5.0)
+        == "fault cleared, but the robot is still stopped by ann: call srv/clear again"
+    )
     assert mode(life) is Mode.STOPPED
     with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
         clear(life, 6.9)  # the same clear request, delivered twice by the network
@@ -402,10 +406,10 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
     press(life, 1.0)
     assert mode(life) is Mode.STOPPED
     latched = f"{PRESSED} (latched at {AT}:01 UTC)"
-    assert life.why == f"{latched}; release it there, then call srv/clear"
+    assert life.why == f"{latched}; release it at the robot, then call srv/clear"
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, number(life))
-    assert str(caught.value) == f"{PRESSED}: release it there, then call srv/clear again"
+    assert str(caught.value) == f"{PRESSED}: release it at the robot, then call srv/clear again"
     life.hold("", "", ns(9.2))
     with pytest.raises(RefusedError, match="came before the release: call srv/clear again"):
         life.clear(number(life), ns(9.2), at(9.3))
@@ -427,14 +431,14 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
     press(life, 1.0)
     stop(life, 2.0, "joe")
     stopped = f"stopped by joe at {AT}:02 UTC"
-    assert life.why == (f"{PRESSED}; also {stopped}; release it there, then call srv/clear")
+    assert life.why == (f"{PRESSED}; also {stopped}; release it at the robot, then call srv/clear")
     life.fault("a wheel is dead", at(3.0))
     assert life.why == (
         f"a wheel is dead, latched at {AT}:03 UTC; also {PRESSED}; also {stopped}; release it "
-        "there, then call srv/clear twice"
+        "at the robot, then call srv/clear twice"
     )
     life.hold("", "", ns(8.0))
-    assert clear(life, 9.0).startswith("fault cleared; still stopped by joe: ")
+    assert clear(life, 9.0).startswith("fault cleared, but the robot is still stopped by joe: ")
     assert life.why == f"{stopped}; call srv/clear"
 
 

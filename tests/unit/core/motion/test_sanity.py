@@ -212,5 +212,5 @@ def test_the_warning_says_what_was_dropped_and_what_to_do() -> None:
     (event,) = warned(Sanity(FeedbackConfig()), WINDOW)
     assert (event.name, event.level) == ("lines_implausible", "warning")
     assert event.text.startswith(f"{MOST + 1} of {MOST + 1} lines were dropped")
-    assert "front_right 200.00 rad/s is over feedback.wheel_speed" in event.text
+    assert "front_right at 200.00 rad/s is over feedback.wheel_speed" in event.text
     assert "mcu.link_check" in event.text

@@ -128,7 +128,7 @@ def test_a_wheel_left_out_as_stuck_is_a_fault_only_while_it_repeats_that_speed(
 ) -> None:
     bench, five = driven(), WheelSpeeds(5.0, 5.0, 5.0, 5.0)
     bench.run(only(0, 10.0, others=5.0), five, seconds=0.1)
-    assert "says one and the same speed" in bench.faults.status.text
+    assert "reports a speed that never changes" in bench.faults.status.text
     told = ""
     for line in range(500):
         seen = only(0, says[line % 2], others=5.0)

@@ -200,7 +200,7 @@ def test_what_can_be_set_says_what_it_is_its_range_and_when() -> None:
     assert described("limits.linear_stop_deceleration", DOUBLE) == ParameterDescriptor(
         "limits.linear_stop_deceleration",
         DOUBLE,
-        "deceleration of a stop or a fault: a number from 0.01 to 100 m/s2",
+        "deceleration after a stop or a fault: a number from 0.01 to 100 m/s2",
         "lowered only while the robot stands",
         read_only=False,
         floating_point_range=[FloatingPointRange(0.01, 100.0, 0.0)],

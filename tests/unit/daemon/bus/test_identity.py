@@ -46,8 +46,8 @@ def test_neither_silence_nor_an_unknown_answer_gives_a_role() -> None:
 def test_a_missing_permission_is_reported_with_the_role_that_it_needs() -> None:
     viewer = Identity("viewer", "anna", "joe/1/aa")
     assert viewer.lacks("srv/clear") == (
-        "your certificate anna is viewer: it may follow and stop, not drive; "
-        "srv/clear is for a certificate that is operator"
+        "your certificate anna has the role viewer: this role may read data and stop the robot, "
+        "but not drive it; srv/clear needs at least the role operator"
     )
     assert viewer.lacks("srv/stop") == viewer.lacks("state") == ""
     assert Identity("maintainer", "", "x").lacks("config") == ""
