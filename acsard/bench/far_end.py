@@ -35,7 +35,10 @@ class Part(msgspec.Struct, frozen=True):
     0 means that the board answers each line.
     """
     baud_rate: int = 0
-    """Baud rate of the simulated board, even if no configuration allows it; 0: as configured."""
+    """Baud rate of the simulated board. 0 means the configured one.
+
+    Rates that the configuration rejects are accepted here.
+    """
 
 
 class NumberedMcu(FakeMcu):

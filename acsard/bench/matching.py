@@ -81,12 +81,13 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 
 
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
-    """Return the time from each command to the first line with its content, ns.
+    """Return the time, ns, from each command to the line that the daemon sent because of it.
 
-    A command without such a line within `PATIENCE_NS` is lost and is left out.
+    If no such line follows within `PATIENCE_NS`, the command is lost and is left out.
 
-    `sent` gives the time of each command and the line that the daemon must make of it. `lines`
-    gives the time and the content of each line on the wire.
+    Args:
+        sent: for each command, its time, ns, and the line that the daemon must make of it.
+        lines: the time, ns, and the text of each line on the wire.
     """
     times: dict[bytes, list[int]] = {}
     for at_ns, line in lines:
@@ -176,9 +177,9 @@ class Record(Struct, frozen=True):
     began_ns: int
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """Monotonic times of the end of the start-up and of the start of the shutdown, ns.
+    """Begin and end of the evaluated time, ns, monotonic.
 
-    Only the time between them is evaluated.
+    It begins when the daemon has started up, and ends just before the daemon is shut down.
     """
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""

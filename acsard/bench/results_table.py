@@ -20,7 +20,7 @@ POINTS = {
     "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
-"""Maps each figure that the benchmark measures to the events between which it measures the time.
+"""Names of the times that the benchmark measures, with the two events that begin and end each.
 
 "Here" is the process of the benchmark.
 """
@@ -33,9 +33,9 @@ OWN = {
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
     "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
-"""Maps each figure that the daemon measures to the events between which it measures the time.
+"""Names of the times that the daemon measures, with the two events that begin and end each.
 
-The names of the figures are those of `latencies.Name`.
+The names are those of `latencies.Name`.
 """
 
 
@@ -63,9 +63,9 @@ class Result(Struct, frozen=True, omit_defaults=False):
     realtime: bool
     """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Figures by the names of `POINTS`. A figure that was not measured is absent or null."""
+    """Results by their names in `POINTS`. A time that was not measured is null or absent."""
     own: dict[str, Summary]
-    """Figures by the names of `OWN`; their percentiles are accurate to 12 %."""
+    """Results by their names in `OWN`. The percentiles are accurate to 12 %."""
     commands_sent: int
     commands_seen: int | None
     """Number of commands whose line arrived at the simulated board; null on a real port."""
@@ -77,7 +77,7 @@ class Result(Struct, frozen=True, omit_defaults=False):
     """Largest number of feedback lines that the simulated board wrote between a line and the
     arrival of its odometry here. Null on a real port."""
     lines_sent: int
-    """Number of lines that the daemon wrote to the port, read together with `missed_periods`."""
+    """Number of lines that the daemon had written to the port when `missed_periods` was read."""
     missed_periods: int
     cpu_percent_following: float
     """Processor use with one subscriber to the odometry and without commands, % of one core."""
@@ -100,7 +100,7 @@ def this_machine() -> Machine:
 
 
 def _cpu_model() -> str:
-    """Return the name of the computer from the device tree, or the name of its processor."""
+    """Return the name of the board, such as a Raspberry Pi model, or else that of the processor."""
     try:
         board = Path("/proc/device-tree/model").read_text().strip("\0\n ")
         if board:

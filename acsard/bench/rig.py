@@ -58,8 +58,8 @@ def ended(who: str, code: int, said: str = "") -> MendableError:
 def daemon_ended(code: int, log: Path) -> MendableError:
     """Return an error that says why the daemon ended by itself.
 
-    The error has the daemon's last message in the file `log`, if there is one. If the daemon's exit
-    code `code` is also known, the benchmark ends with that code.
+    `code` is the daemon's exit code, and `log` its log file. The error contains the last message in
+    the file. If there is a message and `code` is in `Exit`, the benchmark also exits with `code`.
     """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.

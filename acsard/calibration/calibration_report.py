@@ -24,7 +24,10 @@ NAMES = (
 """Settings of `[drive]` in the order of `Multipliers.values`."""
 
 DIGITS = 5
-"""Number of decimals of the multipliers, and of significant digits of `[odometry]`, as written."""
+"""Precision of the written settings.
+
+Multipliers have this many decimals, and settings of `[odometry]` this many significant digits.
+"""
 
 
 class Refusal(Struct, frozen=True):
@@ -64,7 +67,7 @@ class Report(Struct, frozen=True):
     odometry: dict[str, float]
     """New settings of `[odometry]` by name.
 
-    They are the standard deviations of the geometry and, if `Noise.better` is true, the noise.
+    They state the uncertainty of the geometry and, if `Noise.better` is true, the noise.
     """
     feedback: dict[str, float]
     """New settings of `[feedback]` by name.
@@ -82,36 +85,36 @@ class Report(Struct, frozen=True):
     right_wheel_radius: float
     """Radius of the right wheels, m."""
     turn_error_before: float | None
-    """Heading error after a turn of 360 deg, deg."""
+    """Heading error after a turn of 360 deg with the configured multipliers, deg."""
     turn_error_after: float | None
     straight_error_before: float | None
-    """Heading error after 10 m straight ahead, deg."""
+    """Heading error after 10 m straight ahead with the configured multipliers, deg."""
     straight_error_after: float | None
     heading_error_before: float | None
-    """RMS heading error over whole drives, deg."""
+    """RMS heading error over whole drives with the configured multipliers, deg."""
     heading_error_after: float | None
     position_error_before: float | None
-    """RMS position error over whole drives, m."""
+    """RMS position error over whole drives with the configured multipliers, m."""
     position_error_after: float | None
     heading_noise_before: float | None
-    """Standard deviation of the heading, deg, after 10 m with the configured noise.
+    """Standard deviation (deg) of the heading after 10 m, due to the configured noise settings.
 
-    The drive turns as much per metre as the log. The value is None if the noise settings of
-    `[odometry]` stay as configured.
+    The 10 m are assumed to contain as much turning per metre as the log. The value is None if the
+    noise settings of `[odometry]` stay as configured.
     """
     heading_noise_after: float | None
-    """Standard deviation of the heading, deg, after 10 m with the new noise.
+    """Standard deviation (deg) of the heading after 10 m, due to the new noise settings.
 
-    The drive turns as much per metre as the log. The value is None if the noise settings of
-    `[odometry]` stay as configured.
+    The 10 m are assumed to contain as much turning per metre as the log. The value is None if the
+    noise settings of `[odometry]` stay as configured.
     """
     distance_noise_before: float | None
-    """Standard deviation of the distance, m, after 10 m with the configured noise.
+    """Standard deviation (m) of the distance after 10 m, due to the configured noise settings.
 
     It is None if the noise settings stay as configured, or if the log has no positions.
     """
     distance_noise_after: float | None
-    """Standard deviation of the distance, m, after 10 m with the new noise.
+    """Standard deviation (m) of the distance after 10 m, due to the new noise settings.
 
     It is None if the noise settings stay as configured, or if the log has no positions.
     """
@@ -122,9 +125,9 @@ class Report(Struct, frozen=True):
     runs: int
     seconds: float
     distance: float
-    """Distance rolled ahead and back, m."""
+    """Total distance driven, forwards and backwards, m."""
     turns: float
-    """Number of turns of 360 deg to both sides."""
+    """Total turning to the left and to the right, as a number of turns of 360 deg."""
     kept: Sequence[str]
     """Quantities that stay as configured, because the log does not improve them, in words."""
     notes: Sequence[str]
@@ -176,9 +179,9 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the standard deviations of heading (deg) and distance (m) after `METRES`.
+    """Return the uncertainty of heading (deg) and distance (m) that noise causes within `METRES`.
 
-    Noise causes them. They are `NOTHING` if the noise settings stay as configured.
+    These are standard deviations, or `NOTHING` if the noise settings stay as configured.
     """
     noise = calibration.noise
     if noise is None or not noise.better:

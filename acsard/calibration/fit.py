@@ -4,8 +4,8 @@ The fit is a Gauss-Newton fit. The evidence of a sensor is its contribution to t
 summed over each block (a few seconds of driving). The standard deviations come from a jackknife
 over the blocks (Quenouille and Tukey): each block is left out in turn, and the changes of the
 parameters show the effect of chance. These deviations are right even if the errors within a block
-are correlated. Each change is computed by one linear step from the whole fit. If there are few
-blocks, the standard deviation is widened to that of Student's t.
+are correlated. Each change is computed by one linear step from the fit to all blocks. If there are
+few blocks, the standard deviation is widened to that of Student's t.
 """
 
 from __future__ import annotations
@@ -93,9 +93,9 @@ class Evidence(Struct, frozen=True):
     """
 
     normal: Floats
-    """Left-hand sides, shape (blocks, COUNT, COUNT)."""
+    """Left-hand sides J^T W J of the normal equations, shape (blocks, COUNT, COUNT)."""
     score: Floats
-    """Right-hand sides, shape (blocks, COUNT)."""
+    """Right-hand sides J^T W r of the normal equations, shape (blocks, COUNT)."""
     squares: Floats
     """Sum of squared residuals per block."""
     counts: Floats
@@ -138,7 +138,7 @@ def condition(normal: Floats) -> float:
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
     """Return Huber's weight of each residual: 1 up to `HUBER` standard deviations, above it less.
 
-    The standard deviation is estimated from the median of the sizes, and is at least `least`.
+    The standard deviation is the scaled median absolute residual, but at least `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
@@ -197,9 +197,9 @@ class Fit(Struct, frozen=True):
 
     parameters: Floats
     normal: Floats
-    """Normal equations, shape (blocks, COUNT, COUNT)."""
+    """Left-hand sides of the normal equations, shape (blocks, COUNT, COUNT)."""
     score: Floats
-    """Right-hand sides, shape (blocks, COUNT)."""
+    """Right-hand sides of the normal equations, shape (blocks, COUNT)."""
     known: Floats
     """Prior information as normal equations, shape (COUNT, COUNT)."""
     active: tuple[P, ...]
@@ -255,12 +255,12 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return the changes of the parameters without each group, and the parameters' variances.
+        """Return how the parameters change if each group is left out in turn, and their variances.
 
         `group` gives the number of the group of each block. The variances are those of a jackknife
-        over the groups, widened to those of Student's t. If few groups cause a variance, it has few
-        degrees of freedom. Their number is Satterthwaite's estimate (An approximate distribution of
-        estimates of variance components, 1946).
+        over the groups, widened to those of Student's t. The degrees of freedom are few if few
+        groups cause most of a variance. They are estimated with the formula of Satterthwaite (An
+        approximate distribution of estimates of variance components, 1946).
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]

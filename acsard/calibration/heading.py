@@ -93,7 +93,7 @@ TURNING = 0.05
 """Turn rate up to which the robot is considered to drive straight, rad/s."""
 
 FASTEST = 0.95
-"""Fraction of the robot's turned angle that it turned at a rate below `Rates.fastest`."""
+"""Fraction of all turning in a log that is slower than `Rates.fastest`, weighted by angle."""
 
 
 class Rows(Struct, frozen=True):

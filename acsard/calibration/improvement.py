@@ -2,8 +2,8 @@
 
 This is a cross-validation. Each run (one drive in the log) is left out in turn: the parameters are
 fitted to the other runs, and the odometry error is measured on this run. If the log has fewer than
-three runs, each fifth of the log is left out instead. The errors decide between several fits. The
-configured values are kept unless the new ones are surely better.
+three runs, each fifth of the log is left out instead. Of several fits, the one that improves the
+odometry most is used. The configured values are kept unless the new ones are surely better.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LEAST_RUNS = 3
 """Minimum number of runs for leaving out whole runs. With fewer, fifths of the log are left out."""
 
 STRAIGHT = 0.1
-"""Largest curvature of straight driving, rad/m: turn divided by distance, by the wheels."""
+"""Largest curvature that counts as straight, rad/m, computed from the rolling of the wheels."""
 
 STRAIGHT_M = 1.0
 """Distance of straight driving in a log, m, below which its heading error is not reported.

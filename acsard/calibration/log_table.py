@@ -71,10 +71,10 @@ WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Largest possible absolute value of a cell, in the SI unit of its column.
+"""Largest possible absolute value of a cell in any column that `BOUNDS` does not list, in SI units.
 
-`BOUNDS` lists the limits by column, and `PLACE_BOUND` is that of all other columns. Values in
-degrees or nanoseconds stay below the limits, so that later checks can name the wrong unit.
+All limits are so large that values in degrees or nanoseconds stay below them. Later checks can
+therefore name the wrong unit.
 """
 
 RATES = frozenset((*WHEELS, "yaw_rate"))
@@ -83,9 +83,9 @@ RATES = frozenset((*WHEELS, "yaw_rate"))
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as each of its neighbours and as the usual rate. Of the
-rates above `SLOW` rad/s, only the fraction `FEW_VALUES` exceeds the usual rate. A true motion can
-also be this much faster than usual, but never for a single sample.
+A spike is more than `SPIKE` times as large as the sample before it, as the sample after it, and as
+the usual rate. The usual rate is the quantile 1 - `FEW_VALUES` of all rates above `SLOW` rad/s. A
+true motion can exceed it as much, but never for a single sample.
 """
 
 
@@ -169,11 +169,14 @@ AS_CSV = f"export it as CSV, whose first line names the columns, like {EXAMPLE}"
 
 
 class LogError(AcsardError):
-    """A log that cannot be used. The text names the place and the fault, and says what to do."""
+    """The data of a log is unreadable, incomplete or wrong. The text says where, and what to do."""
 
 
 class RefusedError(AcsardError):
-    """The log cannot be used for a calibration. The text says why and what to do."""
+    """The data is readable, but gives no plausible or useful calibration.
+
+    The text says why and what to do.
+    """
 
 
 def noted(error: Exception, notes: Iterable[str]) -> None:
@@ -386,9 +389,10 @@ class _Reader:
         self._runs.append(self._known.setdefault(name, len(self._known)))
 
     def _cells(self, line: str) -> list[str]:
-        """Return the cells of a line with quotes or a comment, or [] if all of it is a comment.
+        """Return the cells of a line that contains quotes or "#"; [] if the line is a comment.
 
-        The name of a run, and text columns that are not used, may contain "#".
+        A "#" after a number begins a comment. In the name of a run and in unused columns, it does
+        not.
         """
         cells = _cut(line, self._separator)
         if line.lstrip().startswith("#") and not self._begins_with_its_run(cells):

@@ -93,7 +93,8 @@ OUTLIER = 9.0
 """Mean square of a window's normalized residuals above which the window weighs less."""
 
 ROUNDING = 1e-12
-"""Variance that is added to each residual, so that a perfect sensor has a regular covariance."""
+"""Variance that is added to each residual, so that the covariance can be inverted even for a
+perfect sensor."""
 
 FLOOR = 0.25
 """Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a multiple of its standard deviation.
@@ -103,17 +104,17 @@ covariance of the pose would then claim that some directions have no error at al
 """
 
 CHANGES = 0.1
-"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a fraction of `SLIP`, `RATIO` and `TRACK`.
+"""Minimum of the noise `DISTANCE`, as a fraction of `SLIP` after conversion by `Windows.lasting`.
 
-`Windows.lasting` converts the last three to the units of the first three. A window does not show
-how long an error lasts beyond the window's end. Without this minimum, the pose covariance of one
-robot in eight had no width in some direction.
+`YAW` has the same minimum with `RATIO`, and `SKID` with `TRACK`. A window does not show how long an
+error lasts beyond the window's end. Without this minimum, the pose covariance of one robot in eight
+had no width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
-"""Gain of log likelihood per residual that counts as sure, whatever its standard deviation is.
+"""A `Noise.gain` above this value always counts as sure, even if `Noise.chance` is large.
 
-A stated standard deviation of twice the true one loses this much likelihood per residual.
+A standard deviation stated at twice its true value loses this much log likelihood per residual.
 """
 
 MOST = 1.0
@@ -361,12 +362,12 @@ class _Motion(Struct, frozen=True):
 
     @property
     def metres(self) -> float:
-        """Sum of the distances ahead and back, m."""
+        """Total distance driven, forwards and backwards, m."""
         return float(np.abs(self.distance).sum())
 
     @property
     def turned(self) -> float:
-        """Sum of the turns to both sides, rad."""
+        """Total turning to the left and to the right, rad."""
         return float(np.abs(self.turn).sum())
 
     @classmethod

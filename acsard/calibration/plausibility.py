@@ -47,7 +47,8 @@ DRIVE = (
 )
 
 UNLIKE = 0.5
-"""Largest fraction of a sensor's motion (sum of squares) that the wheels may not explain."""
+"""Fraction of a sensor's motion (sum of squares) that the wheels do not explain, above which the
+log is refused."""
 
 UNITS = 8.0
 """Largest factor by which a result may differ from the configuration.
@@ -93,7 +94,7 @@ LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
 
 ONE_SIDED = 0.1
-"""Fraction of the turns to one side. If the other side has less, a remark says so."""
+"""If the turns to one side are less than this fraction of those to the other, a remark says so."""
 
 ODD_SIZE = 1.25
 """Smallest factor between the measured and the configured radius that is reported."""

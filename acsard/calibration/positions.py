@@ -31,7 +31,7 @@ from acsard.calibration.runs import Block, Complexes, Run, cumulative
 LEAST_POINTS = 5
 """Minimum number of positions in a segment (the positions between two jumps).
 
-The alignment of a segment has three unknowns: a shift along two axes, and a rotation.
+The number must exceed the three unknowns of the alignment: a shift along two axes, and a rotation.
 """
 
 FINE_S = 0.02
@@ -150,7 +150,10 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
-    """Return the motion of the wheels in steps of about `fine_s` s, and at least one sample."""
+    """Return the motion of the wheels in steps of about `fine_s` s.
+
+    If the samples are further apart than this, each step is the interval between two samples.
+    """
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -186,7 +189,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the same places as `path`, but faster, if TRACK_GROWTH is 0."""
+    """Return only the places of `path`, which is faster. The parameter TRACK_GROWTH must be 0."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)

@@ -1,7 +1,7 @@
 """Reads the recorded drive that `acsard calibrate --log` names, and calibrates from it.
 
-The drive is a CSV file, a black-box recording of acsard, or a ROS 2 bag in MCAP: one file, or the
-directory of a bag.
+The drive is a CSV file, a black-box recording of acsard, or a ROS 2 bag in MCAP. `--log` may also
+name the directory of a bag.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MOST_BYTES = 1 << 30
 """Maximum size of a CSV file or of a recording of acsard, bytes. Both are read into memory."""
 
 MOST_RECORD_BYTES = 1 << 28
-"""Maximum size of a record in a bag, bytes. rosbag2 writes chunks of less than 1 MiB."""
+"""Maximum size of a record in a bag, bytes. It is ample: chunks of rosbag2 are below 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
 """Exceptions that the MCAP reader and LZ4 raise for a damaged bag.
@@ -46,7 +46,8 @@ OTHER_BAGS = {
 }
 """Kinds of bags that this module cannot read, by the suffix of their files.
 
-Each value contains the first bytes of such a file, and a phrase with its format and the conversion.
+Each value contains the first bytes of such a file, and the part of the error message that says how
+to convert it.
 """
 
 
@@ -60,9 +61,9 @@ def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> 
         choice: the topics and the axis to use in a bag.
 
     Raises:
-        LogError: the log cannot be used.
-        MendableError: the file cannot be read.
-        RefusedError: the log gives no calibration.
+        LogError: the content of the log is unreadable, incomplete or wrong.
+        MendableError: the file cannot be opened, or is too large.
+        RefusedError: the log is valid, but it gives no useful calibration.
     """
     try:
         table = _table(log, config, choice)
@@ -114,9 +115,9 @@ def _other_bag(what: str) -> str:
 
 
 def _is_ours(log: Path) -> bool:
-    """Return whether the header of an MCAP file says that acsard recorded it.
+    """Return whether acsard recorded this MCAP file, according to its header.
 
-    A file with a damaged header counts as a recording of acsard.
+    Return True also if the header is damaged.
     """
     with log.open("rb") as stream:
         try:

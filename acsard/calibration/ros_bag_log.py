@@ -6,7 +6,7 @@ fit, or if a topic should not be used, the user names the topics with `--topic`.
 
 An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. An
 `Odometry` is therefore used only if the user names its topic, or if the bag has neither turn rates
-nor other positions. In the second case the log is refused if the odometry turns exactly as the
+nor other positions. An `Odometry` that the user did not name is refused if it turns exactly as the
 wheels do.
 """
 
@@ -46,10 +46,10 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 LEAST_MESSAGES = 20
-"""Minimum number of messages with a value in a topic that is used."""
+"""Minimum number of messages in a topic that is used. Messages without a value do not count."""
 
 CLOCKS_APART_S = 1.0
-"""Largest difference between the delays of two topics whose stamps come from one clock, s.
+"""If the delays of topics differ by more than this, s, their stamps come from different clocks.
 
 The delay of a topic is the median time from the stamp of a message to its recording.
 """
@@ -60,18 +60,19 @@ STEP_S = 1.0
 UPRIGHT, LYING = 0.5, 0.8
 """Limits for the correlation between the turns about an IMU axis and the turns of the wheels.
 
-If the chosen axis is below `UPRIGHT` and another axis is above `LYING`, that other axis points up
-or down, and the log is refused.
+If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for another axis, the
+other axis points up or down, and the log is refused.
 """
 
 OWN = 3e-3
-"""Largest RMS difference at which the turns of an `Odometry` count as computed from the wheels.
+"""Smallest credible difference between the turns of an `Odometry` and those of the wheels.
 
-The difference is a fraction of the RMS turn.
+It is RMS, as a fraction of the RMS turn. If the difference is not larger, the `Odometry` was
+computed from the wheels.
 """
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
-"""Delays of an `Odometry` relative to the wheels that are tried, s."""
+"""Delays of an `Odometry` relative to the wheels, s. `_computed_from` tries each of them."""
 
 
 class RosMessage(NamedTuple):
@@ -260,7 +261,7 @@ def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice)
 
 
 class _Log:
-    """The topics of a bag, and the table that is built from those in use."""
+    """The topics of a bag, and the table that is built from the chosen topics."""
 
     def __init__(
         self, topics: list[_Topic], others: dict[str, str], joints: Sequence[str], choice: Choice
@@ -555,7 +556,7 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether the yaw was computed from the wheels: their turns differ by at most `OWN`.
+    """Return whether the yaw was computed from the wheels, because it turns exactly with them.
 
     `yaw` contains the yaw, rad, at the times `t`, s. `sides` is the result of `_sides`.
     """

@@ -1,8 +1,8 @@
 """Splits the table of a log into runs, and runs into blocks.
 
-A run contains the samples of one drive. Its times begin at 0, whatever the origin of the log's
-times is. Rows that are out of order are sorted. A new run begins where the times jump back, or
-where the wheels have no sample for a minute.
+A run contains the samples of one drive. Its times begin at 0. A new run begins where the times of
+the log jump back by a second or more, or where the wheels have no sample for a minute. Rows that
+are out of order for another reason are sorted.
 
 A block is a few seconds of driving. Every estimate of the calibration is a sum over blocks, and the
 standard deviations come from the differences between blocks. The errors within a block are
@@ -30,7 +30,7 @@ RESTART_S = 1.0
 """Smallest backward step of the times in a log, s, that may be a restart of the recording."""
 
 FEW_RESTARTS = 100
-"""Largest number of restarts. More backward steps of the times show that rows are unsorted."""
+"""Largest number of restarts. If the times step back more often, the rows are only unsorted."""
 
 SLOWEST_S = 0.7
 """Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
@@ -42,24 +42,24 @@ PAUSE_S = 60.0
 """Time without a wheel sample after which a new run begins, s."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
-"""Limits for times that were rounded in the log.
+"""Limits that show that the column t was rounded, if both of them are exceeded.
 
-They are the median interval between different times, s, and the mean number of rows that share a
-time. If both limits are exceeded, the column t was rounded.
+`ROUNDED_S` is for the median interval between different times, s. `REPEATED` is for the mean number
+of rows that share a time.
 """
 
 ROLLING, AGAIN = 0.2, 0.4
 """Criterion for a logger that repeats a position or a yaw until the next one arrives.
 
-While the wheel speeds of both sides add up to more than `ROLLING` rad/s, true values change from
-row to row. If more than the fraction `AGAIN` of these rows have the value of the row before, the
-logger repeats values. For example, rows at 20 Hz repeat half of the positions of a 10 Hz source.
+Only rows count in which the absolute speeds of both sides add up to more than `ROLLING` rad/s. If
+more than the fraction `AGAIN` of these rows have the value of the row before, the logger repeats
+values. For example, rows at 20 Hz repeat each position of a 10 Hz source once.
 """
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
 STREAMS = (WHEELS, "yaw_rate", "yaw", "x y", COMMANDS)
-"""Names of the sensors. A name consists of the sensor's columns, separated by spaces."""
+"""Names of the sensors. A name lists the sensor's columns. The commands count as a sensor."""
 
 Streams = dict[str, tuple[Floats, ...]]
 """The times and the values of each sensor, by the sensor's name in `STREAMS`."""
@@ -100,7 +100,7 @@ others.
 """
 
 LEAST_TURN = 0.2
-"""Angle, rad, that the wheels of one side must turn in a block. Other blocks are left out."""
+"""Blocks in which the wheels of each side turn by less than this angle, rad, are left out."""
 
 MOST_JITTER_S = 5.0
 """Largest variation of the delay from stamp to arrival, s.
@@ -114,7 +114,7 @@ class Run(Struct, frozen=True, dict=True):
 
     name: str
     start: float
-    """Time of the first wheel sample in the log, s."""
+    """Time of the first wheel sample of this drive, s, as the log gives it."""
     t: Floats
     """Times of the wheel speeds."""
     left: Floats
@@ -125,7 +125,7 @@ class Run(Struct, frozen=True, dict=True):
     """Yaw rate, rad/s."""
     yaw_t: Floats
     yaw: Floats
-    """Yaw as recorded: rad, wrapped or not."""
+    """Yaw as recorded, rad. It may be wrapped."""
     place_t: Floats
     place: Complexes
     """Positions x + iy in m, relative to the first one."""
@@ -162,7 +162,7 @@ class Run(Struct, frozen=True, dict=True):
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
     def speed_difference(self, t: Floats) -> Floats:
-        """Return the right minus the left wheels' speed, rad/s, averaged over `SMOOTH_S`."""
+        """Return the mean speed over `SMOOTH_S` of the right wheels minus the left, rad/s."""
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -172,7 +172,7 @@ class Run(Struct, frozen=True, dict=True):
 class Notes:
     """Sentences about a log. A sentence that applies to several runs is listed once.
 
-    A sentence may contain "{}", which a count replaces, summed over all runs.
+    If a sentence contains "{}", a count replaces it. The count is the sum over all runs.
     """
 
     def __init__(self, sentences: Iterable[str]) -> None:
@@ -188,7 +188,7 @@ class Notes:
             sums[0], sums[1] = sums[0] + count, sums[1] + 1
 
     def sentences(self) -> tuple[str, ...]:
-        """Return each sentence once, in the order of their first addition, with its counts."""
+        """Return each sentence once, with its count, in the order in which they were added."""
         return tuple(
             sentence.replace("{}", str(count)) + (f" (in {runs} runs)" if 1 < runs < count else "")
             for sentence, (count, runs) in self._sentences.items()
@@ -459,7 +459,7 @@ def gaps(t: Floats) -> Floats:
 
 
 def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
-    """Return a mask of the intervals from `begin` to `end` that touch no gap (a row of `holes`)."""
+    """Return a mask of the intervals from `begin` to `end` that do not touch the gaps `holes`."""
     after = np.searchsorted(holes[:, 1], begin, side="right")
     before = np.searchsorted(holes[:, 0], end, side="left")
     return np.asarray(after == before)
@@ -471,10 +471,10 @@ def cumulative(steps: Floats) -> Floats:
 
 
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
-    """Return the times in which all wheels stand still, one row (begin, end) for each rest, in s.
+    """Return the intervals in which all wheels stand still, one row (begin, end) each, in s.
 
-    `edge_s` is cut off both ends of each rest, and the rest is left out if less than `least_s`
-    remains, both in s.
+    Each interval is shortened by `edge_s` at both ends. It is left out if it is then shorter than
+    `least_s`. Both are in s.
     """
     moving = np.concatenate(([True], run.moving, [True])).astype(np.int8)
     changes = np.flatnonzero(np.diff(moving))
@@ -507,10 +507,10 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of a side turned by at least `LEAST_TURN` from `begin` to `end`, s.
+    """Return whether the wheels of a side rolled by at least `LEAST_TURN` from `begin` to `end`, s.
 
-    Turns ahead and back both add to the angle. `left` and `right` contain the angles of each side
-    at `begin` and at `end`, rad.
+    Rolling back adds to the angle, as rolling ahead does. `left` and `right` contain the angles of
+    each side at `begin` and at `end`, rad.
     """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True

@@ -56,7 +56,7 @@ only the shortest length is tried. If it has no heading sensor, the shortest len
 """
 
 ENOUGH_BLOCKS = 8
-"""Minimum number of blocks. A block length that gives fewer is not tried after a shorter length.
+"""Minimum number of blocks, unless no shorter block length has given a fit.
 
 With six blocks, the standard deviation of the ratio of left to right radius was up to three times
 too small.
@@ -76,9 +76,9 @@ class Drives(Struct, frozen=True):
     seconds: float
     metres: float
     turns: float
-    """Number of turns of 360 deg to both sides together, according to the calibrated wheels."""
+    """Sum of all left and right turns, in turns of 360 deg, by the calibrated wheels."""
     fastest: float
-    """Rate of the fastest turns, rad/s: 95 % of the turned angle was turned more slowly."""
+    """Turn rate below which the robot turned 95 % of its angle, rad/s."""
 
     @classmethod
     def of(
@@ -108,7 +108,8 @@ class Calibration(Struct, frozen=True):
     multipliers: Multipliers
     """The new multipliers."""
     scale: str
-    """Measurements of the wheels' size: "positions", "distance" (by tape), both, or "" for none."""
+    """What measured the wheels' size: "positions", "distance" (by tape), "positions and distance",
+    or "" for nothing."""
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
@@ -182,7 +183,7 @@ class Prepared(Struct, frozen=True):
     steps: list[WheelSteps]
     """The wheel steps of each run; empty if the log has no positions."""
     sources: list[Source]
-    """The evidence of each sensor as a function of the parameters."""
+    """One function for each sensor, which returns the sensor's evidence for given parameters."""
     start: Floats
     """The parameters from which the fit starts."""
 
@@ -252,7 +253,7 @@ def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bo
 
 
 class Candidate(Struct, frozen=True):
-    """A fit to blocks of one length, and its improvement over drives that the fit did not use."""
+    """A fit to blocks of one length, and how much it improves the odometry of other drives."""
 
     made: Prepared
     fitted: Fit
@@ -468,7 +469,7 @@ def _stays(name: str, deviation: float) -> str:
 
 
 def _of_noise(shown: Noise | None) -> Iterator[str]:
-    """Yield a sentence if some noise stays as configured. `shown` is the noise of the log."""
+    """Yield a sentence if some noise stays as configured. `shown` is the result of `_noise`."""
     if shown is None or not shown.better:
         yield (
             "the variances per metre and per radian stay as configured, because another "
@@ -519,7 +520,7 @@ def _own(what: str) -> str:
 
 
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
-    """Return a function that computes the extent of a run's path from multipliers and its number.
+    """Return a function that computes the extent of a path from multipliers and a run's number.
 
     As in the fit, the track changes with the turn rate.
     """

@@ -50,12 +50,12 @@ It is given as a fraction of `feedback.fault_time`.
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
 """Criterion for a wheel that turns as fast as it can.
 
-For at least twice `STEADY_S` s, its speed is below the fraction `REACHED` of its command. In the
-last `STEADY_S` s, the speed changes by less than the fraction `CONSTANT`.
+Its speed stays below `REACHED` times its command for at least 2 * `STEADY_S` s. In the last
+`STEADY_S` s of this time, the speed changes by less than the fraction `CONSTANT`.
 """
 
 SAME = 1.5
-"""Largest factor between the fitted and the configured response time that counts as equal."""
+"""The fitted and the configured response time count as equal up to this factor."""
 
 
 class WheelResponse(Struct, frozen=True):
@@ -80,7 +80,7 @@ class WheelResponse(Struct, frozen=True):
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time and, if it is finite, one about `fastest`."""
+        """Return a sentence about the response time and, if `fastest` is finite, one about it."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = f", and feedback.response_time = {self.present:g} would take them for faulty: "

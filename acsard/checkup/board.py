@@ -46,7 +46,7 @@ class Wire(Protocol):
         """Send bytes now. Raises `WireLostError` if the connection is lost."""
 
     def late_ns(self) -> int:
-        """Return how long a simulated board has waited for a processor since the last call, ns.
+        """Return how long a simulated board waited for processor time since the last call, ns.
 
         The result is 0 if the board is a real one and not a program on this computer.
         """
@@ -86,8 +86,8 @@ KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced",
 class Board:
     """The board that is checked, with its replies and the results of the steps.
 
-    Entering this context opens the wire. Leaving it sends zeros and closes the wire. It sends no
-    more zeros if they make a motor run away (`fled`).
+    As a context manager, it opens the wire at the beginning. At the end it sends zeros, unless a
+    motor runs away (`fled`), and closes the wire.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Board:
         self.comma = mcu.trailing_comma
         """Whether lines end with a comma."""
         self.latched = False
-        """Whether motor d kept turning after zeros whose line ending is not that of `comma`."""
+        """Whether zeros stop motor d only with the line ending that `comma` selects."""
         self.sealed = self.sampled = False
         """`sealed`: lines have a checksum. `sampled`: they ask for the board's clock and counts."""
         self.identity: dict[str, str] = {}
@@ -196,7 +196,7 @@ class Board:
 
     @property
     def known(self) -> dict[str, object]:
-        """The values of the attributes in `KNOWN`. The check restores them to repeat a step."""
+        """The values of the attributes in `KNOWN`. A repeated step starts from them."""
         return {name: getattr(self, name) for name in KNOWN}
 
     @known.setter
@@ -206,7 +206,7 @@ class Board:
 
     @property
     def line_s(self) -> float:
-        """Time that the wire needs for the longest line, plus a quarter, s."""
+        """Time that the wire needs for the longest line, with a margin of 25 %, s."""
         longest = line_bytes(True, self.sealed, self.sampled)
         return 1.25 * wire_ns(longest, self.baud_rate) / NS_PER_S
 
@@ -256,7 +256,7 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send one line of zeros, and listen for the reply for `wait_s` s, at least one period.
+        """Send one line of zeros, then listen for `wait_s` s, but at least for one period.
 
         `comma` says whether the line ends with a comma; None means `self.comma`.
         """
@@ -266,9 +266,9 @@ class Board:
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """Send this many lines of zeros, and return the first reply to each with its delay, s.
+        """Send zeros `lines` times, and return the first reply to each line with its delay, s.
 
-        The wait for a reply takes `wait_s` s, at least 1.5 periods. A line without a reply has no
+        Wait `wait_s` s for each reply, but at least 1.5 periods. A line without a reply has no
         entry in the result. `comma` says whether the lines end with a comma; None means
         `self.comma`.
         """
@@ -285,7 +285,7 @@ class Board:
         """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies of that time.
 
         The time between two lines is `period_s`; 0 means `self.period_s`. Raises `StoppedError` if
-        the board falls silent while `armed`, because this computer could not see a runaway then.
+        the board falls silent while `armed`, because a runaway motor would then go unnoticed.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -409,8 +409,8 @@ class Board:
     def rest(self) -> None:
         """Send zeros until all motors stand. Raises `StoppedError` if a motor keeps turning.
 
-        If only motor d keeps its speed, and zeros with the other line ending stop it, later lines
-        have that ending. The two endings are with a comma and without one.
+        Some firmware lets motor d obey only one line ending: with a comma, or without one. If only
+        the other ending stops motor d, later lines have that ending.
         """
         began_s = self.now_s
         if self.settles(self.comma):

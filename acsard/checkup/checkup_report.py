@@ -70,7 +70,7 @@ def withheld(simulated: bool, config: Config) -> str:
 
 
 def applied(given: Changes, config: Config) -> Config | None:
-    """Return the configuration with these keys, or None if a value is not permitted."""
+    """Return `config` with the new values `given`, or None if a value is not permitted."""
     plain: Any = effective(config)
     for key, value in given.items():
         where, _, name = key.rpartition(".")
@@ -85,8 +85,8 @@ class Report(Struct, frozen=True):
     """The result of a check.
 
     `changes` are the suggested configuration values, and `toml` contains them as lines of TOML.
-    `written` is the file to which they were written, or None. `error` is a failure that is not the
-    board's fault, or None.
+    `written` is the file that now contains the changes, or None. `error` is a failure that is not
+    the board's fault, or None.
     """
 
     port: str

@@ -1,4 +1,4 @@
-"""Sends damaged lines with speeds to motors that stand: none of them may move a motor."""
+"""Sends damaged speed commands while the motors stand. No such line may move a motor."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def comma(board: Board, dead: bool) -> Finding:
 def _comma_wrong(board: Board, how: str) -> Finding:
     """Return the finding that `mcu.trailing_comma` is wrong. `board.comma` is the right value.
 
-    `how` is the second part of the outcome's name.
+    `how` is the part after the colon in the name of the outcome.
     """
     return outcomes.find(
         f"trailing comma: {how}",
@@ -124,7 +124,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Compare the form of the replies with the documented form. The daemon can read both forms."""
+    """Compare the form of the replies with the documented form. The daemon also reads others."""
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]

@@ -16,19 +16,19 @@ AGREES = 0.02
 """Largest relative difference between the measured and the stated counts per turn."""
 
 ALIKE = 0.75
-"""Smallest ratio of two motors' measured counts per turn that still count as equal.
+"""Smallest accepted ratio of the lowest to the highest counts per turn of the motors.
 
 The ratio is low, because with a coarse encoder the measurement of a single motor is rough.
 """
 
 COARSE = 0.015
-"""Smallest mean jump of a motor's angle from line to line, rad, that shows a coarse encoder.
+"""Smallest mean jump of a motor's angle from reply to reply, rad, that shows a coarse encoder.
 
 The daemon must know the counts per turn of such an encoder.
 """
 
 LONGEST_S = 0.05
-"""Longest time between two lines, s, with which jumps of the speed can show a coarse encoder.
+"""Longest time between two replies, s, for which jumps of the speed can show a coarse encoder.
 
 With a longer time, the motors' own accelerations look like such jumps.
 """
@@ -85,8 +85,8 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Return the finding about `mcu.encoder_counts`, the configured counts per wheel turn.
 
-    The configured value is compared with the one in the board's identification, if it names one,
-    and with a measurement. The measurement uses `motors`, which turned as commanded.
+    The configured value is compared with a measurement, and with the value in the board's
+    identification if there is one. The measurement uses `motors`, which turned as commanded.
     """
     if not board.sampled:
         about = coarse(board.replies, motors)

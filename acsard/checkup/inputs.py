@@ -17,7 +17,7 @@ PRESS_S = 20.0
 """Time in which the operator must press an input and release it, s."""
 
 NEWS_S = 0.5
-"""Time within which a board has reported each of its inputs at least once, s."""
+"""Time within which every board reports each of its inputs at least once, s."""
 
 
 class Input(Struct, frozen=True):
@@ -29,7 +29,7 @@ class Input(Struct, frozen=True):
 
 
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
-    """Let the operator press each input, and return a finding about the board's reports of it.
+    """Let the operator press each input, and return a finding about how the board reported them.
 
     The inputs are those that the configuration requires or the board reports. A bumper is named by
     its configured place, or by its number on the board if no places are configured.

@@ -1,4 +1,4 @@
-"""Counts lost and damaged lines, and finds long silences of the board and the direction of a loss.
+"""Counts lost and damaged lines, and finds long silences and the direction in which lines are lost.
 
 A reply that arrives damaged was damaged on its way from the board. If a line has no reply, either
 the line or its reply was lost. To find out which, the check sends single lines that turn standing
@@ -29,14 +29,14 @@ FEW = 2
 """Smallest number of lost lines that counts as a fault. Fewer may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""Duration of the count of lost lines. `LINES` is enough to show a loss of 2 %.
+"""Limits of the count of lost lines.
 
-The count takes at least `LEAST_S` s. If lines were lost, it goes on until `LINES` lines are counted
-or `MOST_S` s have passed.
+The count takes `LEAST_S` s. If a line was lost in this time, it goes on until it has `LINES` lines,
+which are enough to show a loss of 2 %, or until `MOST_S` s have passed.
 """
 
 SILENT = 2.0
-"""Smallest ratio of a gap between two replies to the usual gap that counts as a silence."""
+"""A gap between two replies is a silence only if it is this many times as long as the mean gap."""
 
 
 class Count(Struct, frozen=True):
@@ -58,9 +58,9 @@ class Count(Struct, frozen=True):
 def finding(board: Board) -> Finding:
     """Send zeros at the control rate, count the lost replies, and set `board.lost`.
 
-    Raises `StoppedError` if many lines are lost, some arrive damaged, and lines have no checksum:
-    lines to the board may then be damaged too, and could command any speed. If the rate of the
-    replies was not measured, the finding says that the loss is not judged.
+    Raises `StoppedError` if the loss exceeds `MOST`, and lines without a checksum arrive damaged. A
+    damaged line to the board could then command any speed. If the rate of the replies was not
+    measured, the finding says that the loss is not judged.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
@@ -130,7 +130,7 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """Return the longest gap between replies, s, or 0 if no gap would look like a lost link."""
+    """Return the longest gap between replies, s, if it would look like a lost link, else 0."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0
@@ -143,29 +143,29 @@ The encoders show the movement, but the board's watchdog does not act yet.
 """
 
 TOLD, PULSES_S = 8, 20.0
-"""Number of pulses without a reply that show the direction of the loss, and the longest search, s.
+"""Limits of the search for the direction of a loss: a number of unanswered pulses, and a time, s.
 
 A pulse is a single line that turns the motors for a moment.
 """
 
 SPREAD, STRIDE = 12, 5
-"""Number of different pauses after pulses, and the step from one pause to the next.
+"""Each pause after a pulse is longer than the last by `STRIDE` line periods, modulo `SPREAD`.
 
-The pauses differ because losses at regular intervals could miss every pulse otherwise.
+With equal pauses, losses at regular intervals could miss every pulse.
 """
 
 OBEYED = 0.5
-"""Smallest angle of a pulse that the motors obeyed, as a fraction of the usual angle."""
+"""The motors obeyed a pulse if they turned by at least this fraction of the usual angle."""
 
 SEEN, GRAINS = 0.02, 4
-"""Smallest usual angle of a pulse that can be judged: `SEEN` rad and `GRAINS` encoder steps."""
+"""Pulses can be judged if they usually turn a motor by `SEEN` rad and `GRAINS` encoder steps."""
 
 
 class Ways(Struct, frozen=True):
     """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
 
-    `sent` counts all pulses. `there` counts those that were lost on the way to the board, and
-    `back` those whose reply was lost: the motors obeyed them.
+    `sent` counts all pulses. `there` counts those that were lost on the way to the board. `back`
+    counts those that the motors obeyed, but whose reply was lost.
     """
 
     sent: int
@@ -232,7 +232,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return True if no report is missing since `since_s`, s, of a board with its own clock."""
+    """Return whether all reports of a board that sends by its own clock arrived since `since_s`."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 

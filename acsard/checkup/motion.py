@@ -53,9 +53,9 @@ TREND_S = 0.5
 """Shortest length of the two intervals whose mean speeds `trend` compares, s."""
 
 FALLS = 0.97
-"""Largest ratio of a motor's speed to its speed just before that means that the motor slows down.
+"""A motor slows down if its speed is below this fraction of its speed just before.
 
-If the ratio is larger than the inverse of this number, the motor speeds up.
+It speeds up if the ratio of the two speeds is above the inverse of this number.
 """
 
 
@@ -141,9 +141,9 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     """Return the numbers of the motors that may still turn at the monotonic time `now_s`, s.
 
-    A coarse encoder reports a speed of 0 in most replies, even while its motor turns. So a motor
-    counts as turning for some time after its last speed above `STANDING`. This is the time in which
-    a motor at the speed `STANDING` would turn by the angle between that reply and the one before.
+    A coarse encoder reports a speed of 0 in most replies, even while its motor turns. So after a
+    reply that shows a turn by some angle, the motor counts as turning for a while: for the time
+    that it would need to turn by the same angle at the speed `STANDING`.
     """
     found: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):
@@ -175,7 +175,7 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
 def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
     """Return the resolution of the speed readings, expressed as a time, s.
 
-    The readings jump, because the firmware counts whole encoder counts between two replies. The
+    The readings jump, because the firmware computes them from whole encoder counts. The
     result is the time in which a motor at `SPEED` turns by the angle of one jump. `steady` are the
     replies of a time in which `motors` turned at this speed. The result is 0 for fewer than five
     replies.

@@ -403,8 +403,8 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
     Args:
         outcome: a key of `MANUAL`. The part before the colon is the finding's name.
         keys: configuration values that the finding suggests.
-        seen: the measured values. `name` replaces the finding's name, and `margin_s` is the margin
-            of an `Unsure`.
+        seen: the measured values. A value `name` replaces the finding's name. A value `margin_s`
+            sets the margin of an `Unsure`.
     """
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))

@@ -61,16 +61,16 @@ Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""Largest numbers of repetitions because this computer was late: of one step, and in all.
+"""Largest numbers of repetitions because this computer was late: of one step, and of all steps.
 
-Without the limit of all repetitions, a check could take four minutes.
+Without the limit for all steps, a check could take four minutes.
 """
 
 AGAIN, MOST = 1, 5
 """Limits for restarts of the board.
 
-A step in which the board restarts is repeated up to `AGAIN` times. `MOST` restarts in all end the
-check.
+The board may restart `AGAIN` times in each step, which is then repeated. One more restart in the
+same step ends the check, and so do `MOST` restarts in all steps together.
 """
 
 
@@ -84,7 +84,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report the first finding of each name. If it was not judged, also report a judged one."""
+        """Report the first finding of each name, and the first judged one if the first was not."""
         if finding is None:
             return
         judged = lateness.judged(finding)

@@ -28,16 +28,16 @@ An identification that arrives later was sent by the board without a request.
 """
 
 UNANSWERED = 5
-"""Smallest number of lines in a row without a reply after which a printed text shows a restart.
+"""Number of successive lines without a reply after which a printed text shows a restart.
 
 With fewer such lines, the text may be a debug print of the firmware.
 """
 
 AHEAD_S = 2.0
-"""Time by which the board's clock may advance more than this computer's between two replies, s.
+"""The board restarted if its clock gains more than this on this computer's between replies, s.
 
-A line that is delayed on its way causes a small difference. A larger one shows a restart, because
-the clock's jump back to 0 looks like a large advance modulo `CLOCK`.
+A line that is delayed on its way causes a smaller gain. A restart causes a larger one, because the
+clock's jump back to 0 looks like a large advance modulo `CLOCK`.
 """
 
 CLOCK = 65536
@@ -47,7 +47,7 @@ SILENT_S = 0.25
 """Shortest time without a sent line after which a watchdog may restart the whole board, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Maps the causes that the reference firmware names after a restart to outcomes of the check."""
+"""Maps each cause of a restart that the reference firmware names to an outcome of the check."""
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
 """Pattern that occurs in printed texts, but in no reply, not even in a damaged one."""
@@ -63,7 +63,7 @@ class Restart(Struct, frozen=True):
     turned: Motors = ZERO
     """Speeds that were commanded just before the restart, rad/s; zeros if the motors stood."""
     silent_s: float = 0.0
-    """Longest time without a line to the board since the last reply before the restart, s."""
+    """Longest pause between lines to the board, from its last reply to its restart, s."""
     cause: str = ""
     """Cause of the restart as the board names it, or "" if it names none."""
 
@@ -182,7 +182,7 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether several restarts came, each after `SILENT_S` s or more without a sent line."""
+    """Return whether several restarts each followed a pause of at least `SILENT_S` in the lines."""
     return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
 
 

@@ -4,9 +4,9 @@ The watchdog must also act if the board receives only damaged lines, as with a h
 
 The check brings the motors to speed, sends nothing (or damaged lines) for some time, and then sends
 zeros. The watchdog's time follows from the distance that the motors ran on, minus the distance of
-an ordinary stop. The replies usually show these distances. Some firmware only replies to lines, and
-with momentary speeds, so its replies do not show them. For such firmware, the check tries silences
-of different lengths, and sees after each whether the motors still turned.
+an ordinary stop. The replies usually show these distances. They do not if the firmware replies only
+to lines and reports momentary speeds. The check then tries silences of different lengths, and sees
+after each silence whether the motors still turn.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Run(Struct, frozen=True):
     ran_s: float
     """Distance until standstill of the motor that ran on farthest, as a time at full speed, s."""
     slow_s: float
-    """Time until all motors were slower than `STOPPED`, s."""
+    """Time from the beginning of the stop until all motors were slower than `STOPPED`, s."""
     first: float
     """Speed in the first reply after the silence, as a fraction of full speed.
 
@@ -135,8 +135,8 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
     """Narrow the bounds of the time for which the motors run on, by bisection.
 
-    `between` are the bounds so far, s. After a silence of the lower bound the motors still turn,
-    and after a silence of the upper bound they stand. `stop` is their behaviour in an ordinary
+    `between` are the bounds so far, s. The motors still turn after a silence as long as the lower
+    bound, and stand after one as long as the upper bound. `stop` is their behaviour in an ordinary
     stop.
     """
     least_s, most_s = between

@@ -89,8 +89,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative error of the own encoder's speed against the command: the larger one of forward
-        and backward."""
+        """Relative error of the speed of the motor's own encoder: the larger of both directions."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
@@ -166,7 +165,7 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
 
 
 NEAR = 0.8
-"""Fraction of `OFF`. A speed with a larger error is measured again over a longer time.
+"""If the error of a speed exceeds this fraction of `OFF`, the speed is measured again for longer.
 
 The first measurement is too inaccurate to decide whether the error exceeds `OFF`.
 """
@@ -175,7 +174,7 @@ LOOK_S = 0.75 * motion.MOTOR_S
 """Time over which the second measurement averages the speed, s."""
 
 LOOKS = 8
-"""Largest number of short measurements that are averaged until the speed of a motor is steady."""
+"""Largest number of short measurements whose mean `run_up` takes as the present speed."""
 
 ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -190,8 +189,8 @@ def one(motor: int, speed: float) -> Motors:
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
 
-    Returns these speeds, rad/s, and the relative error of the motor's speed that its encoder may
-    cause because encoder counts are whole numbers.
+    Returns these speeds, rad/s, and the possible relative error of the motor's speed. The error
+    arises because encoder counts are whole numbers.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
@@ -283,9 +282,9 @@ def probe(board: Board, motor: int) -> Motors | None:
     that the encoders showed, rad/s, and the motor stands.
 
     The firmware may drive a motor without a working encoder to full speed, but the probe is too
-    short for that. If the encoder does not follow, the probe is repeated, unless several readings
-    show that it runs backward: a coarse encoder may need more movement, and a single count backward
-    proves nothing.
+    short for that. If the encoder does not follow, the probe is repeated, because a coarse encoder
+    may need more movement. It is not repeated if several readings show that the encoder runs
+    backward.
     """
     began_s = board.now_s
     shown = _probe(board, motor, motion.SPEED / 2)
@@ -305,7 +304,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each encoder's mean speed in the probe, rad/s, without possible coasting."""
+        """Return each encoder's mean speed in the probe, rad/s, minus what coasting explains."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]

@@ -143,7 +143,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
 
 
 def _require_fitting(args: argparse.Namespace) -> None:
-    """Raise `UsageError` for an option that does not fit a recorded (`--log`) or a guided drive."""
+    """Raise `UsageError` if options of a recorded drive (`--log`) and of a guided one are mixed."""
     if not args.log and args.distance:
         raise UsageError(
             "--distance goes with --log: a guided drive asks for the distances that it needs"
@@ -275,8 +275,8 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 def _differing(config: Config, mine: Config, where: str) -> str:
     """Return why a calibration must not be written into the file `where`, or "" if it may.
 
-    It must not if the daemon's configuration `config` and that of the file, `mine`, give different
-    wheel radii or track widths.
+    It must not if the daemon's configuration `config` and the file's configuration `mine` differ in
+    the wheel radius or the track width.
     """
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):

@@ -106,7 +106,7 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield (subcommand, option) for each option. Those of `recording show` have `recording`."""
+    """Yield (subcommand, option) for each option. `recording show` counts as `recording`."""
     for action in parser._actions:
         yield verb, action
         if isinstance(action, argparse._SubParsersAction):

@@ -75,9 +75,9 @@ def require_one(args: argparse.Namespace) -> None:
 
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Connect to the bus, and yield the client and the ids of the robots if `--id` names several.
+    """Connect to the bus. Yield a client and, if `--id` names several robots, their ids.
 
-    The ids are ("*",) if `--id` is "*". They are () if `--id` names one robot or is missing; then
+    The ids are ("*",) if `--id` is "*". If it names one robot or is missing, the ids are (), and
     the client belongs to that robot or to the configured one.
     """
     many = named(args.id or "")
@@ -90,8 +90,8 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 def require_followed(key: str) -> None:
     """Raise `UsageError`, with the command to type instead, if a key never has messages.
 
-    Print a warning if the table of keys does not have the key. Without it, waiting for messages on
-    a misspelt key would look like a dead robot.
+    Print a warning if the key is not in the table of keys. Without the warning, waiting for
+    messages on a misspelt key would look like a dead robot.
     """
     if unknown(key):
         words = f"{key} is not in the topic table ({key_hint(key)}); waiting for it all the same"

@@ -272,7 +272,7 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events between the times of `part`, and return whether it contains any steps."""
+    """Print the events in the time span `part`, and return whether it contains any steps."""
     story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
@@ -426,7 +426,7 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the recordings that the arguments name, and the part of each between the times."""
+    """Return the recordings that the arguments name, each with the part from --from to --to."""
     times = [when for when in (args.begin, args.end) if when is not None]
     by_clock = bool(times) and not any(isinstance(when, Offset) for when in times)
     if args.file == "all" or (args.file is None and by_clock):

@@ -44,7 +44,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Run a router process, and restart it until a signal arrives. Unusable files end it too."""
+    """Keep a router process running until a signal arrives, or until its files cannot be used."""
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)

@@ -1,9 +1,9 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
-This module is pure. Every program that commands the robot uses its time limits. A program that
-forwards the commands of a person (`Wish`) uses a `Commander`. A `Commander` repeats no command, so
-the robot stops when the person, the panel or the network falls silent. A new command replaces one
-that has not been sent yet. A zero is never too old to be sent, and the last command is a zero.
+This module is pure. Every program that commands the robot uses the time limits defined here. A
+program that forwards the commands of a person (`Wish`) uses a `Commander`. A `Commander` repeats no
+command, so the robot stops when the person, the panel or the network falls silent. A new command
+replaces one that has not been sent yet. A zero is sent however old it is, and ends every drive.
 """
 
 from __future__ import annotations
@@ -123,8 +123,8 @@ class Commander:
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands that have arrived since the first command after a silence began to
-        wait (`GATHER_NS`). `send` resets it to 0."""
+        """Number of commands that have arrived during the wait after a silence (`GATHER_NS`).
+        `send` resets it to 0."""
         self._crowded = False
         """Whether the last burst had more than `CROWD` commands."""
         self._moved_ns: int | None = None
@@ -199,7 +199,7 @@ class Commander:
     def _zero(self, now_ns: int) -> Wish:
         """Return a zero with the present time on the sender's clock as its stamp.
 
-        To the daemon, a stamp of another clock would look as if the sender's clock had been set.
+        The daemon would take a stamp of another clock for a jump of the sender's clock.
         """
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None:

@@ -195,7 +195,7 @@ class _Drive:
     def require(self, grace: float) -> None:
         """Raise `NotDrivenError` if the robot has not followed for `grace` s, or never will.
 
-        Process the states that have arrived first.
+        First process the states that have arrived.
         """
         self.look()
         if not self.objection:

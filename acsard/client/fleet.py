@@ -35,7 +35,7 @@ class Row(Struct, frozen=True):
 
     robot_id: str
     here: bool | None
-    """True while the liveliness token of the robot's daemon is present; None if it never was."""
+    """Whether the liveliness token of the robot's daemon is present; None if it was never seen."""
     state: RobotState | None
     age: float
     """Age of `state`, s; inf before a state has proved that the daemon runs."""
@@ -55,7 +55,7 @@ class _Known:
         self.begin()
 
     def begin(self) -> None:
-        """Begin to follow the robot, or begin again because it has reappeared; query it at once."""
+        """Begin to follow the robot, or begin again because it has reappeared. A query is due."""
         self.since = self.info_due = time.monotonic()
         self.follower = Follower(self.since, FLEET_ASK_S)
         self.follower.due = self.since
@@ -169,7 +169,7 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        """Drop the robot that has been absent for the longest time, but no robot of `ids`."""
+        """Drop the robot that has been absent for longest. Robots that `ids` names always stay."""
         gone = [(one.since, name) for name, one in self._known.items() if not one.here]
         for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
             del self._known[name]

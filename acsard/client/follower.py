@@ -22,8 +22,8 @@ from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 ASK_S = 0.3
-"""Time without a new state, s, after which the client queries `state`. The query is for a robot
-that is configured to publish its state seldom."""
+"""Time without a new state, s, after which the client queries `state`. The query is needed if the
+robot is configured to publish its state seldom."""
 
 QUIET_S = 0.5
 """Age of a state, s, above which a program must not base an action on the state."""
@@ -61,7 +61,7 @@ class Follower:
         self.heard = False
         """Whether any state has proved that the daemon runs (see `answered`)."""
         self.last_seen = now
-        """Time of the last state that proved that the daemon runs; before the first, the start."""
+        """Time of the last state that proved that the daemon runs, or of the start if none did."""
         self.due = now + ask_s
         """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0

@@ -155,7 +155,7 @@ class Client:
         return sender_id(self.name, self._secret)
 
     def like(self, robot_id: str, name: str = "") -> Client:
-        """Return another client on the same connection, as another sender of commands.
+        """Return another client on the same connection. It is a separate sender of commands.
 
         `robot_id` is the id of its robot, which may be the same one. `name` is the name of the
         sender; "" means the host name and the process id.
@@ -236,9 +236,9 @@ class Client:
         """Call a service, such as "stop", with the fields of its payload.
 
         `clear` releases the stop or fault that `state` shows at the time of the call, and
-        `activate` switches on a robot that is switched off at that time. If a person has seen an
-        earlier state and decided to call one of them, pass `latch=state.latch` of that state. The
-        daemon then refuses the call if the robot has been stopped or switched off again since then.
+        `activate` switches on a robot that is switched off at that time. If a person decided on
+        the call by an earlier state, pass `latch=state.latch` of that state. The daemon then
+        refuses the call if the robot has been stopped or switched off again since then.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
@@ -436,7 +436,7 @@ class Client:
         )
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """Return the error to raise instead of `error`, with which a drive or a query has failed.
+        """Return the error to raise in place of `error`, which ended a drive or a query.
 
         The result is one of the errors that `acsard.client` documents. If this client's role may be
         the reason, the text of the error also names the role.

@@ -55,13 +55,15 @@ class Memory(Struct, frozen=True):
     halted_ns: int | None = None
     """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
-    """Longest time from full speed to rest, ns, with any limits in force since the last rest."""
+    """Longest time that the robot may need from full speed to rest, ns. It covers all limits that
+    were in force since the robot was last at rest."""
     stop_ramp_ns: int = 0
-    """Longest time from full speed to rest at the stop decelerations, ns. See `ramp_ns`."""
+    """Longest time that the robot may need from full speed to rest at the stop decelerations, ns.
+    It covers all limits that were in force since the robot was last at rest."""
 
 
 class Guard:
-    """Checks each line to the board, and sends the stop line (all zeros) for a forbidden one."""
+    """Checks each line to the board, and replaces a forbidden line with the stop line (zeros)."""
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
         """Start with the memory of an earlier guard, or with an empty one if `memory` is None.
@@ -116,7 +118,7 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _note_limits(self) -> None:
-        """Update the longest ramp times. A moving robot may still brake as earlier limits ask."""
+        """Update the longest ramp times. A moving robot may still brake by slower, older limits."""
         if _wheels(self._last) == _ZERO:
             self._longest = self._ramps
         else:
@@ -163,8 +165,8 @@ class Guard:
     def _sealed(self, line: bytes) -> bool:
         """Return whether a line ends correctly for a link with checksums.
 
-        From column 31 on, such a line has the trailing comma if the board uses one, `#`, two
-        hexadecimal digits, optionally `S` or `H`, and a correct checksum.
+        From column 31 on, such a line consists of these parts: a comma (only for a board with
+        trailing commas), `#`, two hexadecimal digits, an optional `S` or `H`, a correct checksum.
         """
         body, check = line[:-7], line[-7:]
         comma, mark = self._stop[31:-2], body[31:]

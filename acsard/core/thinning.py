@@ -1,4 +1,4 @@
-"""Containers that thin out curves, bands and paths while data arrives; pure.
+"""Containers that thin out curves, bands and paths while data arrives.
 
 A curve is a value over time, a band is a state over time, and a path is a series of poses. Times
 are in s and never decrease. Each container holds a bounded number of entries. When it is full, it
@@ -171,7 +171,7 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A thinned path. Every place of the path is less than `stride` m from a place that is kept."""
+    """A thinned path. Each place of the path is less than 2 `stride` m from a kept place."""
 
     def __init__(
         self,

@@ -31,7 +31,7 @@ class AcsardError(Exception):
 
 
 class Instant(Struct, frozen=True, gc=False):
-    """One reading of both clocks. Ages and periods use `mono_ns`, published stamps `wall_ns`."""
+    """One moment, by the monotonic clock for ages and periods, and by the wall clock for stamps."""
 
     mono_ns: int
     wall_ns: int
@@ -138,7 +138,7 @@ class Command(Struct, frozen=True):
     This is true for commands through a bridge, and for a sender of which only the key is known.
     """
     ros: bool = False
-    """Whether the command came from ROS, whose tools send no zero by themselves."""
+    """Whether the command came from ROS. ROS tools do not send a zero command by themselves."""
     stamp_replaced: bool = False
     """Whether Zenoh replaced the stamp because the sender's clock is ahead of the daemon's."""
     steady: bool = False
@@ -310,7 +310,7 @@ class WheelsStatus(Struct, frozen=True):
     text: str = ""
     """Description of the faults and the slip, "" if there are none."""
     left_out: tuple[str, ...] = ()
-    """The names of the wheels that the pose ignores."""
+    """The names of the wheels that the odometry ignores."""
     slipping: tuple[str, ...] = ()
     """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
@@ -354,15 +354,15 @@ GyroDoes = Literal[
 ]  # fmt: skip
 """The state of the gyro.
 
-The odometry takes the heading from the gyro only in the states `used` and `disagrees`. The latter
-means that the wheels slip.
+The odometry takes the heading from the gyro only in the states `used` and `disagrees`.
+`disagrees` means that the wheels slip.
 """
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
 """Whether the odometry uses the effective track that it learned from a gyro, or why it does not.
 
-The effective track is the distance between left and right wheels that makes computed turns right.
-With any value except `used`, the odometry uses the configured one.
+The effective track is the distance between left and right wheels with which the odometry computes
+the true turn. With any value except `used`, the odometry uses the configured distance.
 """
 
 
@@ -387,8 +387,9 @@ the board no longer reports it, which counts as pressed."""
 
 
 BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
-"""The level of the battery by the thresholds in `[battery]`; "ok" if none is set. `unknown` means
-that the board no longer reports the battery, or not the quantity (V or %) of the thresholds."""
+"""The level of the battery by the thresholds in `[battery]`; "ok" if no threshold is set. `unknown`
+means that the board does not report the value that is compared with the thresholds (V or %), or has
+reported it only for a few seconds."""
 
 
 class BatteryStatus(Struct, frozen=True, gc=False):
@@ -432,7 +433,7 @@ class Latches(Struct, frozen=True):
     fault: Latch | None = None
     inactive: Latch | None = None
     lowered: dict[str, float] = {}
-    """Each `limits.*` setting that `set` made lower than in the configuration file, by its key."""
+    """The `limits.*` settings that `set` made lower than in the configuration file, by key."""
 
     @property
     def next(self) -> Latch | None:
@@ -497,7 +498,7 @@ class Outputs(Struct, frozen=True):
 
     now: Instant
     due: bool
-    """Whether the step had to compute a line for the board, for its control period or at once."""
+    """Whether a line for the board was due in this step, for the control period or at once."""
     line: bytes | None
     """The line for the board; None if no line was due."""
     speeds: WheelSpeeds
@@ -521,7 +522,7 @@ class Outputs(Struct, frozen=True):
     """Whether the command or the mode has changed since the last computed line, or the emergency
     stop or a bumper was pressed."""
     latches: Latches = Latches()
-    """The latches in force after the step; the same object until one of them changes."""
+    """The latches in force after the step. A new object means that a latch or a limit changed."""
 
 
 class Spread(Struct, frozen=True):
@@ -534,7 +535,7 @@ class Spread(Struct, frozen=True):
 
 
 class Measured(Struct, frozen=True):
-    """One of the daemon's own latencies, us."""
+    """A latency of the daemon, us."""
 
     since_start: Spread = Spread()
     last_minute: Spread = Spread()
@@ -571,7 +572,7 @@ class Snapshot(Struct, frozen=True):
     missed_last_minute: int = 0
     """Number of periods without a step in the last minute."""
     figures: dict[str, Measured] = {}
-    """The daemon's own latencies, by the names in `daemon/latencies.py`."""
+    """The latencies of the daemon, by the names in `daemon/latencies.py`."""
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
     estop: EstopState = ""
@@ -591,7 +592,7 @@ class Snapshot(Struct, frozen=True):
     encoders: tuple[int, ...] = ()
     """Encoder counts per wheel turn, in `WHEELS` order.
 
-    0 means that the number is unknown, or that the reported speeds do not fit whole counts.
+    0 means that the number is unknown, or that the board's speeds are not whole counts per time.
     """
     sender: str = ""
     """The sender whose command the robot follows, "" without one."""

@@ -170,7 +170,7 @@ class ControlLoop:
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
     def totals(self, now_ns: int) -> dict[str, float]:
-        """Return the values of the last log line by name: run time in s, distance in m, counters.
+        """Return the values of the log line `ended`: run time in s, distance in m, counters.
 
         `now_ns` is the monotonic time.
         """
@@ -180,9 +180,9 @@ class ControlLoop:
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time at which a command that came too soon after a line gets its step, ns.
+        """Monotonic time at which the waiting command gets its step, ns; None if no command waits.
 
-        None if no command waits.
+        A command that comes too soon after a line must wait.
         """
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
@@ -424,7 +424,7 @@ class ControlLoop:
         return None
 
     def _keep(self, request: Request, now: Instant) -> None:
-        """Queue a `set` with `keep` for a check that the configuration file can be changed.
+        """Let the settings file check whether it can store the settings of a `set` with `keep`.
 
         Refuse `request` if there is no configuration file.
         """

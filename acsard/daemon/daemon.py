@@ -128,8 +128,8 @@ async def run(
         gateway: Arguments of the `acsard gateway` process, which this daemon starts if
             `bus.outside` names endpoints. None if the gateway is a service of its own.
         page: Arguments of the `acsard web` process, or None for no page.
-        settings_file: The configuration file, which the daemon compares with the settings in force
-            and changes. None to do neither.
+        settings_file: The configuration file. The daemon compares it with the settings in force,
+            and stores settings in it. None to do neither.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())

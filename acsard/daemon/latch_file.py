@@ -96,7 +96,7 @@ def place(config: Config, environ: Mapping[str, str]) -> Path:
 
 
 class LatchFile:
-    """The latch file of one robot. Call `start` once, then `keep` after every step."""
+    """The latch file of one robot. Call `start` once, then `keep` after every change."""
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
         """Find the path of the file from the configuration and the environment of the process."""
@@ -127,7 +127,7 @@ class LatchFile:
         """Latches that are in the file but not in the robot, because the start could not read the
         file in time."""
         self._box = Mailbox[Latches](1)
-        """The newest latches that `keep` was given, until the thread takes them."""
+        """The newest latches that `keep` was given, until the writing thread takes them."""
         self._news = Mailbox[Event](EVENTS)
         self._held: Latches | None = None
         """The latches that the file contains now. None before the first write."""
@@ -285,7 +285,7 @@ class LatchFile:
 
     @property
     def _hangs(self) -> bool:
-        """True if a sync, or a write while the newest latches wait, takes longer than `START_S`."""
+        """True if a sync, or a write that delays the newest latches, exceeds `START_S`."""
         if self._failed:
             return False
         busy_ns = None if self._held is self._handed else self._busy_ns

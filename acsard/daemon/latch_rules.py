@@ -2,7 +2,7 @@
 
 If the latch file cannot be read or cannot be written, the robot starts stopped until `clear`. It
 does not matter how the previous process ended, because each latch is written when it is set and not
-at the end. This module is pure; `latch_file.py` reads and writes the file.
+when the process ends. This module is pure; `latch_file.py` reads and writes the file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_BYTES = 65_536
 """Largest size of a file that is read, bytes. Three latches and all limits take about 1 kB."""
 
 MAX_TEXT = 500
-"""Largest number of characters of a name or a reason, which any client may choose."""
+"""Largest number of characters of a name or a reason in the file. A longer text is cut off."""
 
 ANSWER_NS = NS_PER_S // 5
 """Longest time for which the answer to a stop waits for the latch file, ns.
@@ -163,8 +163,8 @@ class LatchKeeper(Protocol):
 class Handover:
     """Hands the latches of the control loop to their keeper, and reports when they are stored.
 
-    The robot stops at once, but the answer to a stop waits until the stop is stored, so that it
-    survives a kill of the process. After `ANSWER_NS` the answer says that it is not stored yet.
+    The robot stops at once, but the answer to a stop waits until the stop would survive a kill of
+    the process. After `ANSWER_NS` the answer says that the stop is not stored yet.
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:

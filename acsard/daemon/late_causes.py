@@ -48,10 +48,10 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
     """A late control period, and the kernel's counters from before and after it."""
 
     late_ns: int
-    """Time from the moment at which the first missed period was due to the late step, ns."""
+    """How late the step came, ns, counted from the due time of the first missed period."""
     loop: Scheduled
-    """Time that the loop's thread ran, and time that it waited for a processor, between the period
-    before the lateness and the late step."""
+    """Time that the loop's thread ran, and time that it waited for a processor. Both count from the
+    last period before the lateness to the late step."""
     before: Reading
     after: Reading
     busiest: Program | None = None

@@ -50,8 +50,8 @@ name."""
 
 CONDITIONS_NS = 10 * NS_PER_S
 """Age at which the conditions of the processor, such as its voltage, are read again, ns. They are
-not read more often, because on some computers the firmware must answer. After a lateness they are
-read in any case."""
+not read more often, because on some computers each reading is a request to the firmware. After a
+lateness they are read in any case."""
 
 LOOK_S = 0.2
 """Time between the two readings of all processes in one search for the busiest process, s."""
@@ -82,7 +82,7 @@ class Late(Struct, frozen=True):
 
     @property
     def loop(self) -> Scheduled:
-        """Time that the loop's thread ran and waited between the period before and the late one."""
+        """Time that the loop's thread ran, and time that it waited, from `before` to `after`."""
         before, after = scheduled(self.before), scheduled(self.after)
         return Scheduled(after.ran_ns - before.ran_ns, after.waited_ns - before.waited_ns)
 
@@ -194,9 +194,9 @@ class LateWatch:
         self._news.put(event_of(late, clause, news=news))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
-        """Return the busiest process from the last search, or None if that search found none.
+        """Return the busiest process, or None if no process is busy.
 
-        Search again if the last search is older than `LOOK_AGAIN_NS`.
+        Search again only after `LOOK_AGAIN_NS`. Until then return the result of the last search.
         """
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:

@@ -1,8 +1,8 @@
 """Measures the daemon's own latencies, in fixed memory and without reading a clock.
 
-Each figure is a duration in us. The messages `state` and `diagnostics` publish its median, 99th
-percentile and maximum, since the start and over the last minute. The control loop passes the
-measured times to `Stopwatch`.
+A latency is a duration in us. The messages `state` and `diagnostics` publish the median, the 99th
+percentile and the maximum of each latency, since the daemon's start and over the last minute. The
+control loop passes the times to `Stopwatch`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ PER_DECADE = 20
 """Buckets per factor of ten. A percentile is accurate to 12 %."""
 
 DECADES = 7
-"""Number of factors of ten that the buckets cover: values from 1 to 10^7. Values outside this range
-fall into the first or the last bucket."""
+"""Factors of ten that the buckets cover: durations from 1 us to 10^7 us. The first bucket also has
+all shorter durations, and the last bucket all longer ones."""
 
 LAST = PER_DECADE * DECADES
 """Index of the last bucket."""
@@ -76,27 +76,27 @@ Name = Literal[
 - command_age: from a command's arrival to the write of each line that carries it.
 - command_to_wire: from a command's arrival to the write of the first line that carries it. A
   command that had to wait until its source was chosen is not counted.
-- feedback_to_bus: from the read of a feedback line's end to the moment at which the line's messages
-  are in the queue of the bus. If the loop stood still, the line waited in the kernel before the
-  read. That time is not included.
-- mcu_round_trip: from the write of a line to the read of the end of its reply. Only the replies of
-  a checked link are measured, because only these name the line that they reply to.
+- feedback_to_bus: from the moment at which the daemon has read a complete feedback line to the
+  moment at which its messages are queued for the bus. The time for which the line waited in the
+  kernel before the read is not included.
+- mcu_round_trip: from the write of a line to the read of the end of its reply. It is measured only
+  if the lines are checked (`mcu.link_check`), because only then a reply names the line it answers.
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)
 
 SLOT_NS = 10 * NS_PER_S
-"""Length of a slot, ns. The last minute has `SLOTS` slots, and a new one replaces the oldest."""
+"""Length of a time slot, ns. The last `SLOTS` slots together are the last minute."""
 
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""Longest age of the cached values, ns. Adding up the slots of a minute takes longer than a control
-step."""
+"""Age up to which `Stopwatch.measured` returns cached values, ns. It computes them seldom, because
+adding up the slots of a minute takes longer than a control step."""
 
 
 class Figure:
-    """One latency since the start and over the last minute."""
+    """The durations of one latency, since the daemon's start and over the last minute."""
 
     def __init__(self) -> None:
         self._past = Histogram()
@@ -173,7 +173,7 @@ class Stopwatch:
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
         """Record that the step of a period began `late_ns` ns late, at monotonic `now_ns`.
 
-        `missed` is the number of periods without a step before it.
+        `missed` is the number of periods just before this one that had no step.
         """
         self.figures["period_lateness"].add(now_ns, late_ns)
         if missed:

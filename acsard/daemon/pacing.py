@@ -22,7 +22,7 @@ class Period(Struct, frozen=True):
 
 
 NO_PERIOD = Period(0, 0)
-"""The value for a step between two periods."""
+"""The `Period` of a step that runs between the ends of two periods."""
 
 
 BREATH_NS = 1_000_000
@@ -30,13 +30,13 @@ BREATH_NS = 1_000_000
 ns."""
 
 IDLE_WAKES = 3
-"""Largest number of steps per period that input from the bus may cause without a new command or
-mode. If the number is exceeded, input waits for the next period. This bounds the cost of a flood
-of messages from any client."""
+"""Number of steps in a period that may have input from the bus but no new command or mode. After
+one more such step, input waits for the next period. This bounds the cost of a flood of messages
+from any client."""
 
 
 class Pace:
-    """Decides when a line may be written, and records for this decision what the period has sent.
+    """Decides when a line may be written, from the results of the earlier steps of the period.
 
     The serial port knows when it wrote the last line, so the methods get that time as `sent_ns`.
     """

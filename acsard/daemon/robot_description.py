@@ -24,8 +24,9 @@ MAX_JSON = MESSAGE_BYTES - 1024
 and for Zenoh's headers."""
 
 XACRO = "/xacro}"
-"""End of the namespace of a xacro element in its tag, as ElementTree writes it. Files use different
-namespaces, such as http://www.ros.org/wiki/xacro and http://ros.org/wiki/xacro."""
+"""Text by which the tag of a xacro element is recognized. ElementTree writes the tag as
+"{NAMESPACE}NAME", and the namespace is http://www.ros.org/wiki/xacro, http://ros.org/wiki/xacro or
+similar."""
 
 DOCUMENT_TYPE = "<!DOCTYPE"
 """Beginning of a document type. The file must not have one, because its entities could expand to

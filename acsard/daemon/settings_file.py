@@ -73,8 +73,8 @@ class _Pending(Struct):
 
     request: Request
     due_ns: int
-    """Monotonic time after which the request is answered as overdue, ns. A request that the robot
-    is deciding about does not become overdue."""
+    """Monotonic time after which the request is answered as overdue, ns. This limit does not
+    apply while the robot decides about the request."""
     edit: Edit | None = None
     """The change of the file, once the thread has checked it; None before."""
     answer: Answer | None = None
@@ -111,8 +111,8 @@ class SettingsFile:
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
-        """The limits at the start of the daemon, and the same limits with the values that the
-        daemon has written to the file since."""
+        """`_started` has the limits at the start of the daemon. In `_limits`, the values that the
+        daemon has written to the file since then replace them."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of `latches`: its last arguments, the `_limits` at that time, and its result."""
 
@@ -148,19 +148,19 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread, unless a waiting item has woken it already.
+        """Wake the thread, unless the mailbox has an item, which has woken it already.
 
-        Another item could displace a request from a full mailbox.
+        In a full mailbox, the item "look" would displace a request.
         """
         if not self._box.waiting:
             self._box.put("look")
 
     def obeyed(self, answer: Answer) -> bool:
-        """Process the robot's answer to any request. Return whether `results` will return it.
+        """Process the robot's answer to any request. Return whether the answer must wait.
 
-        It will if the request is a `set` with `keep` whose settings the robot has used. The thread
-        writes them to the file first. If this method returns False, the caller must send the
-        answer.
+        An answer waits if its request is a `set` with `keep` whose settings the robot has used. The
+        thread then writes the settings to the file, and `results` returns the answer. If this
+        method returns False, the caller must send the answer.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -219,9 +219,9 @@ class SettingsFile:
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
         """Return the robot's latches for the next start, which reads its limits from the file.
 
-        The robot's own `lowered` compares the limits in force with those at the start of the
-        daemon. If the daemon has written limits to the file since, this method compares with the
-        file instead.
+        `Latches.lowered` has the limits that are lower now than at the start of the daemon. If the
+        daemon has written limits to the file since then, the result has the limits that are lower
+        now than in the file.
 
         Args:
             latches: the latches of the robot.

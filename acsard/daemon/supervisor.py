@@ -21,7 +21,7 @@ AGAIN_S = 0.1
 """Pause before a process that has ended is started again, s."""
 
 LATER_S = 2.0
-"""Pause before a process that could not be started is tried again, s."""
+"""Pause before a restart, s, if the process could not be started or its exit code was above 1."""
 
 
 class Kind(Struct, frozen=True):
@@ -32,7 +32,7 @@ class Kind(Struct, frozen=True):
     final: frozenset[int] = frozenset()
     """Exit codes after which the process is not started again."""
     again_s: float = AGAIN_S
-    """Pause before the process is started again, s."""
+    """Pause before a restart, s. After an exit code above 1 the pause is `LATER_S` instead."""
     final_at_first: frozenset[int] = frozenset()
     """Exit codes that are final for the first process only. A later process may have read files
     while a person was changing them."""
@@ -47,8 +47,9 @@ ROUTER = Kind(
     "router_ended",
     final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
 )
-"""The router of a fleet. Unusable files end it for good only at its first start. At a later restart
-they may only be incomplete for a moment, and a fleet must not lose its router for that reason."""
+"""The router of a fleet. If its files are unusable at its first start, it is not started again. At
+a later restart it is tried again, because a person may be changing the files at that moment, and
+the fleet needs its router."""
 
 PAGE = Kind(
     "the robot's page",
@@ -65,8 +66,8 @@ async def keep_running(
 ) -> int:
     """Run `acsard` with the arguments `words`, and start it again when it ends, until cancelled.
 
-    Return the exit code of the process if `kind` is not started again after that code. `log` gets
-    an event for each restart.
+    If the process ends with an exit code that is final for its `kind`, return this code and do not
+    start the process again. `log` gets an event for each restart.
     """
     final = kind.final | kind.final_at_first
     while True:

@@ -114,7 +114,7 @@ class Next(Struct, frozen=True):
     retry_ns: int | None
     """Monotonic time of the next step for a waiting command, ns; None if no command waits."""
     period_ended: bool = True
-    """Whether a period has ended in the step. If so, the next stop gets a step of its own."""
+    """Whether the step ran at the end of a period. If so, the next stop gets a step of its own."""
 
 
 class Wakeup:
@@ -151,8 +151,8 @@ class Wakeup:
     def stop(self) -> None:
         """Report a stop, from any thread.
 
-        After this stop, further stops do not wake the loop until a step has ended a period or has
-        asked for commands (`Next.listens`).
+        The first stop wakes the loop. Further stops do not, until a step at the end of a period has
+        run or a step has asked for commands (`Next.listens`).
         """
         if not self._stop_told:
             self._stop_told = True

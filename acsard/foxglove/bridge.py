@@ -105,12 +105,15 @@ class Bridge:
         self._wake.set()
 
     def close(self) -> None:
-        """Send a zero for each viewer that drives, then stop the server."""
+        """Send a zero command for each viewer that drives, then stop the server."""
         self._drives.end()
         self._server.stop()
 
     def _viewer(self, client: int) -> Client:
-        """Return a bus client for the viewer with the id `client`, as a sender of its own."""
+        """Return a bus client that sends the commands of the viewer with the id `client`.
+
+        To the daemon, each of these bus clients is a different sender.
+        """
         name = self._robot.sender.rpartition("/")[0]
         return self._robot.like(self._id, f"{name}/{client}")
 
@@ -177,10 +180,10 @@ class Bridge:
                 self._watch.look(now)
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Tell the viewers, once for each viewer that drives, why the robot does not follow it.
+        """Tell all viewers why the robot does not follow a viewer that requests a speed.
 
-        `driving` has the bus client of each viewer that requests a speed, by the viewer's id. The
-        message is removed from the viewers when its reason ends.
+        `driving` maps the id of each such viewer to its bus client. The message about a viewer is
+        removed when its reason ends.
         """
         now_ns = clock.mono_ns()
         for client in driving.keys() - self._objections.keys():

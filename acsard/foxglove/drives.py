@@ -1,9 +1,11 @@
 """Drives the robot from the panels of Foxglove viewers. To the daemon, each viewer is one sender.
 
-A panel repeats its command while a button is held, and sends nothing after the release. Few panels
-send a stamp, from which the daemon could see that a command is late. So this module sends a zero
-before the first command after a silence. A burst of commands after a silence has been delayed on
-its way, so the module drops it.
+A panel repeats its command while a button is held, and sends nothing after the release. But the
+daemon lets a sender drive only after a zero command. So this module sends one before the first
+command after each silence.
+
+A burst of commands after a silence has been delayed on its way, so this module drops it. The daemon
+could detect the delay only from stamps, which few panels send.
 """
 
 from __future__ import annotations
@@ -25,12 +27,12 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""A panel publishes too seldom if `SLOW_TIMES` messages in a row each follow a silence of 0.3 to
-2.5 s: longer than `commander.SILENCE_NS`, and at most `SLOW_NS`, ns."""
+"""A panel publishes too seldom if `SLOW_TIMES` messages in a row each come after a silence. Such a
+silence is longer than `commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
-"""Decoder of velocity commands (twists). They depend on neither the joints nor the wheels of the
-robot, so the default configuration is sufficient."""
+"""Decoder of velocity commands (twists). The configuration of joints and wheels has no effect on a
+twist, so the default one is sufficient."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
@@ -75,10 +77,10 @@ class Viewer:
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
-        """Record the silence before a message, ns; return whether the panel publishes too seldom.
+        """Return whether the panel publishes so seldom that the robot stops between its messages.
 
-        The robot stops between the messages of such a panel. `silence_ns` is None for the first
-        message, and after a silence of at most `commander.SILENCE_NS`.
+        Call this for each message. `silence_ns` is the time since the previous message, ns. It is
+        None if that time is at most `commander.SILENCE_NS`, and for the first message.
         """
         slow = silence_ns is not None and silence_ns <= SLOW_NS
         self._slow = self._slow + 1 if slow else 0
@@ -160,7 +162,7 @@ class Drives:
     def withdrawn(self, client: int, channel: int) -> None:
         """Remove a channel that the viewer `client` has closed, explicitly or by disconnecting.
 
-        If the robot may still follow this viewer, send a zero.
+        If the robot may still follow this viewer, send a zero command.
         """
         with self._lock:
             viewer = self._viewers.get(client)
@@ -182,7 +184,7 @@ class Drives:
             return {one: it.robot for one, it in viewers if it.commander.drives(now_ns)}
 
     def end(self) -> None:
-        """Send a zero for each viewer that drives, then stop the sending thread."""
+        """Send a zero command for each viewer that drives, then stop the sending thread."""
         with self._lock:
             for viewer in self._viewers.values():
                 self.outbox.release(viewer.commander, self.timeout_s)

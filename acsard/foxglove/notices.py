@@ -105,10 +105,11 @@ class Objections:
         """The reported reason why the robot does not follow, in words; "" if there is none."""
 
     def look(self, objection: str, now_ns: int) -> bool:
-        """Process the present reason, "" if the robot follows; return whether `told` has changed.
+        """Update `told`, and return whether it has changed.
 
-        A reason is stored in `told` once the robot has not followed for `GRACE_S`. `now_ns` is the
-        monotonic time, ns.
+        `objection` is the present reason why the robot does not follow, "" if it follows. A reason
+        is copied to `told` once the robot has not followed for `GRACE_S`. `now_ns` is the monotonic
+        time, ns.
         """
         if not objection:
             self._since_ns = None

@@ -116,8 +116,8 @@ class Reader:
 class Commanders:
     """Receives the commands that programs send to the robot, for one topic per command source.
 
-    A command is decoded as the daemon decodes it. A command that the daemon refuses is not shown,
-    because the daemon counts it. Only one thread may use this class; Zenoh's threads call `wake`.
+    A command is decoded as the daemon decodes it. A command that the daemon refuses appears only in
+    the daemon's counters. Only one thread may use this class; Zenoh's threads call `wake`.
     """
 
     def __init__(self, robot: Client, wake: Callable[[], object]) -> None:

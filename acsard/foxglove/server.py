@@ -33,8 +33,8 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 
 POLL_NS = 5 * NS_PER_S
-"""Interval, ns, at which the settings are read again while a viewer subscribes to them, because
-other clients may change them."""
+"""Time between two reads of the settings while a viewer subscribes to a setting, ns. The settings
+are read again because other clients may change them."""
 
 
 class Shown:
@@ -63,7 +63,10 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return the topics with a viewer, and those that have gained one since the last call."""
+        """Return the topics that have viewers, and the topics that have a new viewer.
+
+        A viewer is new if it subscribed after the last call.
+        """
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
@@ -116,7 +119,7 @@ class Settings:
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
         """Change all of these settings or none of them, and return their values afterwards.
 
-        All viewers are told whether the daemon changed them.
+        All viewers get a message that says whether the daemon has changed the settings.
         """
         try:
             if any(value is None for value in wishes.values()):

@@ -102,7 +102,10 @@ def limit(pid: int, limits: Limits) -> None:
 
 
 def how_it_ended(code: int) -> str:
-    """Return how a process ended, in words. `code` is its exit code, or minus its signal."""
+    """Return how a process ended, in words.
+
+    `code` is its exit code, or the negative number of the signal that ended it.
+    """
     return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
 
 
@@ -218,7 +221,7 @@ class Child:
 
 
 class Parent:
-    """The child's side: the parent process at the other end of standard input, `fd`."""
+    """The child's connection to its parent process, over the child's standard input `fd`."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -247,7 +250,7 @@ class Parent:
 def end_with_parent(number: signal.Signals) -> None:
     """Let the kernel send the signal `number` to this process when its parent ends.
 
-    A child calls this function, so that it also ends if its parent crashes. To the kernel, the
-    parent is the thread that started this process.
+    A child calls this function, so that it also ends if its parent crashes. The kernel regards the
+    thread that started this process as the parent, so the end of that thread is enough.
     """
     ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG in linux/prctl.h

@@ -210,7 +210,10 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
 def require_changeable(
     file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
 ) -> None:
-    """Raise the `MendableError` that `change` would raise, before work whose result it writes."""
+    """Raise the `MendableError` that `change` would raise.
+
+    Call this function before long work whose result `change` will write.
+    """
     try:
         place, _, _ = _changed(file, keys, new)
         if not os.access(place.parent, os.W_OK):

@@ -52,7 +52,11 @@ class Conditions(Struct, frozen=True, omit_defaults=True):
 
 
 class Reading(Struct, frozen=True, omit_defaults=True):
-    """The kernel's counters at one moment. The durations are totals since the computer started."""
+    """The kernel's counters at one moment.
+
+    Each counter is a total since the start of the computer, of this process or of its cgroup. Only
+    the difference between two readings shows the activity in between.
+    """
 
     asleep_ns: int = 0
     """Time in which this computer was suspended."""
@@ -86,12 +90,15 @@ class Program(Struct, frozen=True):
     name: str
     ran_ns: int
     priority: int = 20
-    """Kernel priority of its first thread: 20 plus the nice value, or negative for a real-time
-    thread. The lowest number is the highest priority."""
+    """Kernel priority of the process's first thread: 20 plus the nice value, or a negative number
+    for a real-time thread. The lowest number is the highest priority."""
 
     @property
     def real_time(self) -> bool:
-        """Whether its first thread is a real-time thread, which runs before all ordinary ones."""
+        """Whether the first thread of the process is a real-time thread.
+
+        Such a thread runs before all ordinary threads.
+        """
         return self.priority < 0
 
 
@@ -109,7 +116,7 @@ def steal(text: str, tick_ns: int) -> tuple[int, ...]:
 def iowait(text: str, tick_ns: int) -> int:
     """Return how long a processor was idle while a program waited for I/O, ns.
 
-    `text` is that of `/proc/stat`. The result is that of the processor with the longest such time.
+    Of all processors, the one with the longest time counts. `text` is the text of `/proc/stat`, and
     `tick_ns` is the length of the kernel's clock tick.
     """
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)

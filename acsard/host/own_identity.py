@@ -16,7 +16,10 @@ from acsard.host.processes import called
 
 
 def own_name() -> str:
-    """Return the user, the machine and the program, if it has a name, as "alice@laptop patrol"."""
+    """Return the names of the user, the machine and the program, as "alice@laptop patrol".
+
+    The program is left out if it has no name.
+    """
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
     except KeyError:

@@ -119,7 +119,7 @@ def _processes() -> Iterator[Path]:
 
 
 def _open_devices(part: str) -> Iterator[_Open]:
-    """Yield the devices that any process has open below a /dev, with `part` in their path."""
+    """Yield each file that any process has open, if its path contains "/dev/" and `part`."""
     for process in _processes():
         try:
             numbers = os.listdir(process / "fd")

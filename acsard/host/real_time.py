@@ -30,7 +30,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 def ask() -> str:
     """Ask for real-time scheduling, locked memory and a processor that stays awake.
 
-    Returns a sentence about the refused requests, with the fix, or "".
+    Returns a sentence that names the refused requests and the fix, or "" if none was refused.
     """
     asked = {
         "real-time scheduling": _schedule(),

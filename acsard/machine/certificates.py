@@ -44,7 +44,7 @@ HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
     """Create an authority, the robot's certificate and one for each role, in `directory`.
 
-    Returns the names and addresses in the robot's certificate. They are the machine's own ones and
+    Returns the names and addresses in the robot's certificate: those of this machine, and
     `addresses`. `days` is the validity of the certificates. An existing authority is replaced only
     if `force` is set.
     """
@@ -105,8 +105,9 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     """Replace the robot's own certificate, and return the names and addresses in the new one.
 
-    They are `addresses`, and those of the machine and of the old certificate for which the
-    authority may sign. `days` is the validity of the new certificate in days.
+    The new certificate contains `addresses`. It also contains the names and addresses of this
+    machine and of the old certificate, if the authority may sign for them. `days` is the validity
+    of the new certificate in days.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
@@ -121,8 +122,8 @@ def _names_of(name: str) -> list[str]:
     """Return the host names that a certificate with this common name should contain.
 
     They are the name itself and NAME.local, if they are possible host names. If a certificate
-    contains no host name, OpenSSL takes a common name such as `anna.meyer` or `10.0.0.5` for one.
-    It then refuses the certificate if the authority may not sign for this name.
+    contains no host name, OpenSSL checks its common name, such as `anna.meyer` or `10.0.0.5`, as a
+    host name. It then refuses the certificate if the authority may not sign for this name.
     """
     named = [name] if ADDRESS.match(name) else []
     if not HOST_LIKE.match(name) or name.endswith(".local"):

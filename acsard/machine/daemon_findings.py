@@ -112,8 +112,9 @@ class Running(Struct, frozen=True):
 def asked(config: Config, address: Address) -> Running:
     """Query the daemon at this address for its configuration, its states and its events.
 
-    If this client may not query the daemon's configuration, the result contains `config`, that of
-    the local file, instead. Raises an `AcsardError` if the daemon does not answer.
+    `config` is the configuration in the local file. If this client may not query the daemon's
+    configuration, the result contains `config`, corrected by the daemon's `info`, instead. Raises
+    an `AcsardError` if the daemon does not answer.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -161,7 +162,7 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(its: Mapping[str, Difference]) -> str:
-    """Return the daemon's values as lines of the configuration file."""
+    """Return the daemon's values of the keys in `its`, as lines for the configuration file."""
     parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
@@ -298,10 +299,10 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return how often the link was lost without the fault of this computer, and a description.
+    """Return how often the link was lost for another reason than a stall of the daemon's computer.
 
-    The result is a list with this pair, or [] if there were no such losses. `counters` are the
-    daemon's counters.
+    The result is a list with one pair, this number and a sentence that describes it. The list is
+    empty if the number is 0. `counters` are the daemon's counters.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
@@ -332,7 +333,7 @@ GYRO_MENDS: dict[GyroDoes, str] = {
     "not believed": "check that its z axis points up and that it sends rad/s; then `acsard "
     "calibrate` measures the track width",
 }
-"""Maps the gyro's status in `state` to the remedy; "" if the status is good."""
+"""Maps the gyro's status in `state` to the remedy; "" if the status needs no remedy."""
 
 CAUSES_SHOWN = 3
 """Largest number of late control periods whose causes are shown. Older ones are left out."""
@@ -453,8 +454,8 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
 def late(running: Running) -> Iterator[Finding]:
     """Yield a warning if the daemon misses control periods, and the last known causes.
 
-    The daemon's counters cover its whole run, and its diagnostics the recent time. The causes come
-    from its events.
+    The daemon's counters show the periods that were missed since its start. If those are few, its
+    diagnostics show whether periods were missed recently. Its events name the causes.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -478,9 +479,10 @@ def late(running: Running) -> Iterator[Finding]:
 def clocks(running: Running) -> Iterator[Finding]:
     """Yield a warning if the daemon's clock differs from this machine's.
 
-    The daemon read its clock at an unknown moment between the request and the answer, so half of
-    that time is tolerated. Also yield a warning if commands came with stamps from the future, which
-    Zenoh replaces.
+    The daemon read its clock at an unknown moment between the request and the answer. So a
+    difference of up to 0.4 s plus half of the time between the two is tolerated.
+
+    Also yield a warning if commands came with stamps from the future. Zenoh replaces such stamps.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S

@@ -414,7 +414,10 @@ def state(unit: str) -> str:
 
 
 def source() -> Path:
-    """Return the directory `deploy/`, which is in an installed package or beside it in a clone."""
+    """Return the directory `deploy/`.
+
+    It is inside the package if acsard is installed, and beside the package in a clone.
+    """
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
     if inside.is_dir():

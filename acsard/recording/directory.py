@@ -1,6 +1,6 @@
 """The directory of recordings, bounded in bytes, in days and by the free space of the disk.
 
-    000012-20261121T070027Z.mcap.part   being written, or cut off by a crash
+    000012-20261121T070027Z.mcap.part   being written, or cut off
     000012-20261121T070027Z.mcap        finished
     000012-20261121T070027Z.near.mcap   finished, less than a minute from an incident
     000012-20261121T070027Z.kept.mcap   finished, and an incident happened in it
@@ -46,10 +46,10 @@ DIRECTORY_MODE = 0o750
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
 """Modes of the directory and its files when the daemon records as a systemd service.
 
-Every user may read them. That is safe because only root can enter the parent directory. The systemd
-unit of the robot's web page mounts this directory read-only. Group permissions cannot give that
-unit access, because a dynamic group has no name, and systemd 257 makes the user nobody the owner of
-state directories.
+The modes let every user read. This is safe because only root can enter the parent directory. The
+robot's web page, which must read the recordings, gets the directory from its systemd unit as a
+read-only mount. Group permissions cannot give the page access, because a dynamic group has no name,
+and systemd 257 makes the user nobody the owner of state directories.
 """
 
 PRIVATE = Path("/var/lib/private")
@@ -76,7 +76,7 @@ S_PER_DAY = 86400
 FRESH_S = 10.0
 """Time without a write, s, after which a `.part` file no longer counts as being recorded.
 
-A daemon writes once a second, and its log reports a disk that hangs.
+A daemon writes once a second. If the disk hangs for longer, the daemon's log reports it.
 """
 
 STAMP = "%Y%m%dT%H%M%SZ"
@@ -143,7 +143,7 @@ class Run(Struct):
     """State that lasts until the daemon ends. After a disk error the next `Ring` takes it over."""
 
     numbers: set[int] = field(default_factory=set)
-    """Numbers, from their names, of the files that ended in this run of the daemon."""
+    """The numbers in the names of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
     """Maps the name of each file that a disk error cut off in this run to its retention class.
 
@@ -249,7 +249,10 @@ class Ring:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and its files, also those of an earlier version."""
+        """Let every user read the directory and its files.
+
+        An earlier version may have made them with other modes.
+        """
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.

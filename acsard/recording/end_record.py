@@ -71,7 +71,7 @@ class EndRecord(Struct, frozen=True):
     said: str
     """Summary of the events in a few words, from `timeline.summary`."""
     cut: str = ""
-    """Why the recording was cut off: a key of `CUTS`, or "" if it ends with an ordinary end."""
+    """Why the recording was cut off: a key of `CUTS`, or "" if the daemon ended normally."""
     why: str = ""
     """For the cause `bug`, the step in which the daemon failed and the exception; otherwise ""."""
     earliest_ns: Ns | None = None

@@ -396,7 +396,7 @@ class Recording:
         self.ended = False
         """True if the file is finished. This is known only after `messages` was read to its end.
 
-        It is also true if the data just before the end is damaged. `damaged` counts that damage.
+        A finished file may be damaged just before its end. `damaged` then counts that place too.
         """
         self.damaged = 0
         """Number of damaged places, mostly MCAP chunks, that have readable data after them."""

@@ -76,7 +76,7 @@ class ReplayResult(NamedTuple):
     gaps: list[Gap]
     """The parts of the file that are not compared."""
     failed_step: str = ""
-    """Sentence that says whether the step in which the daemon failed fails in this version too.
+    """Sentence that says whether this version fails in the same step as the recorded daemon.
 
     It is "" if the daemon did not fail.
     """
@@ -133,10 +133,10 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Limit on the total size of the states that are decoded after gaps, in bytes per byte of the file.
+"""Bytes of states that may be decoded after gaps, for each byte of the file, besides `MAX_BYTES`.
 
-In a file a state is compressed to a third of its size. Without this limit the replay of a forged
-file of 5 kB took 4 s.
+A file stores a state compressed to a third of its size, so a genuine file stays below this limit.
+Without the limit, the replay of a forged file of 5 kB took 4 s.
 """
 
 
@@ -178,10 +178,10 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Decode the robot in the checkpoint `saved` if it was made just before the step `number`.
+        """Decode the robot in the checkpoint `saved`, which was made just before the step `number`.
 
-        Otherwise return None. Also return None if this version cannot read the robot, or if the
-        states that were decoded after gaps exceed their limit in size.
+        Return None if `saved` was made before another step, if this version cannot read the robot,
+        or if the states that were decoded after gaps exceed their limit in size.
 
         Args:
             saved: the last checkpoint that was read; None if there is none.
@@ -472,7 +472,10 @@ class EventCopies:
         """Number of damaged places before the last batch."""
 
     def batch(self, steps: list[Step]) -> None:
-        """Add a batch of steps. Then call `copy` for the copies of its events."""
+        """Compare the copies of the previous batch, and store the events of a new batch of steps.
+
+        The messages that `copy` adds next are copies of the new batch's events.
+        """
         self._compare(last=False, follows=self._number in (None, steps[0].number))
         self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [
@@ -490,7 +493,11 @@ class EventCopies:
             self._differs(str(error))
 
     def end(self) -> None:
-        """Compare the copies of the last batch. In a whole file, also compare its summary."""
+        """Compare the copies of the last batch.
+
+        If the file is finished and undamaged, also compare the summary in its end record with its
+        events.
+        """
         recording = self._recording
         self._compare(last=True)
         if self.difference or not recording.whole:

@@ -4,9 +4,9 @@ The head of an MCAP chunk holds the chunk's length and checksum. Most programs t
 chunk only when it is complete, and a power cut costs the whole chunk. A recording writes its chunk
 while it grows:
 
-1. First it writes a head with a length that no file has.
+1. First it writes a head whose length field is larger than any file.
 2. Once a second it appends a zstd block with the new messages.
-3. When the chunk is complete, it replaces the first head by the true head.
+3. When the chunk is complete, it replaces this head by the true head.
 
 The reader does not need the head. Each zstd block holds its own length, and the sequence number of
 each message is the message's checksum. So the reader recovers every second that was written before
@@ -51,11 +51,14 @@ If a chunk was cut off after a whole block, this block completes it.
 MAX_CHUNK_BYTES = 1 << 23
 """Largest uncompressed size of a chunk that is read, bytes.
 
-A recorder writes chunks of at most 1 MiB and one message.
+A recorder writes chunks of at most 1 MiB plus one message.
 """
 
 MAX_MESSAGE_BYTES = 1 << 22
-"""Largest size of a message that is read, bytes. A second with 20 commands takes 16 000 bytes."""
+"""Largest size of a message that is read, bytes.
+
+A message with one second of steps and 20 commands has 16 000 bytes.
+"""
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
 """Head of a chunk's record: opcode, length, first and last time, uncompressed size and its CRC-32,
@@ -63,7 +66,7 @@ length and name of the compression, compressed size.
 """
 
 _AFTER_LENGTH = _HEAD.size - 9
-"""Number of bytes after the length field of a chunk's head. The length counts these bytes too."""
+"""Size of a chunk's head after its length field, bytes. The length field includes this size."""
 
 _NAME_AT = 37
 """Offset of `ZSTD` in the head of a chunk, bytes."""
@@ -81,10 +84,10 @@ MAX_DATA_BYTES = MAX_MESSAGE_BYTES - _MESSAGE.size
 """Largest size of the data of a message that is read, in bytes."""
 
 _CHECKED = struct.Struct("<HQ")
-"""Layout of the channel and time of a message, which its checksum covers besides the data."""
+"""Layout of a message's channel and time. The checksum covers these bytes, and then the data."""
 
 _BESIDE_DATA = _MESSAGE.size - 9
-"""Number of bytes after the length field of a message's head. The length counts these bytes too."""
+"""Size of a message's head after its length field, bytes. The length field includes this size."""
 
 _LONGEST_FRAME_HEAD = 18
 
@@ -92,7 +95,7 @@ _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed and uncompressed."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Allowance for each block in the work of unpacking, which is counted in unpacked bytes.
+"""Fixed part of the work of unpacking a block, in unpacked bytes.
 
 Unpacking an empty block takes about as long as unpacking 1 KiB of a large block.
 """
@@ -305,8 +308,8 @@ MAGIC = b"\x89MCAP0\r\n"
 MAX_EFFORT = 256
 """Limit on the work of unpacking damaged chunks, in unpacked bytes for each byte of the file.
 
-The chunks in the recordings of the tests take 5 to 13. A damaged chunk is read up to three
-times, and a damaged block in it counts as 128 KiB.
+The chunks in the test recordings need 5 to 13. Damaged chunks may need more: each is read up to
+three times, and a damaged block counts as 128 KiB.
 """
 
 HEAD = struct.Struct("<BQ")
@@ -342,7 +345,7 @@ class Found(NamedTuple):
     end: int
     """Offset in the file, bytes, at which this item ends and the reader goes on."""
     damaged: bool = False
-    """True for a damaged place, but false for the torn end of a file that was cut off."""
+    """True for a damaged place. False for the incomplete end of a file that was cut off."""
 
     @property
     def messages(self) -> list[Message]:
@@ -417,9 +420,9 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 class _Chunks:
     """Reads chunks, and searches for the next complete chunk without searching a place twice.
 
-    In a hostile file thousands of incomplete chunks may share their last blocks, and each chunk
-    then unpacks to megabytes. Therefore the work of unpacking incomplete chunks is limited in
-    proportion to the size of the file.
+    In a hostile file the same blocks may belong to thousands of incomplete chunks, and each of
+    these chunks unpacks to megabytes. Therefore the work of unpacking incomplete chunks is limited
+    in proportion to the size of the file.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -433,7 +436,7 @@ class _Chunks:
 
     @property
     def spent(self) -> bool:
-        """True if the work for incomplete chunks exceeds its limit. Then `later` stops too."""
+        """True if the work for incomplete chunks exceeds its limit, so that `later` gives up."""
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:

@@ -29,7 +29,7 @@ MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
 
 
 ROUNDED_NS = 1000
-"""Bound on the error of a rounded time, ns. Steps are at least 1 us apart."""
+"""Bound on the rounding error of `TimelineEntry.seconds`, ns. Steps are at least 1 us apart."""
 
 
 class Published(NamedTuple):

@@ -35,10 +35,10 @@ SLOW_NS = 3 * NS_PER_S
 SLOW = "the disk has accepted nothing for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Longest time between two steps that is counted as waiting for the disk, ns.
+"""Largest part of the time between two steps that counts as waiting for the disk, ns.
 
-Of a longer time only this part is counted. During a longer pause this process did not run, so the
-recorder's thread did not run either, and the disk is not the cause.
+If the time is longer, this process did not run in the meantime. Then the recorder's thread did not
+run either, and the disk is not the cause.
 """
 
 FLUSH_S = 0.98
@@ -48,7 +48,7 @@ MAX_TEXT = 200
 """Largest number of characters of an exception's text."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
-"""Time limits of `close`, s: first to write the end of the file, then to write a marker instead."""
+"""Time limits of `close`, s: for the end of the file, and then for a marker if the disk is slow."""
 
 
 class Recorder:
@@ -191,8 +191,8 @@ class Recorder:
     def close(self, error: BaseException | None = None) -> None:
         """Write the last steps and the end of the file within `CLOSE_S`.
 
-        If the disk is too slow for this, write a marker that says so, except after a failure of the
-        daemon.
+        If the disk is too slow for this, write a marker that says so. After a failure of the daemon
+        no marker is written.
 
         `error` is the exception that ends the daemon, or None for an ordinary end. A
         `BaseException` that is not an `Exception`, such as a `KeyboardInterrupt`, counts as an

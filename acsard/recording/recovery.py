@@ -24,7 +24,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
 
 NOTHING_BYTES = 64 << 10
-"""Size up to which a file may be without data, bytes.
+"""Largest size of a file that is deleted if it has no readable data, bytes.
 
 A larger file has more than a header and one second of steps. It is never deleted, even if its data
 is unreadable.

@@ -35,9 +35,9 @@ KEPT_FILES = 50
 """Largest number of `kept` recordings that are protected. Older ones count as unprotected."""
 
 FILES = 100
-"""Number of recording files of the largest size that fit into the allowed total size.
+"""Divisor of the allowed total size that gives the largest size of one recording file.
 
-Then the 50 protected files take about half of the total size.
+The 50 protected files then take at most about half of the total size.
 """
 
 LEAST_BYTES = 100_000
@@ -246,5 +246,5 @@ class IncidentWindow(Generic[File]):
             self.earlier_happened(ended_ns)
 
     def earlier_happened(self, at_ns: int) -> None:
-        """Register the monotonic time `at_ns`, ns, of an incident or crash of the previous run."""
+        """Register an incident or crash of the previous run at the monotonic time `at_ns`, ns."""
         self._happened_ns = max(self._happened_ns, at_ns)

@@ -107,7 +107,10 @@ class Row(Struct, frozen=True, array_like=True):
     shutting_down: bool
     superseded: bool
     now: int
-    """Time since the previous row of the batch with a true `tick`, else since `Batch.mono_ns`."""
+    """Time since the last earlier row of the batch whose `tick` is true.
+
+    If there is no such row, it is the time since `Batch.mono_ns`.
+    """
     offset: int
     """Offset of the wall clock from the monotonic clock, minus `Batch.offset_ns`."""
     reads: tuple[Read, ...]

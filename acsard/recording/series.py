@@ -24,9 +24,9 @@ from acsard.recording.time_span import Contents, Span, clock, part_between, read
 MARGIN_S = 60.0
 """Tolerance for the times in an end record, s.
 
-A file is read completely if the times in its end record are within this tolerance of the searched
-range. The end record gives only the time at which the last message began, and messages are long if
-the disk is slow. The pause between two files of one series is also shorter than this.
+The end record gives the time at which the last message begins. If the disk is slow, this message
+may hold many seconds of steps. Therefore a file is also read if it lies outside the searched range
+by at most this time. Consecutive files of one series must also be less than this time apart.
 """
 
 GAP_S = 2.0

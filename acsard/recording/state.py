@@ -228,7 +228,7 @@ def _same(now: Any, begun: Any) -> bool:
 
 
 def _names(item: object) -> list[str]:
-    """Return the names of an object's own attributes."""
+    """Return the names of the attributes that are stored in the object, not in its class."""
     slots = [name for kind in type(item).__mro__ for name in getattr(kind, "__slots__", ())]
     names = [*getattr(item, "__dict__", ()), *slots]
     return [name for name in names if hasattr(item, name)]

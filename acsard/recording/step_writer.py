@@ -58,7 +58,7 @@ class Bug(NamedTuple):
     """An internal error that ends the daemon."""
 
     why: str
-    """The exception, after the number of its step if a step raised it."""
+    """Text of the exception. If a step raised it, the text begins with the number of that step."""
     at: Instant | None
     """Instant of the step that failed; None if the daemon failed outside a step."""
     unfinished: bytes
@@ -123,7 +123,7 @@ class StepWriter:
         """The failure that ends the daemon; only the last call of `write` reads it."""
         self._pause = 0
         self._handed = self._safe = 0
-        """Numbers of steps of the present call of `write`.
+        """Counts of steps in the present call of `write`.
 
         `_handed` counts the steps that were written to the file or counted as lost. `_safe` counts
         those of them that are synced or counted as lost. If the disk refuses to write, all other
@@ -154,13 +154,13 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Mark the unfinished file with the cause `cut`, so that no later start assumes a crash.
+        """Mark the unfinished file with the cause `cut`.
 
-        Another thread may call this method while `write` waits for the disk.
+        Without the marker, the next start treats the file as cut off by a crash. Another thread may
+        call this method while `write` waits for the disk.
         """
         writing = self._writing
         if writing is not None:
-            # Without the marker, the next start treats the file as cut off by a crash.
             with suppress(OSError):
                 mark_cut(writing.path, self._incidents.kind, cut)
 
@@ -249,7 +249,7 @@ class StepWriter:
     def _look_back(self, ring: Ring, now: Instant) -> None:
         """Register the files of the previous run of the daemon.
 
-        Then an incident also protects the files within a minute of it that another run wrote.
+        Then an incident in one run also protects files of the other run within a minute of it.
         """
         for path, kind, ended_ns in ring.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)

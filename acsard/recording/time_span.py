@@ -47,7 +47,7 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A moment or a whole day, from `begin` to `end`, s since 1970. A moment has both equal."""
+    """A moment, whose `begin` and `end` are equal, or a whole day. Times are s since 1970."""
 
     begin: float
     end: float
@@ -107,7 +107,7 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return year, month and day."""
+    """Return the year, month and day that `words` mean. The day may be less than 1."""
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
         return today.tm_year, today.tm_mon, today.tm_mday - _DAYS_AGO[words]

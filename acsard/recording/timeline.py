@@ -47,9 +47,10 @@ SET_NS = 5 * NS_PER_S
 """Change of the wall clock against the monotonic clock that counts as a clock step, ns."""
 
 WAITS_NS = NS_PER_S
-"""Time, ns, for which a sender must send speeds without effect before the timeline mentions it.
+"""Time for which a sender sends speeds without effect before the timeline mentions it, ns.
 
-When one sender takes over from another one, both send for a shorter time than this.
+When an operator changes from one sender to another, both may send for a moment. That is shorter
+than this time, so the timeline does not mention it.
 """
 
 SILENT_NS = NS_PER_S
@@ -141,7 +142,10 @@ class ReasonChanges:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. The reason has `#` for each number."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry or of the last change shown in mode `waiting`, ns."""
+        """Monotonic time of the last entry, ns.
+
+        An event or a change of mode that shows the reason for `waiting` counts as an entry too.
+        """
         self._sender = ("", "")
         """The last source that the robot followed, and the last sender on that source."""
 
@@ -183,12 +187,12 @@ class BoardIdentity:
 
     def __init__(self) -> None:
         self._data = b""
-        """The last received bytes that may be the beginning of such a line."""
+        """The last received bytes, if they may be the beginning of the board's line."""
         self._reported_ns = -REASON_NS
         """Monotonic time of the last entry."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry with the line, at most one each second."""
+        """Yield an entry if the board's line has arrived, at most one each second."""
         now = step.inputs.now
         for read in step.inputs.received:
             data = self._data + read.data
@@ -282,8 +286,8 @@ class WaitingSenders:
     def _why(self, waiting: str, followed: str) -> str:
         """Return why the robot follows the source `followed` and not the source `waiting`.
 
-        Returns "" if the priorities do not explain this, because one of the sources is unknown or
-        the source `waiting` has the higher priority. Then the robot refuses its commands.
+        Returns "" if one of the sources is unknown, so that its priority is not known. Also returns
+        "" if `waiting` has the higher priority, because the robot then refuses its commands.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -448,7 +452,8 @@ INCIDENTS = {
 }
 """Maps the name of an event to its word in the summary of a recording.
 
-`link_up` has no word. It is in the table because a later loss of the link is counted separately.
+`link_up` is not counted and has no word. It is in the table so that `summary` receives it, and
+counts a loss of the link after it separately.
 """
 
 

@@ -361,7 +361,8 @@ def _keys(entries: Sequence[_Entry]) -> None:
 def _is_part(kind: Any) -> bool:
     """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
 
-    No code of such a class has to run for this: no `__new__` or `__setstate__` of its own.
+    The class must not define `__new__`, `__reduce_ex__` or `__setstate__`, whose code would have
+    to run for this.
     """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")

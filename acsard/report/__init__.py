@@ -1,6 +1,6 @@
 """`acsard recording report`: turns a recording into the text of one HTML file.
 
-All modules of this package are pure, except `page.drawn`, which replays the recording.
+All code of this package is pure, except the function `page.drawn`, which replays the recording.
 
 - `report_data` collects the data to draw, step by step. It thins the data while they arrive
   (`acsard.core.thinning`), so a day takes no more memory than a minute.

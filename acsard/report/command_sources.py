@@ -16,8 +16,9 @@ from acsard.recording.recorded_steps import Step
 STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent.
 
-In the state `sends` the robot accepts the source's commands, but does not drive for another reason.
-If short spans of time are merged, the state that comes first in this list is kept.
+In the state `sends` the robot accepts the source's commands, but the source does not drive. The
+reason of the robot's mode says why. If short spans of time are merged, the state that comes first
+in this list is kept.
 """
 
 MOVES = ("ready", "driving")
@@ -129,6 +130,6 @@ class CommandSources:
         yield OTHERS, "refused" if refusal else "", refusal
 
     def _refusal(self, name: str, t: float) -> str:
-        """Return why a command of a source was refused within the source's timeout, or ""."""
+        """Return why a source counts as refused at time `t`, s, or "" if it does not."""
         until, words = self._refused.get(name, (-math.inf, ""))
         return words if t < until else ""

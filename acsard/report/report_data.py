@@ -70,7 +70,7 @@ class Marks:
     def __init__(self) -> None:
         self._first: dict[str, list[tuple[int, Mark]]] = {}
         self._last: dict[str, deque[tuple[int, Mark]]] = {}
-        """The kept events of each name, with their place in the order of all events."""
+        """The last events of each name, each with its number in the order of all events."""
         self._count = 0
         """Number of calls of `add`."""
         self.counts: Counter[str] = Counter()
@@ -118,7 +118,7 @@ class Lateness:
         self._number = 0
         """Number of the last period."""
         self._ahead = 0
-        """Number of lines since the last period that the daemon sent at once."""
+        """Number of lines that `at_once` has counted since the last period."""
         self._began_ns: int | None = None
         self._earliest = math.inf
         """Smallest delay so far, ns, measured from the first period. It may be negative."""
@@ -166,13 +166,13 @@ class Lateness:
 
 
 class LineCount:
-    """Number of serial lines of one kind, in each second and in all."""
+    """Number of serial lines of one kind: for each second, and the total."""
 
     def __init__(self) -> None:
         self.curve, self.total = Curve(), 0
 
     def add(self, t: float, count: int) -> None:
-        """Add the number of lines in the second around the time `t`, s."""
+        """Add the number of lines in one second. `t` is the middle of that second, s."""
         self.curve.add(t, count)
         self.total += count
 
@@ -290,7 +290,7 @@ class ReportData:
         self._mono_ns = self._wall_ns = 0
         """Monotonic and wall-clock time of the first step of the recording, ns."""
         self._wall = -math.inf
-        """Wall-clock time of the last step, s since 1970, computed from the monotonic clock."""
+        """Wall-clock time of the first step plus the monotonic time since then, s since 1970."""
         self._number: int | None = None
         """Number of the last step."""
         self._place: Place | None = None

@@ -31,7 +31,7 @@ MAX_REASONS = 8
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 FINE_S = 0.05
-"""Longest time that a point of a picture may stand for without a note in the report, s."""
+"""If a point of a picture stands for more than this time, s, the report has a note about it."""
 
 MAX_NAMES = 5
 """Largest number of names or texts in a list."""

@@ -38,11 +38,11 @@ HEARD_S = 0.9
 After a longer silence the subcommand sends zero speeds, so the robot begins to stop within a second
 of the program's last line. The program sends a line every 0.1 s, even if the line is only `{}`. TCP
 resends a lost packet after 0.2 s, and again after another 0.4 s, so a line that is lost twice still
-arrives in time. A key press that is lost three times would arrive as late as these zeros.
+arrives in time. A line that is lost three times arrives too late.
 
-If this computer is too busy to keep the limit, a guided drive ends earlier, because the daemon was
-silent for 0.5 s (calibration/guided/leg_driver.py). When a person drives by hand, this limit does
-not apply. Then each command is a sign of life, and the timeout of the command source applies.
+This computer may be too busy to keep the limit. Then a guided drive ends for another reason: it has
+received nothing from the daemon for 0.5 s (calibration/guided/leg_driver.py). When a person drives
+by hand, each command is a sign of life, and the timeout of the command source replaces this limit.
 """
 
 LISTEN_S = 0.05
@@ -185,7 +185,7 @@ class JsonPrompt:
         )
 
     def keys(self, wait_s: float) -> str:
-        """Return " " if a key was pressed since the last answer or call, else "".
+        """Return " " if a key was pressed since the last answer or the last call, else "".
 
         Waits up to `wait_s` s for a key press.
         """

@@ -115,7 +115,7 @@ def reason(state: RobotState) -> str:
 def refused(objection: str) -> str:
     """Return a sentence which says why the robot does not follow the keys.
 
-    If the robot waits for a zero, the sentence also says how to send one with the keys.
+    If the robot waits for a zero command, the sentence also says how to send one with the keys.
     """
     release = " (release the key, and press it again)" if "must send a zero" in objection else ""
     return f"your keys do not drive: {printable(objection)}{release}"

@@ -1,4 +1,4 @@
-"""The data of `acsard top`: the robot's received states and the facts of its daemon."""
+"""The data of `acsard top`: the robot's received states and the `info` of its daemon."""
 
 from __future__ import annotations
 

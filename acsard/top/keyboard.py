@@ -2,7 +2,7 @@
 
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `HOLD_S`. Once the keyboard repeats a held key, each repeat drives the robot for `REPEAT_S` only.
-When this time is over, the tool sends three zeros and then nothing.
+When this time is over, the tool sends three zero commands and then nothing.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ repeat a held key 10 to 30 times a second.
 BURST = 8
 """Largest number of keys that count if they arrive together.
 
-A held key repeats about 30 times a second. More keys at once have waited, usually in an SSH
-connection that stalled, and the operator may have released the key long ago.
+A larger number was delayed, usually by an SSH connection that stalled, because a held key repeats
+only about 30 times a second. The operator may have released the key long ago.
 """
 
 BURST_S = 0.2

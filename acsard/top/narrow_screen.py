@@ -82,7 +82,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link, the commands, and rejected lines and commands."""
+    """Return the lines about the serial link and the commands, and about everything rejected."""
     before = seen.before or state
     lines = [rule(width, [(0, title(seen, state))])]
     if state.certificate_expiry:

@@ -23,7 +23,7 @@ ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
 NAME, WHY = 12, 32
 """Minimum widths of the columns ROBOT and WHY, in characters.
 
-On a narrow terminal the column ROBOT shrinks, but not below its minimum, so that WHY gets its own.
+On a narrow terminal the column ROBOT shrinks to make room for WHY, but not below its minimum.
 """
 
 BATTERY = HEADS.index("BATTERY")

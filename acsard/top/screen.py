@@ -57,7 +57,7 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
 
 
 def _unmeasured(state: RobotState) -> RobotState:
-    """Return the state without speeds, which are outdated because the link is down."""
+    """Return the state without speeds, which are outdated because the link is not up."""
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
@@ -90,9 +90,9 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return the lines with the warnings: one line on a wide screen, and none without a warning.
+    """Return the lines with the warnings, or an empty list if there is no warning.
 
-    A single warning is shown with its details.
+    A wide screen has only one line. A single warning is shown with its details.
     """
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))

@@ -1,6 +1,7 @@
-"""Shows the screens of `acsard top`, `fleet` and `drive`. A simple terminal gets lines for `drive`.
+"""Shows the screens of `acsard top`, `fleet` and `drive`.
 
-A key or a signal ends a screen. Ctrl-Z suspends it, and `fg` resumes it.
+If the terminal cannot show a screen, `drive` prints lines instead. A key or a signal ends a screen.
+Ctrl-Z suspends it, and `fg` resumes it.
 """
 
 from __future__ import annotations
@@ -278,7 +279,7 @@ class Page:
 
     def __init__(self) -> None:
         self._shown = NO_END
-        """Number of lines printed since the first line of the help."""
+        """Number of lines since the first line of the help; `NO_END` before the first help."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
         """Return the lines `told` of a report, with the help first if it is no longer in sight.

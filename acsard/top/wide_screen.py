@@ -1,6 +1,6 @@
 """Builds the parts of the screen of `acsard top` for a wide terminal. This module is pure.
 
-The parts are below the mode of the robot, and each begins with a horizontal line.
+On the screen, they are below the robot's mode. Each part begins with a horizontal line.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ WIDEST = 116
 """Maximum width of the screen in character cells. Longer lines are harder to read."""
 
 SHORT_WORDS, LONG_WORDS = 21, 56
-"""Widths of the short and the long explanation of a figure, in character cells.
+"""Widths of the short and the long explanation of a latency in `FIGURES`, in character cells.
 
 The long explanation is used if the screen is `WIDEST` cells wide.
 """
@@ -64,7 +64,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Return the four wheel speeds (NaN if unknown) and the speed that fills a bar, rad/s."""
+    """Return the four wheel speeds (NaN if unknown) and the speed at which a bar is full, rad/s."""
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
     return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
@@ -83,7 +83,10 @@ def wheel(speed: float, scale: float, cells: int) -> Text:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return a line for each command source, in at most `room` lines."""
+    """Return a heading and at most `room` lines, one for each command source.
+
+    If some sources do not fit, the last line names them.
+    """
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
     at = ((0, "sources"), (start, "priority"), (start + 10, "seen"), (start + 17, "waits for"))
@@ -96,7 +99,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def hidden(left: Sequence[SourceState]) -> str:
-    """Return a line that names the sources `left`, which do not fit."""
+    """Return a line that counts and names the sources that do not fit on the screen."""
     names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
     return f"  and {count(len(left))} more: {names}"
 
@@ -107,7 +110,10 @@ def drives(source: SourceState, state: RobotState) -> bool:
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return in words what a source waits for. If that is nothing, say why it drives or not."""
+    """Return in words what a source waits for.
+
+    If it waits for nothing, the text says that it drives, or gives the mode of the robot.
+    """
     if source.waits_for:
         return clean(source.waits_for)
     if drives(source, state):
@@ -126,7 +132,7 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link, the commands, and rejected lines and commands."""
+    """Return the part about the serial link, commands, gyro, track, board and rejected input."""
     before = seen.before or state
     head = title(seen, state)
     titles: list[tuple[int, str | Text]] = [(0, head)]
@@ -222,7 +228,7 @@ def missed(state: RobotState, before: RobotState) -> Text:
 
 
 def _refusals(state: RobotState, before: RobotState) -> list[Text]:
-    """Return the numbers of rejections by reason, and the last refusal in words."""
+    """Return two rows: the numbers of rejections by reason, and the last rejection in words."""
     kinds = [
         Text(f"{kind} ").append_text(Text(", ").join(parts))
         for kind, parts in refused(state, before)
@@ -268,7 +274,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def spread(found: Spread | None) -> Text:
-    """Return median, 99th percentile and maximum of a figure, in 21 cells."""
+    """Return median, 99th percentile and maximum of a latency, in three columns of 7 cells."""
     if found is None or found.count <= 0:
         return Text("-".rjust(7) * 3, "dim")
     p50, p99, most = (rough(1e-6 * us, 1e-6).rjust(7) for us in (found.p50, found.p99, found.max))

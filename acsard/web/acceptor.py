@@ -10,8 +10,8 @@ No other module counts connections. A connection goes through these states:
 4. open: aiohttp reads its requests.
 
 If all places are taken, `Sockets` chooses the connection to close. The first request must arrive
-within `REQUEST_S`. `Reader` answers bytes that are not an HTTP request with an explanation, and
-counts the refusal. aiohttp alone would log a traceback each time.
+within `REQUEST_S`. If a client sends bytes that are not an HTTP request, `Reader` explains this in
+its answer and counts the refusal. aiohttp alone would log a traceback each time.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 """Time limit for a TLS handshake, s, and maximum number of handshakes at once."""
 
 HURRIED_S = 0.3
-"""Time limit, s, for a TLS handshake while other connections wait for theirs. It applies to the
-network with the most handshakes. Without it, clients that fall silent in their handshakes would
-delay a phone by `HANDSHAKE_S`."""
+"""Time, s, after which a TLS handshake may be cut so that a waiting connection can start its own.
+The network with the most handshakes loses one. Without this limit, clients that fall silent in
+their handshakes would delay a phone by `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit, s, from accepting a connection to the head of its first request. After that, the
@@ -80,8 +80,8 @@ class Acceptor:
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
-        """The connections that wait for their handshake, by network. When a handshake starts, its
-        network moves to the end."""
+        """The connections that wait for their TLS handshake, by network. When a handshake starts,
+        its network moves to the end of this dict, so the networks take turns."""
         self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
         """The connections in the TLS handshake, each with the time of its start, oldest first."""
@@ -91,9 +91,9 @@ class Acceptor:
         """The connections whose token was no longer valid at the last call of `tidy`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Accept connections at a listening socket; `make` creates the handler of each.
+        """Accept connections at the listening socket `opened`.
 
-        `secure` is None for plain HTTP.
+        `make` creates the handler of a connection. `secure` is None for plain HTTP.
         """
         sslproto.SSLProtocol.max_size = READ_BYTES
         # A browser sends no request before it has the answer to the last one. aiohttp would queue
@@ -103,7 +103,7 @@ class Acceptor:
         self._resume(opened, secure, make)
 
     def close(self) -> None:
-        """Accept no more connections, and cut those on which no client has been identified."""
+        """Stop accepting connections, and cut the open ones whose client is not identified."""
         loop = asyncio.get_running_loop()
         for opened in self._listeners:
             loop.remove_reader(opened)
@@ -199,7 +199,7 @@ class Acceptor:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Record that a connection's handshake has ended, and let the next one start."""
+        """Remove a connection from the state `starting`, and let the next handshake start."""
         self._starting.pop(one, None)
         if self._again is None:
             self._next()
@@ -340,7 +340,7 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """End the limits for a request's head, because the head of a request has arrived."""
+        """Record that the head of a request has arrived, so the limits on its time and size end."""
         self._head, self._body = 0, body
         self._cancel_timer()
 
@@ -399,7 +399,7 @@ def _connection(transport: asyncio.BaseTransport | None) -> _Connection | None:
 
 
 class Reader(RequestHandler):
-    """aiohttp's handler of one connection, with an answer of its own to invalid requests."""
+    """aiohttp's handler of one connection. Only its answer to an invalid request differs."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
         """Create a handler for `server`, which is the server of the application's runner."""

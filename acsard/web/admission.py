@@ -1,9 +1,10 @@
-"""Decides whether an HTTP request reaches the handler of its row in the table of routes.
+"""Decides whether an HTTP request reaches its handler.
 
-`Admission` checks each request in this order: whether the client is on the robot (`callers.py`),
-the origin of the web page that sent the request, the token, the request rate, and the role that the
-row requires. The handler of an admitted request finds the client's identity, a `Who`, in the
-request. A path without a row also requires a token, so a stranger does not learn which paths exist.
+The table of routes has a row for each path. `Admission` checks a request in this order: whether the
+client is on the robot (`callers.py`), the origin of the web page that sent the request, the token,
+the request rate, and the role that the row requires. The handler of an admitted request finds the
+client's identity, a `Who`, in the request. A path that has no row requires a token too, so a client
+without a token does not learn which paths exist.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ WORDS = {
 }
 
 WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
-"""Key under which a request contains the client's identity. There is none for a path that is open
-to every client."""
+"""Key under which a request contains the client's identity. A request for a path that is open to
+every client does not contain it."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -201,11 +202,11 @@ class Admission:
             await asyncio.sleep(HOLD_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Check a request; return whether it, or its answer, must wait because of its rate.
+        """Check a request; raise `RefusedError` if it is refused.
 
-        `row` is the route of the request, None for a path that does not exist. The identity of the
-        client is stored in the request unless the route is open to every client. Raises
-        `RefusedError`.
+        Return True if the client exceeds the request rate, so the request or its answer must wait.
+        `row` is the route of the request, or None if the path does not exist. Store the client's
+        identity in the request unless the route is open to every client.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -249,7 +250,7 @@ class Admission:
         return by_listed_page(asked_of(request), self._origins)
 
     def _preflight(self, request: web.Request) -> web.Response:
-        """Return the CORS answer that lets a page of a listed origin send its request."""
+        """Return the CORS answer that lets a page in `web.origins` send its request."""
         place(asked_of(request), self._names | {own_address(request)})
         return web.Response(
             status=204,
@@ -261,7 +262,7 @@ class Admission:
         )
 
     async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Add the CORS headers that let a page of a listed origin read the answer."""
+        """Add the CORS headers that let a page in `web.origins` read the answer."""
         if self._origins:
             vary = response.headers.get("Vary", "")
             response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"

@@ -156,10 +156,10 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""The files that are sent inside another file, by the name of the outer file.
+"""Maps the name of a file to the files that are sent inside it.
 
-The value of an inner file has two parts: the HTML element in the outer file that would load it, and
-the name of the element that replaces this one and contains the inner file.
+Each inner file has two values. The first is the element in the outer file that would load the inner
+file. The second is the name of the element that is sent instead, with the inner file as its text.
 """
 
 

@@ -124,8 +124,8 @@ class Page:
     def end_all(self, why: str) -> None:
         """Cancel the report, stop reading the camera, and close every WebSocket.
 
-        A robot that a viewer drives gets a last zero. `why` is sent to the clients as the reason
-        for closing, at most 120 characters.
+        If a viewer drives the robot, the robot is sent a zero velocity. `why` is sent to the
+        clients as the reason for closing, at most 120 characters.
         """
         self._reports.end()
         self._camera.close()
@@ -133,7 +133,7 @@ class Page:
             viewer.end(why)
 
     async def tidy(self) -> None:
-        """End connections whose token is not valid any more, and reports that no client waits for.
+        """Close the connections whose token is not valid any more, and drop unwanted reports.
 
         The server calls this method once a second. A token is not valid if it has expired, was
         revoked, or cannot be read from the disk within `READ_S`. The client of a WebSocket is told

@@ -32,7 +32,7 @@ Reason = Literal[
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name of every client on the robot itself, which shows no token."""
+"""Name of every client on the robot itself. Such a client has no token that could name it."""
 
 COOKIE = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a `__Host-` cookie only if it is Secure, without a
@@ -107,7 +107,8 @@ def place(asked: Asked, names: Collection[str]) -> Place:
     """Return "here" if the client is on the robot and asks for a loopback name, otherwise "away".
 
     `names` are the robot's names and addresses in lower case. Raises `RefusedError` for a request
-    through a proxy, for plain HTTP that is not "here", and for a host that is not in `names`.
+    through a proxy. If the client is "away", also raises it for plain HTTP and for a host that is
+    not in `names`.
     """
     if asked.proxied:
         raise RefusedError(
@@ -148,7 +149,7 @@ def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
     `origins` are in lower case. The result is False for the robot's own page, even if its origin is
-    listed. Otherwise the cookies of the robot's page would be ignored, as those of other pages are.
+    listed, because the server ignores the cookies that come with a request of a listed page.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False

@@ -29,13 +29,13 @@ from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Maximum number of concurrent requests of all clients together, and, counted separately, of stops
-of the page's own robot. Stops beyond their limit share one request, because they stop the same
-robot."""
+"""Maximum number of concurrent requests, and maximum number of concurrent stops of the page's own
+robot, each for all clients together. Such a stop does not count as a request. Stops beyond their
+limit share one stop, because they stop the same robot."""
 
 ELSEWHERE_AT_ONCE = 8
-"""Maximum number of stops of other robots for whose answers the server waits at the same time. A
-stop beyond the limit is sent too, but the server does not wait for its answer."""
+"""Maximum number of stops of other robots that wait for their answers at the same time. A stop
+beyond the limit is sent too, but the server does not wait for its answer."""
 
 MERGE_S = 0.02
 """Shortest interval between two stops that the server sends for one client to one robot, s. Stops
@@ -48,7 +48,7 @@ user."""
 T = TypeVar("T")
 
 Stop = Callable[[], Awaitable[ServiceReply]]
-"""Sends a stop and returns the reply."""
+"""Function that sends a stop and returns the reply."""
 
 
 class Ending(NamedTuple):
@@ -170,7 +170,7 @@ class Calls:
         )
 
     def _require_few(self, who: Who) -> None:
-        """Raise `RefusedError` if the client stops too many robots that may not exist."""
+        """Raise `RefusedError` if the client too often stops robots that may not exist."""
         if not self._unknown.take(who.token or who.name, clock.mono_ns()):
             rate = STOPS_ELSEWHERE
             raise RefusedError(
@@ -190,15 +190,16 @@ class Calls:
 class Merged:
     """Limits the stops of each client to each robot to one every `MERGE_S`.
 
-    No stop is lost: the stops that arrive in that time after a sent stop share the next one.
+    No stop is lost. The stops that arrive too soon after a stop was sent share the next one.
     """
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """An event for each name whose last stop was sent less than `MERGE_S` ago. The event is set
-        when that time is over."""
+        """Maps the name of a client and robot to an event that is set `MERGE_S` after the client's
+        last stop of the robot. The name is then removed."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
-        """For each name, the task that waits for the event in `_rests` and then sends a stop."""
+        """Maps the name of a client and robot to the task that waits for the event in `_rests` and
+        then sends a stop."""
 
     async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
         """Return the reply to a stop that is sent after this call began.
@@ -281,7 +282,7 @@ def _require_stop(verb: str, robot: str) -> None:
 
 
 def _named(client: Client, robot: str, who: Who) -> Client:
-    """Return a bus client for `robot`, which calls services under the name of `who` for the log."""
+    """Return a bus client that calls services of `robot`, and is logged under the name of `who`."""
     other = client.like(robot)
     other.name = f"{who.name}@page"
     return other

@@ -24,8 +24,8 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Longest time, s, for which a request waits for a new picture, and then again for a free place to
-send it (`SENDS`)."""
+"""Maximum time, s, for which a request waits for a new picture. If one comes, the request waits at
+most this long again, until the picture may be sent (`SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits for the connection to the camera's server, and for the next byte from it, s."""
@@ -111,7 +111,7 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Wait until there is a picture that is newer than number `number`, and return it.
+        """Wait for a picture that is newer than the one with this number, and return it.
 
         Return None if none comes within `WAIT_S`. Raises `TroubleError` if the robot has no camera,
         or its stream cannot be read.

@@ -46,7 +46,7 @@ class Fleet:
         are visible."""
 
     def join(self, viewer: object) -> None:
-        """Start tracking on behalf of this viewer."""
+        """Add this viewer; the first one to join starts the tracking."""
         self._joined.add(viewer)
         self._look()
 

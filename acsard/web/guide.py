@@ -76,7 +76,7 @@ class Choices(Struct, frozen=True):
     """Reason for the recommendation and the alternatives."""
     ports: Sequence[Board]
     note: str
-    """Explanation of a limit of this server, with the command to type instead, or ""."""
+    """Advice if this server sees no serial port, with the command to type instead; else ""."""
 
 
 class _Said(Struct, frozen=True):
@@ -177,7 +177,7 @@ class Guide:
             errand.relay()
 
     async def close(self) -> None:
-        """End the running child; kill it after 2 s."""
+        """Interrupt the running child, and kill it if it does not exit within 2 s."""
         if self._task is None or self._errand is None:
             return
         self._errand.leave()
@@ -242,8 +242,8 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     """Return the arguments of the `acsard` command that carries out the request `begin`.
 
     `ports` are the serial ports that may be checked. Raises `FrameError` if a value in the request
-    is not allowed. A text from the browser is only ever the value of an option that is fixed here,
-    and the value must be one of a known set or a plain key.
+    is not allowed. This function chooses the options. A text from the browser can only become the
+    value of an option, and must be in a known set of values or be a plain key.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
@@ -292,7 +292,7 @@ class _Errand:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run the child and return its exit code and the end of its standard error.
+        """Run the child; return its exit code and the last lines of its standard error.
 
         Raises `OSError`.
         """
@@ -307,7 +307,7 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """Send the child an answer to its open question; return False for any other question."""
+        """Send the child an answer; return False if its question is not the open one."""
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg

@@ -1,4 +1,4 @@
-"""The limits that the page's server sets to its clients. This module is pure.
+"""The limits that the page's server sets for its clients. This module is pure.
 
 The rates of messages, commands, requests, TLS handshakes and wrong tokens are limited, and so are
 the numbers of TCP connections, WebSockets and subscriptions. A network is an IPv4 address, or the
@@ -18,8 +18,8 @@ SOCKETS, SOCKETS_HERE = 256, 96
 opens six connections in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
-"""Maximum numbers of TCP connections from one network without a valid token, and with one token.
-Further connections with that token count as connections without a token."""
+"""Maximum number of TCP connections without a valid token from one network, and maximum number with
+the same valid token. Further connections with that token count as connections without one."""
 
 SOCKETS_OF_BROWSER = 7
 """Number of connections that each token keeps when all places are taken: those of one browser."""
@@ -87,9 +87,9 @@ on the page sends 20 a second. The daemon accepts 1000 a second from this server
 client that drove."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
-"""Limit on the rate of stops from one token to robots that may not exist, because no page shows
-them and they have never answered a stop from this server. Stops to other robots have no such
-limit."""
+"""Limit on the rate of stops from one token to robots that may not exist. A robot is known to exist
+if a page shows it, or if it has answered a stop from this server. Stops to known robots have no
+such limit."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens: from one network (see `callers.network_of`), and in all."""
@@ -113,7 +113,7 @@ class Sockets(Generic[C]):
     1. The network with the most connections without a valid token loses the oldest of these. So a
        flood from a few networks displaces its own connections.
     2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest one. But it keeps `SOCKETS_OF_BROWSER`: then the new connection is refused instead.
+       oldest one. If it has only `SOCKETS_OF_BROWSER`, the new connection is refused instead.
     """
 
     def __init__(self, most: int) -> None:
@@ -245,7 +245,7 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return each limit for a WebSocket, the counted name, and the refusal text."""
+        """Return each limit for a WebSocket, with the name to count and the text of a refusal."""
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]

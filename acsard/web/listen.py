@@ -122,12 +122,12 @@ def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socke
 
 
 def _older_ports(listen: Sequence[Listen]) -> set[int]:
-    """Return the ports of the IPv4 addresses. A `::` socket uses such a port for IPv6 only."""
+    """Return the ports of the IPv4 addresses. At such a port, a `::` socket is for IPv6 only."""
     return {one.port for one in listen if ":" not in one.host}
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open a socket at one address, and return the address with its port, and the socket.
+    """Open a socket at one address; return the address with the port that was free, and the socket.
 
     `both` lets `::` accept IPv4 too. It is true if no IPv4 address has this port.
     """

@@ -26,10 +26,10 @@ Refs = dict[Any, Described]
 """Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of two schemas: any message to the WebSocket's server, and any message from it."""
+"""Names of two schemas, for the WebSocket messages to the robot's server and those from it."""
 
 VALUE = "Value."
-"""Prefix of the names of the schemas for the messages of subscribed keys."""
+"""Prefix of a schema's name, if the schema describes the messages of a subscribed key."""
 
 GUIDED = "Guided"
 
@@ -59,7 +59,7 @@ def _raw(schema: Described) -> Any:
 
 
 def _value(key: str, kind: str) -> type[Struct]:
-    """Return the type of the messages that `socket_sender.Following` builds for a key."""
+    """Return the type of the WebSocket messages that contain the values of a key."""
     return msgspec.defstruct(
         VALUE + key.replace("/", "."),
         [
@@ -157,10 +157,10 @@ def _needed(kind: type | str) -> bool:
 
 
 def _messages() -> Described:
-    """Return the schemas of the bus's messages, and of their nested types as `Type.Part`.
+    """Return the schemas of the messages on the bus.
 
-    The nested types are separate schemas, because most readers of OpenAPI documents cannot resolve
-    a schema that contains `$defs`.
+    A nested type has its own schema, named `Type.Part`, because most readers of OpenAPI documents
+    cannot resolve a schema that contains `$defs`.
     """
     found: Described = {}
     for name, schema in SCHEMAS.items():
@@ -172,9 +172,10 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return a JSON schema in which references to `$defs` refer to the document's schemas instead.
+    """Return the JSON schema `node`, with each reference into `$defs` replaced.
 
-    `before` is the prefix of the names of these schemas.
+    The new reference is to the schema in the OpenAPI document whose name is `before` followed by
+    the old name.
     """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
@@ -202,9 +203,10 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    """Return the schemas `ToRobot` and `FromRobot` of all WebSocket messages, and `Guided`.
+    """Return the schemas `ToRobot` and `FromRobot`, and `Guided`, which is a part of `FromRobot`.
 
-    Each message has a field that no other message has, so a reader can tell them apart.
+    Together they describe all WebSocket messages. Each kind of message has a field that no other
+    kind has, so a reader can tell them apart.
     """
     guided = msgspec.defstruct(
         GUIDED,

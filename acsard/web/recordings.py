@@ -41,7 +41,7 @@ DRAW_S = 600.0
 minutes on a small computer."""
 
 ALONE_NS = 60 * NS_PER_S
-"""Time without a request for its progress, ns, after which the drawing of a report is cancelled."""
+"""Time, ns, after which the drawing of a report is cancelled if no client asks for its progress."""
 
 KEEP_NS = 900 * NS_PER_S
 """Time, ns, after which a finished report is dropped if no client has asked for it."""
@@ -215,10 +215,10 @@ class Reports:
     finished report stays in memory, compressed, until another one is drawn or no client has asked
     for it for `KEEP_NS`. No file is written.
 
-    A recording may contain text of strangers, so a report could contain a malicious script. There
-    are three defences. The report escapes the text. The policy in the report allows exactly two
-    scripts and loads nothing. `POLICY` gives the report an opaque origin, so a script in the report
-    could use neither the cookie nor the interface of the robot's page.
+    A recording may contain text from unknown senders, so a report could contain a malicious script.
+    There are three defences. The report escapes the text. The policy in the report allows exactly
+    two scripts and no loading. `POLICY` gives the report an opaque origin, so a script in the
+    report could use neither the cookie nor the interface of the robot's page.
     """
 
     def __init__(self, command: Sequence[str] = ()) -> None:

@@ -69,14 +69,14 @@ def _path() -> Track:
 
 
 class _Asking:
-    """A client for a `Watch` on the event loop. Queries run in threads, because they may block."""
+    """The client that a `Watch` uses. Queries run in threads, and do not block the event loop."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key unless the last query is under way; `take` is called with each reply."""
+        """Query a key unless a query is still running; `take` is called with each reply."""
         if self._asked is None or self._asked.done():
             self._asked = asyncio.create_task(self._ask(name, take))
 
@@ -131,7 +131,7 @@ class Robots:
         return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:
-        """Query the facts in `about` soon again, because they may have changed."""
+        """Query the facts in `about` at once, because they may have changed."""
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:

@@ -1,7 +1,7 @@
 """The rows of the table of routes: the meaning, the role, the input and the output of each path.
 
-This module is pure. `app.ROUTES` is the table. The router, the admission of requests, the rate
-limits and the OpenAPI document use it, so a path that is not in the table does not exist. This
+This module is pure. `app.ROUTES` is the table. aiohttp's router, the admission of requests, the
+rate limits and the OpenAPI document use it, so a path that is not in the table does not exist. This
 module makes the rows of the robot's keys and services from the tables in `keys_and_roles.py`.
 """
 
@@ -81,9 +81,9 @@ class Route(Struct, frozen=True):
     waits: bool = False
     """True if a request beyond the rate waits; False if it is refused.
 
-    A POST, such as a stop, is carried out at once, and its answer waits. If this is true, each
-    token has a limit of its own in each network. So a program cannot keep out a page that uses the
-    same token in another network.
+    A POST, such as a stop, is carried out at once, and only its answer waits. If `waits` is true,
+    `rate` applies to each token in each network separately. So a program cannot use up the limit of
+    a page that uses the same token in another network.
     """
 
     @property
@@ -93,7 +93,7 @@ class Route(Struct, frozen=True):
 
     @property
     def pattern(self) -> str:
-        """The path in the form of the router, with a regular expression for each parameter."""
+        """The path as aiohttp's router needs it, with a regular expression for each parameter."""
         patterns = {name: PARAMETERS.get(name, "[^{}/]+") for name in self.parameters}
         return _PARAMETER.sub(lambda found: f"{{{found[1]}:{patterns[found[1]]}}}", self.path)
 

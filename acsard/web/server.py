@@ -43,7 +43,7 @@ sends the cookies for all ports of a host in one header, so a lower limit could 
 browser."""
 
 LEAVE_S = 0.3
-"""Time, s, that the server has at its shutdown to send last zeros for the viewers that drive."""
+"""Time, s, that the server has at its shutdown to send zero velocities for viewers that drive."""
 
 
 class Wanted(Struct, frozen=True):

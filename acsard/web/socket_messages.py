@@ -28,8 +28,8 @@ MAX_RATE, USUAL_RATE = 50.0, 10.0
 
 LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
 """Largest stamp that a command may have, ms since 1970: one day before the largest one that the
-daemon accepts. The zero that the server sends when a client ends has a later stamp than the last
-command, and must still be accepted."""
+daemon accepts. When a client disconnects, the server sends a zero velocity with a later stamp than
+the client's last command, and the daemon must accept it."""
 
 PROGRAM = "app"
 """Command source of a command that names no source. The page in the browser names `teleop`."""
@@ -260,7 +260,7 @@ class Row(Struct, frozen=True):
     place: Sequence[float] | None = None
     """x and y in m, and yaw in rad, in the odom frame; None while no state arrives."""
     battery: str = ""
-    """State of charge, else the voltage, in words; "" if neither is reported."""
+    """State of charge or, if it is unknown, the voltage, in words; "" if neither is known."""
 
 
 class Rows(Struct, frozen=True):

@@ -199,7 +199,7 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key, or change its rate. The client is told the reason of a refusal."""
+        """Subscribe to a key, or change its rate. Tell the client why if this is refused."""
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)

@@ -114,7 +114,7 @@ class Vault:
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
         """Create a token that expires after `days` and `hours`; return its text and its record.
 
-        The text is not stored, so show it now. Raises `UsageError`.
+        The text is not stored, so the caller must show it to the user. Raises `UsageError`.
         """
         with self._changing() as tokens:
             now_s = int(time.time())

@@ -55,7 +55,7 @@ ACTIONS: dict[str, Role] = {
     "recordings": RECORDINGS,
     "begin": Begin.least,
 }
-"""The least role for each action for which the page shows a control."""
+"""Maps each action that has a control on the page to the least role that may use it."""
 
 HEARTBEAT_S = 10.0
 """Interval of the pings, s. The connection ends if a ping is not answered within half of it."""
@@ -71,17 +71,17 @@ found yet."""
 class ViewerCommands:
     """Puts the newest velocity command of each viewer on the bus.
 
-    A command is sent once, with the stamp of its sender, or it is dropped. The server repeats no
-    command and creates none, except one zero for a viewer that was driving and has disconnected.
-    `client` returns the connection to the bus, or None before it is open.
+    A command is sent once, with the stamp of its sender, or it is dropped. The server does not
+    repeat commands. It creates only one of its own: a zero velocity for a viewer that was driving
+    and has disconnected. `client` returns the connection to the bus, or None before it is open.
     """
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """Queue of commands, with the thread that sends them. The server must exit if this thread
-        has died, because then it sends neither the commands of viewers nor their last zeros."""
+        """Queue of commands, with the thread that sends them. If this thread dies, the server must
+        exit, because without it no command is sent, not even the zero that ends a drive."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
@@ -283,7 +283,7 @@ class Viewer:
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        """Send a last zero from each command source that may still drive for this viewer."""
+        """Queue a zero for each command source with which this viewer may still drive the robot."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
             self._commands.outbox.release(commander, timeouts.get(source, LONGEST_S))
@@ -303,7 +303,7 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message beyond a limit. A call gets an answer, because its program waits."""
+        """Refuse a message beyond a limit. A call gets an answer, because its sender waits."""
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
             self._out.say(socket_messages.Answer(frame.id, False, text))

@@ -636,8 +636,8 @@ FAULTS = (
         "bus reasons",
         "a message that is too big is counted as one that cannot be read",
         COMMANDS,
-        'raise DecodeError("too_big", f"{len(arrival.payload)} bytes")',
-        'raise DecodeError("malformed", f"{len(arrival.payload)} bytes")',
+        'raise DecodeError("too_big", f"{len(arrival.payload)} bytes are',
+        'raise DecodeError("malformed", f"{len(arrival.payload)} bytes are',
     ),
     fault(
         "bus answers",

@@ -64,7 +64,7 @@ def stamped(seconds: float) -> bytes:
 BAD = [
     Bad(GO[:-3], "malformed", "cmd/app"),
     Bad(pack(twist(math.nan)), "not_finite", "NaN"),
-    Bad(b"forward!", "unknown_encoding", "neither"),
+    Bad(b"forward!", "unknown_encoding", "not a JSON object"),
     Bad(GO, "wrong_shape", "cmd/app", encoding="application/msgpack"),
     Bad(pack(twist(0.5)), "malformed", "cmd/app", encoding="application/json"),
     Bad(GO + b" " * 60_000, "too_big", "bytes"),

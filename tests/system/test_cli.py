@@ -340,7 +340,7 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_reported(shared: Daemo
     ended = tool(shared, "call", "stop", "--id", "other")
     assert (ended.code, ended.out) == (69, "")
     assert "other" in ended.err
-    assert "there is acsar; use --id acsar" in ended.err
+    assert "The robots here are acsar; use --id acsar" in ended.err
 
 
 @each("robot_id", ["a/b*", "", "**", "robot 1"])

@@ -236,7 +236,7 @@ def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: Client) -> 
         states.find(lambda s: s["mode"] == "stopped" and not any(s["wheels"]), 3.0, "it stands")
         success, message = ros.call("acsard/clear").trigger()
         assert not success
-        assert "look at the robot, then call /acsard/clear again 2 s after that" in message
+        assert "call /acsard/clear again when 2 s have passed since then" in message
         released(ros)
         lines = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") > lines + 20, 3.0, "20 periods")

@@ -39,6 +39,32 @@ def test_its_exposure_is_small(container: Container, unit: str) -> None:
     assert float(text.partition(f"{unit}:")[2].split()[0]) <= EXPOSURE
 
 
+def test_the_unit_of_a_fleet_s_router_runs_the_router(container: Container) -> None:
+    unit, place = "acsard-router.service", ("127.0.0.1", 7460)
+    container.run("useradd", "--system", "zenohd")
+    container.write(f"/etc/systemd/system/{unit}", (ROOT / "deploy/zenoh" / unit).read_text())
+    router = {
+        "mode": "router",
+        "listen": {"endpoints": [f"tcp/{place[0]}:{place[1]}"]},
+        "scouting": {"multicast": {"enabled": False}},
+    }
+    container.write("/etc/zenohd/router.json5", json.dumps(router))
+    checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{unit}")
+    assert (checked.code, checked.out, checked.err) == (0, "", "")
+    container.run("systemctl", "daemon-reload")
+    try:
+        assert container.start(unit).code == 0
+        connect = f"import socket; socket.create_connection({place}, 1.0)"
+        words = ("/opt/acsard/venv/bin/python", "-c", connect)
+        until(lambda: container.run(*words).code == 0, 10.0, container.messages(unit))
+        assert (container.show("ActiveState", unit), container.show("User", unit)) == (
+            "active",
+            "zenohd",
+        )
+    finally:
+        container.run("systemctl", "stop", unit)
+
+
 def opened(container: Container) -> None:
     """The service with a TLS gateway."""
     made = container.run(ACSARD, "tls", "init", "--force", "--address", "127.0.0.1")

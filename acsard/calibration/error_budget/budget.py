@@ -5,8 +5,9 @@ The errors of one cause are propagated alone through the error model of the odom
 which gives the position error. It is also repeated until the robot has turned by 360 deg to one
 side, which gives the heading error.
 
-The feedback lines show the errors of time, quantisation, gaps and contradicting wheels, and the
-gyro noise that the odometry assumes. All other errors are those that `[odometry]` declares.
+Some errors are measured from the feedback lines: wrong stamps, quantization, gaps and contradicting
+wheels. A gyro shows the error of the track. The noise of the gyro is taken from the variance that
+the odometry publishes. All other errors are those that `[odometry]` declares.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ STEP_S = 0.1
 """Minimum length of the steps into which a drive is divided, s."""
 
 MOST_STEPS = 20_000
-"""Maximum number of steps in 100 m of driving. If the robot drove slowly, steps are longer."""
+"""Maximum number of steps in 100 m of driving. In a slow drive, steps are longer than `STEP_S`."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""A step of 0.05 m straight ahead and a step of 0.05 rad on the spot, both without errors.
+"""A step that turns by 0.05 rad on the spot, without errors.
 
-They replace the recorded steps if the robot stood still.
+If the robot stood still, `STRAIGHT` and `SPIN` replace the recorded steps.
 """
 
 
@@ -86,9 +87,9 @@ class Budget(Struct, frozen=True):
     seconds: float
     """Duration of the drive, s."""
     metres: float
-    """Sum of the distances ahead and back, m."""
+    """Total distance driven, forwards and backwards, m."""
     turned: float
-    """Sum of the turns to both sides, deg."""
+    """Total turning to the left and to the right, deg."""
     lines: int
     """Number of feedback lines."""
     missing: int
@@ -106,7 +107,7 @@ class Budget(Struct, frozen=True):
     still: bool
     """True if the robot hardly moved. `shares` then contains only errors that settings declare."""
     at_rest: tuple[float, float]
-    """Standard deviations (m/s, rad/s) of the twist because wheel speeds have two decimals."""
+    """Standard deviations of linear (m/s) and angular (rad/s) speed at rest, due to rounding."""
     shares: tuple[Share, ...]
     multiplier: float = 1.0
     """Configured ratio of effective track to wheel separation."""
@@ -118,9 +119,9 @@ class Budget(Struct, frozen=True):
     learned_std: float = 0.0
     """Standard deviation of `learned`."""
     learned_used: bool = False
-    """True if the odometry uses `learned` while only the wheels measure the turn."""
+    """True if the odometry uses `learned` for turns that only the wheels measure."""
     coarse: bool = False
-    """True if the wheel speeds jump like those of coarse encoders of unknown counts."""
+    """True if the wheel speeds jump as with coarse encoders, and their counts are unknown."""
 
     def largest(self, *bases: Basis) -> Share | None:
         """Return the share with the largest position error, among the shares with one of `bases`.
@@ -164,9 +165,9 @@ class Received(Struct, frozen=True):
     deviation: float = 0.0
     """Relative standard deviation of `learned`."""
     used: bool = False
-    """True if the odometry uses `learned` while only the wheels measure the turn."""
+    """True if the odometry uses `learned` for turns that only the wheels measure."""
     coarse: bool = False
-    """True if the wheel speeds jump like those of coarse encoders of unknown counts."""
+    """True if the wheel speeds jump as with coarse encoders, and their counts are unknown."""
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:

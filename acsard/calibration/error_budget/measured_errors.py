@@ -13,9 +13,9 @@ at a constant speed repeats the same error, so n equal values in a row are one e
 size. If a wheel passes through a value while it becomes faster or slower, the errors in the first
 and in the second half of the equal values cancel.
 
-Some firmware counts encoder edges in each period and reports multiples of the speed of one count.
-If it misses an edge in one period, it counts that edge in the next period. Therefore only the
-rounding of the reported multiple to two decimals adds up, and this rounding error is known.
+Some firmware counts encoder edges in each period, so each speed is a multiple of the speed of one
+count. An edge that comes too late for one period is counted in the next one, so this error does not
+add up. Only the rounding of the multiple to two decimals adds up, and its error can be computed.
 
 `Driving` divides a drive into steps, each with the errors of one cause. Errors that are independent
 from step to step are given as variances. Errors that have the same sign in each step add up, so
@@ -48,19 +48,19 @@ At 100 Hz they take 0.3 s, the longest time for which a host does not run the da
 """
 
 MISSING = 0.6
-"""Increase of the smallest delay among `AHEAD` lines, in periods, that shows a lost line."""
+"""Growth of the smallest delay among `AHEAD` lines, in periods, above which a line was lost."""
 
 FOLLOWED = 0.05
-"""Fraction of each change of the delay by which the expected delay follows, if no line was lost.
+"""Gain of the low-pass filter that computes the expected delay from the smallest delays.
 
-The expected delay must follow because the period is at first known only to about 1 %.
+The delays drift because the period is at first known only to about 1 %.
 """
 
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
-"""Criterion for feedback lines that arrive one by one, not in bursts.
+"""Limits for taking the median interval between lines as the period, instead of the mean.
 
-More than the fraction `CLUSTERED` of the intervals between lines must be alike: they differ from
-the median interval by less than the fraction `ALIKE_TIMES` of it.
+More than the fraction `CLUSTERED` of all intervals must be near the median: they differ from it by
+less than the fraction `ALIKE_TIMES` of it. If lines arrive in bursts, fewer intervals are near it.
 """
 
 
@@ -78,9 +78,9 @@ class LineTimes(Struct, frozen=True):
 def line_times(t: Floats, sent: Floats) -> LineTimes:
     """Estimate the delays of at least 3 feedback lines, and the lines that were lost.
 
-    `t` contains the stamps of the feedback lines, and `sent` the times of the daemon's own lines,
-    in s. A board sends feedback lines at a fixed period, or one as the answer to each line of the
-    daemon. The function tries both, and returns the estimate with the smaller delays.
+    `t` contains the stamps of the feedback lines, s. `sent` contains the times at which the daemon
+    sent lines, s. A board sends feedback at a fixed period, or one line as the answer to each line
+    of the daemon. The function tries both, and returns the estimate with the smaller delays.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -152,8 +152,8 @@ BLOCK_S = 0.5
 LEAST_LINES, ALIKE = 20, 0.99
 """Limits for the fit that separates the gyro's noise, which grows with time, from its scale error.
 
-`LEAST_LINES` is the minimum number of feedback lines while the robot moves. If the cosine between
-turn and time is above `ALIKE`, the fit cannot separate both.
+`LEAST_LINES` is the minimum number of feedback lines while the robot moves. If the turns are nearly
+proportional to time (cosine above `ALIKE`), the two errors look the same.
 """
 
 LATEST_S = 0.1
@@ -220,9 +220,9 @@ class Motion(Struct, frozen=True):
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
     """Compute the motion of a drive of at least 3 feedback lines, and its errors.
 
-    `sent` contains the times of the daemon's own lines, s. `whole` is true if this program received
-    every feedback line that the daemon received. If it is false, a missing line may have been lost
-    after the daemon, so it does not count as a gap that the odometry filled.
+    `sent` contains the times at which the daemon sent lines, s. `whole` is true if this program
+    received every feedback line that the daemon received. If it is false, the daemon may have
+    received the missing lines, so they do not count as gaps that the odometry filled.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -247,12 +247,12 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 
 
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
-    """Return the growth of the heading's variance with time, from each line to the next, rad2.
+    """Return the variance, rad2, that the gyro's noise adds to the heading from line to line.
 
-    It is 0 while the wheels do not turn, and None if a least-squares fit cannot separate it from
-    the other part of the variance. That part is S^2 A^2, where S is the relative standard deviation
-    of the gyro's scale and A the turn since the pose was set. A line with the turn dA adds
-    2 S^2 A dA to it. A is unknown at the first line, so the fit estimates A as well.
+    The gyro's scale error adds to the variance as well: S^2 A^2, where S is the relative standard
+    deviation of the scale and A the turn since the pose was set. A line with the turn dA adds
+    2 S^2 A dA. A is unknown at the first line, so a least-squares fit estimates A and the noise.
+    The result is None if the fit cannot separate them. While the wheels stand still, it is 0.
     """
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
@@ -462,7 +462,7 @@ class Driving:
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return the steps with the errors that the two decimals of reported speeds cause."""
+        """Return the steps with the errors from the rounding of reported speeds to two decimals."""
         found = self._rounding
         if found.count:
             return self._steps(missed=self._of_wheels(found.offset[1:]))

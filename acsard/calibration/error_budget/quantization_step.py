@@ -29,7 +29,7 @@ STRAYS = 0.005
 """Fraction of the speeds that need not be multiples of the step, because of damaged lines."""
 
 BY_CHANCE = 1e-5
-"""Highest probability of an accepted step to be the result of chance."""
+"""Probability of fitting all speeds by chance, above which a step is rejected."""
 
 STEEP = 1.0
 """Smallest step, rad/s, that is accepted without a test against chance.
@@ -56,7 +56,7 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Return how many speeds in two decimals are not multiples of `step`, rad/s.
+    """Return how many speeds, rounded to two decimals, are not multiples of `step`, rad/s.
 
     `doubt` is the largest relative error of `step`.
     """

@@ -53,7 +53,7 @@ class DisturbedError(GuideError):
     """A leg was cut short for a temporary reason, so the leg can be repeated."""
 
     def __init__(self, why: str, text: str) -> None:
-        """Store the reason `why`. `text` is the whole message if the leg is not repeated."""
+        """Store the reason `why`, and the message `text` to show if the leg is not repeated."""
         super().__init__(text)
         self.why = why
 
@@ -102,9 +102,11 @@ class Slant(Struct, frozen=True):
 
     quantity: Quantity
     near: str
-    """Name of the answer with the distance of the point that a left turn moves towards the line."""
+    """Name of the answer with the distance from the line to the point that a left turn brings
+    closer to it."""
     far: str
-    """Name of the answer with the distance of the other point from the line."""
+    """Name of the answer with the distance from the line to the point that a left turn takes
+    away from it."""
     apart: str
     """Name of the answer, asked before the first leg, with the distance between both points."""
     since: str = ""
@@ -149,7 +151,7 @@ MOST_S = 90.0
 """Longest driving time of all legs of a method together, s. The tests check each method."""
 
 USUAL_SPEED = 0.3
-"""Usual speed straight ahead in a guided drive, m/s. Lower limits make it slower."""
+"""Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower."""
 
 FASTEST_WHEEL = 0.5
 """Largest rolling speed of the wheels in a turn, m/s."""
@@ -254,8 +256,8 @@ class Setup(Struct, frozen=True):
     def rate_per_command(self) -> float:
         """Turn rate without skidding, rad/s, for an angular command of 1 rad/s.
 
-        The daemon computes the wheel speeds of a command with the configured multipliers. Without
-        skidding, the robot turns as these speeds, wheel radius and separation alone predict.
+        It differs from 1 because the daemon computes the wheel speeds with the configured
+        multipliers, which make up for skidding.
         """
         bare = replace(
             self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
@@ -287,7 +289,7 @@ class Method(Struct, frozen=True):
     asks: tuple[Ask, ...] = ()
     """Questions that the person answers before the first leg."""
     tool: str = ""
-    """The tool of the person's measurements, in words; "" if a sensor measures instead."""
+    """Measuring tool that the person uses, in words; "" if a sensor measures instead."""
 
     def longest_s(self, setup: Setup) -> float:
         """Return the longest driving time, s, over all effective tracks in `TRACKS`."""

@@ -77,7 +77,7 @@ class LegDriver:
         self._waits = "no state of the daemon has arrived"
         """The reason why the daemon does not accept the commands yet, or ""."""
         self._starved = f"no command of source {source} has arrived for {OPENING_S:g} s"
-        """Objection if the daemon receives no commands because this computer is too busy."""
+        """Reason to halt the leg if this computer is too busy to send commands."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -196,15 +196,15 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if an objection to its continuation lasts for `DEVIATES_S`.
+        """Halt the leg if the reason to halt it has lasted for `DEVIATES_S`.
 
-        A shorter objection is tolerated: if this computer is busy for a moment, it sends its
-        commands late, and the robot only slows down.
+        A shorter time is tolerated: if this computer is busy for a moment, it sends its commands
+        late, and the robot only slows down.
 
         Args:
-            why: the present objection, or "" if there is none.
+            why: the reason to halt the leg now, or "" if there is none.
             now: the present time, s.
-            disturbed: whether the leg can be repeated after this objection.
+            disturbed: whether the leg can be repeated after it was halted for this reason.
         """
         if not why:
             self._deviates_since = None

@@ -1,10 +1,10 @@
 """Connects a guided drive to the robot: sends the commands of a leg, and records the messages.
 
 `leg_driver.py` decides which command to send. `Recorder` keeps the samples of a leg in the same
-form as a log. The programs that send the messages stamp them with their own clocks, which may
-differ, or not at all. The stamps on a key therefore show only the intervals between its messages.
-The recorder assumes that the message with the smallest delay from stamp to arrival arrived without
-delay. The fit finds the delays that remain.
+form as a log. The programs that send the messages stamp them with different clocks, or do not stamp
+them. The stamps of one sensor therefore show only the intervals between its messages. The recorder
+assumes that the message with the smallest delay from stamp to arrival arrived without delay. The
+fit finds the delays that remain.
 """
 
 from __future__ import annotations

@@ -41,11 +41,12 @@ There the floor has no limits, and no person has to set the robot back.
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
     """Return the index of the leg with which a guided drive goes on after a disturbed leg.
 
-    If a sensor measures, only the disturbed leg is driven again. A tape shows where the robot is
-    relative to the place in which the person put it. The drive therefore goes back to the last leg
-    before which the person placed the robot. Exception: if only an angle after an earlier leg is
-    needed (`angle_before`), the person measures that angle again, and only the disturbed leg is
-    driven again.
+    If a sensor measures, it is the disturbed leg. If a person measures by tape, each measurement
+    is relative to the place where the person put the robot. The drive then goes back to the last
+    leg before which the person placed the robot.
+
+    There is one exception: if the disturbed leg only needs the robot's angle before it
+    (`angle_before`), the person measures this angle again, and the drive repeats only that leg.
 
     Args:
         legs: the legs of the method.

@@ -47,7 +47,10 @@ UNKNOWN = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Number of readings whose scatter weighs as much as the assumed skidding."""
+"""Weight of the assumed skidding when it is averaged with the scatter of the readings.
+
+With this number of readings beyond the necessary ones, both have the same weight.
+"""
 
 MOST_STEPS = 50
 SMALL = 1e-9
@@ -239,7 +242,7 @@ def _held_out_residual(
 
 
 READ_M = 0.002
-"""Standard deviation of a distance by tape, and of a robot that a person set on a line, m."""
+"""Standard deviation of a distance by tape, m, and of the placement of a robot on a line, m."""
 
 CREDIBLE = 0.85, 3.0
 """Range of credible ratios of effective track to wheel separation.
@@ -277,9 +280,10 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 
 
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
-    """Return about the ratio of effective track to wheel separation, from a `turned` reading.
+    """Return the approximate ratio of effective track to wheel separation, from a full turn.
 
-    The next legs are planned with it. Raises `GuideError` if the ratio is not credible.
+    `reading` is a `turned` reading. The next legs are planned with the ratio. Raises `GuideError`
+    if the ratio is not credible.
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)

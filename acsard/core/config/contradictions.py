@@ -30,7 +30,7 @@ from acsard.core.values import ROOT, WHEELS
 LEAST_WRAP_PERIODS = 2
 """Shortest allowed time, in control periods, until the encoder counts become ambiguous.
 
-They do so when a wheel turns by half the range of the counts between two feedback lines: the turn
+The counts are ambiguous if a wheel turns by half their range between two feedback lines: the turn
 then looks like one in the other direction. With two periods, one lost line does no harm.
 """
 
@@ -199,9 +199,9 @@ def _gyro_problems(config: Config) -> list[str]:
 
 
 def _battery_problems(config: Config) -> list[str]:
-    """Find thresholds in the wrong order, and levels that could never end.
+    """Find battery thresholds in the wrong order, and levels that the battery could never leave.
 
-    A level ends when the battery rises above the threshold plus the hysteresis.
+    The battery leaves a level when it rises above the threshold plus the hysteresis.
     """
     battery, found = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
@@ -317,7 +317,7 @@ def _ros_problems(config: Config) -> list[str]:
 
 
 def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    """Return the endpoints of `bus.listen` and `bus.connect`. A Zenoh client does not listen."""
+    """Return the endpoints in use, by key. `bus.listen` is not used if `bus.mode` is "client"."""
     listen = {"listen": bus.listen} if bus.mode == "peer" else {}
     return listen | {"connect": bus.connect}
 

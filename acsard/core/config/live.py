@@ -123,7 +123,7 @@ class Difference(Struct, frozen=True):
     """Value in the file."""
 
     def words(self, key: str) -> str:
-        """Return a text with the setting's key and both values."""
+        """Return a text with the setting's key, its value in force and its value in the file."""
         # If only one configuration has a command source, the other has no value for its keys.
         its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
         return f"{key} = {its}, not {ours}"

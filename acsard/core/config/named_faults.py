@@ -112,7 +112,7 @@ def named(text: str) -> NamedFault:
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a warning if `sim.faults` names faults, because they look like real ones."""
+    """Return a warning if `sim.faults` names faults, because simulated ones look like real ones."""
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []

@@ -228,7 +228,7 @@ class BatteryConfig(Struct, frozen=True):
 
     @property
     def bounds(self) -> dict[BatteryLevel, float]:
-        """The thresholds that are set, V or %, by level. The worst level is the last one."""
+        """Battery thresholds that are set, V or %, by level. The most severe level is the last."""
         found: dict[BatteryLevel, float] = {
             "warning": self.warning_below,
             "return": self.return_below,
@@ -315,7 +315,7 @@ class RatesConfig(Struct, frozen=True):
 
 
 TLS = "tls/"
-"""Prefix of endpoints with TLS, which present a certificate and require one from the client."""
+"""Prefix of endpoints with TLS. They present a certificate and require one from the client."""
 
 
 class BusConfig(Struct, frozen=True):

@@ -75,7 +75,6 @@ def build_partly(
 def _value(
     field: FieldInfo, raw: object, where: str, problems: list[str], invalid: set[str]
 ) -> Any:
-    """Return the value, or None if it is not valid."""
     if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
         return build_partly(field.type, raw, where, problems, invalid)
     kind = inspect.type_info(field.type)

@@ -37,7 +37,7 @@ COMFORTABLE_USE = 0.8
 """Largest comfortable use of the wire, as a share of its capacity.
 
 Above it, a line that is a little late delays the next one. The rest of the capacity also leaves
-room for boards that send a space after each comma, which makes a reply 9 % longer (36 bytes).
+room for boards that send a space after each comma. Their replies have 36 instead of 33 bytes.
 """
 
 
@@ -47,7 +47,7 @@ def wire_ns(count: int, baud_rate: int) -> int:
 
 
 def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
-    """Return the length of a command or a reply, bytes: that of the longer one.
+    """Return the length of a command or of its reply, whichever is longer, bytes.
 
     Each direction has its own wire, so only the longer line limits the rate.
 

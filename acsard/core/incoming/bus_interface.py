@@ -58,18 +58,18 @@ class Bus(Protocol):
         """Published topics that have a subscriber."""
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with about `queries` queries.
+        """Return the input since the last call, with at most `queries` + 1 queries.
 
-        The service calls come first, at most `queries` of them. Then comes one slow query (ROS
-        parameters or a `set`), even beyond the limit. Other queries fill the rest, or wait for the
-        next call.
+        First come up to `queries` service calls. Then comes one slow query (ROS parameters or a
+        `set`), even if `queries` is reached. Other queries follow until `queries` is reached. The
+        remaining queries wait for the next call.
         """
 
     def publish(self, key: str, message: Message) -> None:
         """Queue a message for the subscribers of `key`. `flush` sends it."""
 
     def flush(self) -> None:
-        """Start to send the queued messages, and do not wait until they are sent."""
+        """Start to send the queued messages, without waiting until they are sent."""
 
     def reply(self, reply: Reply) -> None:
         """Reply to the query that holds the ticket `reply.ticket`."""

@@ -113,16 +113,17 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's timestamp by the wall clock, ns, if the sender or a router set it."""
     sender: str
-    """The id of the Zenoh session that stamped the sample, usually the sender's own.
+    """Id of the Zenoh session that stamped the sample, usually the session of the sender.
 
-    It is "" if only the daemon's session did so, or, on a native key, a connected router.
+    It is "" if no other session than the daemon's stamped the sample. On a native key, it is also
+    "" if a connected router stamped it.
     """
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
     """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it.
 
-    The session does so if the sample had no timestamp, or one too far ahead of the daemon's clock.
+    The session sets one if the sample has none, or one that is too far ahead of the daemon's clock.
     """
 
 
@@ -143,8 +144,7 @@ If the Encoding names no type, only the size distinguishes the two.
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
-"""The type names that an Encoding may contain: `TWISTS` for a Twist, `STAMPED_TWISTS` for a
-TwistStamped."""
+"""Type names of a TwistStamped in an Encoding. `TWISTS` contains those of a Twist."""
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
@@ -303,8 +303,8 @@ class Identity(Struct, frozen=True):
     steady: bool = False
     """Whether the sender states that the clock of its stamps is never adjusted."""
     signed: str = ""
-    """The public name of the sender id alone, without the certificate. "" unless the sample is a
-    command on a native key with a sender id."""
+    """Public name of the sender's id, which does not depend on the certificate. "" if the sample
+    has no id, or is not a command on a native key."""
 
 
 # The results are cached, because each command needs the parts of its key twice, and few different
@@ -359,7 +359,7 @@ def identify(arrival: Arrival) -> Identity:
 
 
 def _by_gid(gid: bytes) -> str:
-    """Return the public name of a ROS publisher, which no native sender id can have."""
+    """Return the public name of a ROS publisher. No native sender can have the same name."""
     return f"gid {public_name(gid.hex())}"
 
 
@@ -400,8 +400,8 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
 
     It is the public name of the sender id in the attachment, with the transport in brackets. The
     name is only a claim of the program, because Zenoh does not say on which connection a query
-    arrived. The digits in a public name are the same as long as the program has the same sender id.
-    A call over rmw_zenoh is named by the GID of the client. A call through a bridge has no name.
+    arrived. A program keeps its public name as long as it keeps its sender id. A call over
+    rmw_zenoh is named by the GID of the client. A call through a bridge has no name.
 
     Args:
         via: the tree of keys on which the call arrived.

@@ -83,7 +83,7 @@ class GyroFollower:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Follow the sender with the public name `who`. Return whether it replaces another.
+        """Follow the sender with the public name `who`. Return whether it replaces another sender.
 
         `now_ns` is the monotonic time of the sample. Raises `DecodeError` if the daemon follows
         another gyro that is not silent.

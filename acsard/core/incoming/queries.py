@@ -91,7 +91,7 @@ class Reply(Struct, frozen=True):
     """A reply to a query."""
 
     ticket: int
-    """The ticket of the query."""
+    """Number of the query that this reply answers (`Query.ticket`)."""
     key: str
     payload: bytes
     encoding: str

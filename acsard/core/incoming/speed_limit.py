@@ -3,12 +3,12 @@
 A speed limit never raises a speed. The robot's `limits.linear_speed` is the lower of two values:
 
 - the *setting*: the value in the configuration, or the value of the last `set`.
-- the limit in the last message, in m/s. A message with 0.0 lifts the limit.
+- the limit in the last message, converted to m/s. A message with 0.0 lifts the limit.
 
-The robot itself does not know speed limits. This module turns a message into a request like that of
-a client's `set`. While a limit is in force, a client's `set` is checked against the settings
-without the limit, because they apply again when the limit is lifted. The robot then gets the
-client's value or the limit, whichever is lower. So each control step keeps to both values.
+The class `Robot` knows nothing of speed limits. This module turns a message into a `set` request of
+its own. While a limit is in force, a client's `set` is checked against the settings without the
+limit, because they apply again when the limit is lifted. The robot then gets the client's value or
+the limit, whichever is lower. So each control step keeps to both values.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ loop. Until the time has passed, the newest message waits.
 """
 
 LIFTED = 0.0
-"""Value of nav2_msgs/SpeedLimit that means "no limit", in either unit."""
+"""Value of nav2_msgs/SpeedLimit that means "no limit", in m/s and in %."""
 
 
 class _Payload(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -96,13 +96,13 @@ class SpeedLimiter:
     """The speed limit in force, and the settings that apply without it."""
 
     def __init__(self, config: Config) -> None:
-        """Start without a limit, with the configuration that the robot has."""
+        """Start without a limit. `config` is the robot's present configuration."""
         self._limit = NONE
         self._waiting: Limit | None = None
         """The newest message that has not been applied yet."""
         self._changed_ns = 0
         self._robot = self._settings = config
-        """`_robot` is the robot's configuration, and `_settings` that without the speed limit."""
+        """`_robot` is the robot's configuration. `_settings` is the one without the speed limit."""
         self._asked: tuple[Request, float] | None = None
         """The client's `set` of the speed in this step, and the speed that it asks for, m/s."""
         self._held: list[Request] = []
@@ -123,7 +123,7 @@ class SpeedLimiter:
     def lowers(self) -> bool:
         """Whether the limit lowers the speed.
 
-        After the end of a limit, this is True until the robot has applied the end.
+        After a limit has ended, this stays True until the robot has its higher setting again.
         """
         lowest = min(self._limit.speed, self._robot.limits.linear_speed)
         return lowest < self._settings.limits.linear_speed
@@ -205,10 +205,10 @@ class SpeedLimiter:
     def settle(
         self, robot: Config, answers: Iterable[Answer], events: list[Event]
     ) -> tuple[Answer, ...]:
-        """Store the robot's configuration after the step, and return its answers for the clients.
+        """Store the robot's configuration after the step, and return the answers to the clients.
 
-        If a client has set a speed above the limit, the answer and a new event in `events` say that
-        the speed applies after the end of the limit.
+        If a client has set a speed above the limit, its answer and a new event say that the speed
+        will apply when the limit ends.
 
         Args:
             robot: The configuration of the robot after the step.

@@ -21,17 +21,18 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Number of counts between two readings by which a wheel may exceed those at its highest speed.
+"""Number of counts that a wheel may make between two readings beyond those at its highest speed.
 
-This covers one count at each end of the interval, and play in the gears.
+It covers one count at each end of the interval, and play in the gears.
 """
 
 ROUNDING_MS = 2
-"""Largest error of the time between two readings, ms. The board sends its clock in whole ms."""
+"""Largest error of the time between two readings, ms. The board sends its clock in whole ms, so
+each of the two times has an error of up to 1 ms."""
 
 LATEST_MS = 1000.0
-"""Largest delay of a line that `Encoders` distinguishes, ms. A longer delay counts as this value,
-because the session restarts after such a gap anyway."""
+"""Limit of the measured delay of a line, ms. A longer delay counts as this value, because the
+session restarts after such a gap anyway."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
 """The reason why the difference between two readings of the encoders cannot be used.
@@ -55,9 +56,9 @@ class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start.
 
-        Between two readings, the board's clock can gain on the host's clock only if the first
-        reading arrived late, and by no more than its delay. If the gain exceeds that delay by more
-        than `quiet_ns`, the board has restarted.
+        If the first of two readings arrived late, the board's clock seems to gain on the host's
+        clock, but by no more than that delay. If it gains more than the delay plus `quiet_ns`, the
+        board has restarted.
 
         Args:
             counts: Encoder counts per turn, 0 if unknown.
@@ -72,10 +73,10 @@ class Encoders:
         """Measures by how much the delay of a reading exceeds the least delay, ms."""
 
     def forget(self) -> None:
-        """Forget the last reading.
+        """Forget the last reading, so that the next reading gives no angles.
 
-        The reading belongs to another session, or the caller has already used speed times time for
-        a later line.
+        This is needed in a new session, and after a line whose angles the caller has computed as
+        speed times time.
         """
         self._last = None
 

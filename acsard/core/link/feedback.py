@@ -9,7 +9,7 @@ from the best clock that is available:
 - the period of the board, if it reports by its own clock (`FreeRunningTimes`);
 - otherwise the times at which the host read the lines, spread evenly if one read has several lines.
 
-`ReplyStyle` detects whether the board answers or reports by its own clock. These times do not
+`ReplyStyle` detects whether the board answers or reports by its own clock. The sample times do not
 affect the state of the link, which depends only on arrival times.
 """
 
@@ -39,21 +39,21 @@ FULL_READ = 1024
 data."""
 
 DIFFERS = 1.5
-"""Least difference between the number of reply periods and the number of command lines since the
-last read of the port. `ReplyStyle` evaluates a read with at least this difference, because
-scheduling alone does not cause as much, and also the next `AFTER` reads."""
+"""`ReplyStyle` evaluates a read of the port if the number of reply periods since the last read
+differs by at least this much from the number of command lines. Scheduling alone does not cause such
+a difference. It also evaluates the next `AFTER` reads."""
 
 TELLING = 2.5
-"""`ReplyStyle` decides only if the sum of the reply periods and the sum of the command lines differ
-by at least this number."""
+"""`ReplyStyle` decides only if its two sums (of reply periods and of command lines) differ by at
+least this number."""
 
 LATEST = 100.0
 """Longest time between two reads of the port that `ReplyStyle` evaluates, in reply periods."""
 
 CLEAR = 0.5
-"""Margin that a decision of `ReplyStyle` needs, as a share of the difference between the sum of the
-reply periods and that of the command lines. The number of received lines must be nearer to one sum
-than to the other by this margin."""
+"""`ReplyStyle` decides only if the number of received lines is clearly nearer to one of its two
+sums (of reply periods and of command lines) than to the other. The two distances must differ by at
+least this share of the difference between the sums."""
 
 AFTER = 3
 """Number of further reads of the port that `ReplyStyle` evaluates after one that reaches
@@ -61,16 +61,16 @@ AFTER = 3
 
 NEAR = 0.35
 """`ReplyStyle` decides for a kind of board only if the expected and the received number of lines
-differ by at most this share of the received lines. It is not 0 because some lines get lost."""
+differ by at most this share of the received lines, or by 1.5 lines if that is more. It is not 0
+because some lines get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
     """A good line. The board read its encoders at `at`, `dt` s after the previous sample.
 
-    After a gap `dt` is 0, because the motion during the gap is unknown, and `gap` is the length of
-    the gap in s. `turned` is the angle of each wheel since the previous line according to the
-    encoder counts in the line, in rad and `WHEELS` order, or None if unknown. `turned` is valid
-    even after a gap.
+    After a gap of `gap` s, `dt` is 0, because the motion during the gap is unknown. `turned` is the
+    angle of each wheel since the previous line, rad, in `WHEELS` order. It comes from the encoder
+    counts in the lines, is valid even after a gap, and is None if unknown.
     """
 
     at: Instant
@@ -90,9 +90,9 @@ class Feedback(Struct, frozen=True, gc=False):
     heard_ns: int = 0
     """Monotonic time at which the host had received the whole line, ns."""
     counted: Motors | None = None
-    """Angle that each wheel turned in the last `dt - bridged` seconds, rad, in `WHEELS` order. None
-    unless the counts per turn are configured and the speeds show whole counts
-    (`whole_counts.py`)."""
+    """Angle that each wheel turned in the last `dt - bridged` seconds, rad, in `WHEELS` order, as
+    `whole_counts.py` recovers it from the speeds. None if the counts per turn are not configured,
+    or if the firmware does not report whole counts."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Quantization step of each wheel's reported speed, rad/s, `math.inf` if unknown."""
     count: float = 0.0
@@ -188,7 +188,8 @@ class Timeline:
         self._spoilt = False
         """Whether a bad or ignored line came since the last good line."""
         self._later = 0.0
-        """Mean time by which `PromptedTimes` dates a line later than `FreeRunningTimes`, ns."""
+        """Mean time by which a line is later according to `PromptedTimes` than according to
+        `FreeRunningTimes`, ns."""
         self.leaps = 0
         """Number of lines with impossible encoder counts. For these, speed times time is used."""
         self.restarted = False
@@ -236,7 +237,7 @@ class Timeline:
     def spoilt(self) -> None:
         """Skip the next line of the read, because it is bad.
 
-        If the board answers lines, the bad line is still the reply to one of them.
+        If the board answers lines, also skip the command line that the bad line answers.
         """
         self._rest -= 1
         self._spoilt = True
@@ -296,7 +297,8 @@ class Timeline:
     def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
         """Return the time of the next line according to the best available clock.
 
-        `asked_ns` is as in `place`. `came_ns` is the monotonic time at which the line was complete.
+        `asked_ns` is the monotonic time at which the command line that it answers was written, None
+        if unknown. `came_ns` is the monotonic time at which the line was complete.
         """
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
@@ -322,9 +324,9 @@ class Timeline:
     def _since_last(self, placed: Placed) -> tuple[float, float]:
         """Return the time since the last good line, and the part of it whose lines were lost, s.
 
-        If two different clocks dated the lines, the time is the difference of their `due_ns`,
-        corrected by the mean offset of the clocks. Without this correction, the errors of many
-        changes between the clocks would add up.
+        If the times of the two lines come from different clocks, the result is the difference of
+        the two `due_ns`, corrected by the mean offset between the clocks. Without this correction,
+        the errors of many changes from one clock to the other would add up.
         """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
@@ -350,7 +352,7 @@ class Timeline:
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return the mean time by which `clock` dates a line later than `FreeRunningTimes`, ns."""
+        """Return by how much `clock` gives later times than `FreeRunningTimes` on average, ns."""
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0

@@ -22,8 +22,8 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
-"""Share of the silence after which a link is stale (`Link.quiet_ns`). If the time between two
-control steps is longer than this share, this computer caused the silence and not the board."""
+"""A link is stale after a silence of `Link.quiet_ns`. If the time between two control steps reaches
+this share of it, this computer caused the silence and not the board."""
 
 BUSY = (
     "`top` shows which other program uses the processor; if acsard runs as the service, it has "

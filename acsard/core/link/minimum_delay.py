@@ -30,8 +30,8 @@ class MinimumDelay:
     def add(self, ours: float, theirs: float) -> float:
         """Process an event, and return its delay in excess of the minimum so far.
 
-        If the result is negative, this event is the new minimum. The result includes the drift of
-        the clocks since the last event.
+        If the result is negative, this event is the new minimum. Unlike the result of `measure`, it
+        is not reduced by the allowed drift.
 
         Args:
             ours: time since the last event by this computer's clock.

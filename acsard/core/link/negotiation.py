@@ -96,8 +96,8 @@ MENDS: dict[Trouble, str] = {
 }
 
 TRIES = 3
-"""Number of questions of one kind, with or without request letters, that the daemon asks in vain
-before it concludes that the board does not know this kind."""
+"""Number of unanswered questions of one kind after which the daemon concludes that the board does
+not know this kind. One kind asks for a sample, and the other has no request letters."""
 
 WINDOW = 64
 """Largest number of lines that wait for an answer. It is far below the number of sequence numbers,
@@ -123,17 +123,17 @@ REPORTS = 20
 0.2 s."""
 
 CHANGE = 2.0
-"""Least sum of the speed changes in a run of reports that counts as an echo, rad/s. The change from
-one report to the next is the largest of the four wheels. With coarse encoders, a smaller sum may be
-a coincidence."""
+"""A run of reports counts as an echo only if its speed changes add up to this, rad/s. The change
+from one report to the next is that of the wheel with the largest change. With coarse encoders, a
+smaller sum may be a coincidence."""
 
 LINES = 8
 """Number of the newest sent lines with which `EchoDetector` compares a report. At 100 Hz, this
 detects an echo that comes back within 70 ms."""
 
 _Run = tuple[int, float, WheelSpeeds]
-"""A run of reports that repeat sent lines: their number, the sum of their speed changes in rad/s,
-and the last speeds."""
+"""A run of reports that repeat sent lines: the number of reports, the sum of their speed changes in
+rad/s, and the speeds in the last report."""
 
 
 class Throttle:

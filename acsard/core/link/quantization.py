@@ -2,8 +2,8 @@
 
 If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds.
 Otherwise the pose uses speed times time, because the speeds do not show how many counts a turn has.
-Only firmware that divides its counts by a fixed period would show it. But the time between the
-lines of such firmware is known, so its speed times time has only the error of two decimals.
+They would show it only with firmware that divides its counts by a fixed period. Such firmware does
+not need it: the time between its lines is known, so only the rounding of the speeds causes errors.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Coarseness:
 
 
 class CountRecovery:
-    """Adds to each good line of one port the counted angles and the quantization of the speeds."""
+    """Adds the counted angles and the quantization steps to each good line of one port."""
 
     def __init__(self, counts: int = 0) -> None:
         """Start. `counts` is the configured number of counts per turn, 0 if unknown."""
@@ -135,8 +135,8 @@ class CountRecovery:
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)
         self._reported, self._steps = NOTHING, NOTHING
-        """Learned quantization step of each wheel, first without and then with the bound `ALIKE`,
-        rad/s."""
+        """`_reported` is the learned quantization step of each wheel, rad/s. `_steps` is the same,
+        limited by `ALIKE`."""
 
     @property
     def counts(self) -> tuple[int, ...]:

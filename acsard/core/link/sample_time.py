@@ -22,12 +22,11 @@ from msgspec import Struct
 from acsard.core.values import NS_PER_S
 
 Read = tuple[int, int]
-"""The time at which the last line of a read was complete, ns, and the number of lines in the
-read."""
+"""A read of the port: the time at which its last line was complete, ns, and its number of lines."""
 
 BRIDGED_S = 1.0
-"""Longest time without lines that is filled from the lines before and after it, s. After a longer
-time the board may have been reset."""
+"""Longest time without lines that the odometry fills from the lines before and after it, s. After a
+longer time the board may have been reset."""
 
 
 class Placed(Struct, frozen=True, gc=False):
@@ -46,8 +45,8 @@ class Placed(Struct, frozen=True, gc=False):
     bridged: float = 0.0
     """The part of `dt` whose lines were lost, s."""
     early: bool = False
-    """Whether the line came before the clock expected it. Then `due_ns` is the time of its arrival,
-    and the time to the next line is the difference of their `due_ns` and not the next `dt`."""
+    """Whether the line came before the clock expected it. Then `due_ns` is the time of its arrival.
+    The `dt` of the next line is not valid then: subtract the two `due_ns` instead."""
 
 
 # A free-running board. A slot is one period of its clock, in which the board sends one line.
@@ -57,16 +56,16 @@ WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
 one window, `FreeRunningTimes` finds or corrects the clock of the board."""
 
 LOOP_GAIN = 0.2
-"""Gain g with which `FreeRunningTimes` corrects its clock after the first windows. The reads of one
-window show the error of the clock to a few hundredths of a period."""
+"""Final value of the gain g with which `FreeRunningTimes` corrects its clock. The gain starts at 1
+and falls during the first windows. The reads of one window show the error of the clock to a few
+hundredths of a period."""
 
 DRIFT = 0.01
 """Largest relative error of a board's clock. A ceramic resonator reaches half of it."""
 
 EXACT = 0.001
 """A measured period is rounded to a whole number of ms if it differs from it by less than this
-share. The share covers the error of a quartz and of the measurement. A period within `DRIFT` of a
-configured one counts as the configured one."""
+share. The share covers the error of a quartz and of the measurement."""
 
 LONE = 0.7
 """If at least this share of the reads of the port contains a single line, lines are treated as read
@@ -80,13 +79,13 @@ lines that an adapter batches. `HELD_NS` limits both."""
 HELD_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
 16 ms. A line that is later than this probably answers a command that was sent between two periods.
-Then `FreeRunningTimes` finds no clock, even if the lines of a slow board really vary by more."""
+Then `FreeRunningTimes` finds no clock. This also applies to a slow board whose lines vary more."""
 
 EARLY_ALONE, ALONE = 0.55, 12
-"""A clock is refused if all reads except a few come more than `EARLY_ALONE` periods after their
-slots. A few means one, and one more for each `ALONE` reads. The lines of these few reads answer
-commands that were sent between two periods, and so the clock would be a period early for all other
-lines."""
+"""`FreeRunningTimes` refuses a clock if nearly all reads come more than `EARLY_ALONE` periods after
+their slots. The exceptions are the earliest read, and one more for each `ALONE` reads. They
+probably answer commands that were sent between two periods, so a clock that fits them is too early
+for all other lines."""
 
 JUMP = 1.4
 """If two reads with a single line each are less than this number of periods apart, no line is
@@ -119,9 +118,9 @@ class FreeRunningTimes:
 
     - Lines are read one by one. Then x is about 0, and each line shows at once how many lines are
       missing before it.
-    - An adapter batches lines. Then x lies between 0 and 1. A read shows a single missing line only
-      if it came no later after the previous read than usual. Any other read shows a missing line
-      only if x exceeds the greatest possible lateness.
+    - An adapter batches lines. Then x lies between 0 and 1. If no more than the usual time has
+      passed since the previous read, a read shows even a single missing line. Any other read shows
+      a missing line only if x exceeds the greatest possible lateness.
 
     The missing slots are spread over the lines of the read. If a line comes before its slot, too
     many slots were counted as missing, so one is taken back. Twice a second the least x corrects c
@@ -139,7 +138,7 @@ class FreeRunningTimes:
         self.usual = 0.0
         """The last measured period T of the board, ns. 0 until a clock has been found."""
         self._stretch = 1.0
-        """Slots per line of the last read: 1, and more if lines are missing before it."""
+        """Slots per line of the last read: 1, or more if lines are missing before it."""
         self._before = 0
         self._first, self._slot = 0.0, 0
         """The time c of slot 0, ns, and the number k of the slot of the last line."""
@@ -311,9 +310,9 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a window: reset its least lateness x and its numbers of reads and of slots.
+        """Start a window: reset its least lateness `_least`, reads `_count` and slots `_passed`.
 
-        `_lossy` is the number of reads in the window before which lines are missing.
+        `_lossy` counts the reads in the window before which lines are missing.
         """
         self._window_ns: int = at_ns
         self._least = math.inf
@@ -377,9 +376,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return the latest time of slot 0, ns, with which no read comes before its slot.
+    """Return the time of slot 0, ns: the latest one for which no read comes before its slot.
 
-    Also return the lateness of each read with this time, in slots. `period` is in ns.
+    Also return the lateness of each read that follows from this time, in slots. `period` is in ns.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -392,7 +391,8 @@ MEMORY = 64
 """Largest number of command lines that are remembered because their replies may still come."""
 
 FAST = 0.05
-"""Gain per reply or read of the filters for the usual reply delay, its spread and the batches."""
+"""Gain of the filters for the usual reply delay, its spread, the time between command lines and the
+batches."""
 
 SLOW = 0.0125
 """Gain per read of the filter that decides whether the board itself varies the reply delay."""
@@ -403,8 +403,9 @@ outdated least delay is forgotten after about 500 replies."""
 
 CREEP, CREEPS_FOR = 0.05, 3
 """The least delay of the last replies rises by the share `CREEP` of the time since the last read,
-so that older replies are forgotten. This time counts as at least one and at most `CREEPS_FOR` times
-the usual time between two command lines, because a board may stall and then answer all lines."""
+so that older replies are forgotten. This time counts as no less than the usual time between two
+command lines and no more than `CREEPS_FOR` times it, because a board may stall and then answer all
+lines."""
 
 LATE = 1.25
 """If the least delay of the last replies exceeds the long-term least delay by more than this,
@@ -412,8 +413,8 @@ replies were lost. The unit is the usual time between two command lines. A limit
 because the delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""If two command lines were written close together, a late reply proves a lost one only if at least
-this share of the replies was lost before."""
+"""Share of lost replies. If two command lines were written close together, a late reply proves that
+a reply was lost only if at least this share was lost before."""
 
 JITTER_NS = 350_000
 """Mean deviation of the reply delay that USB and the scheduler cause, ns."""
@@ -428,7 +429,7 @@ forgotten. A link is batched if an adapter holds replies back, so that one read 
 
 LOSING = 0.005
 """Gain of the filter for the share of lost replies. It is small, because a filter over 20 reads
-would show 3 % after only two lost replies."""
+would reach `LOSSY` after only two lost replies."""
 
 LOSSY = 0.03
 """Share of lost replies above which a batched link counts as lossy. Then any command line may lack
@@ -439,8 +440,8 @@ SEVERAL = 0.15
 Host stalls alone cause fewer such reads."""
 
 THINKS = 0.6
-"""If the reply delay varies in more than this filtered share of the reads, the board itself varies
-it. An adapter whose packets fill line by line varies it too, but only for a quarter of a second."""
+"""If the delay varies in more than this filtered share of the reads, the board itself varies it. An
+adapter whose packets fill line by line varies the delay for only a quarter of a second."""
 
 BATCH_NS = 2_000_000
 """Mean deviation of the reply delay above which an adapter holds the lines back, ns. No board
@@ -489,15 +490,16 @@ class PromptedTimes:
         self._soon = 0.0
         """Least delay of the last replies, ns."""
         self._sent: int | None = None
+        """Time at which the last command line was written, ns."""
         self._apart = self._missing = 0.0
-        """`_sent` is the time at which the last command line was written, and `_apart` the usual
-        time between two of them, both ns. `_missing` is the share of lost replies."""
+        """`_apart` is the usual time between two command lines, ns. `_missing` is the share of lost
+        replies."""
         self._last: int | None = None
         """Time at which the last answered command line was written, ns. If its reply came later or
         sooner than usual because of the board, the time is shifted by the difference."""
         self._passed = self._line = 0
-        """`_passed` is the time at which the last command line that was answered or given up was
-        written. `_line` is that of the last line that was answered. Both are ns."""
+        """Times at which two command lines were written, ns. `_line` belongs to the last line that
+        was answered, and `_passed` to the last line that was answered or given up."""
         self._lost = False
         """Whether the last reply that was read alone showed that an earlier reply was lost."""
         self._given: list[int] = []
@@ -630,7 +632,7 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Give up the command lines whose replies were lost, for a batch of replies.
+        """Give up the command lines whose replies were lost. This is for a read of a batched link.
 
         The last reply of a batch shows the loss: it is too late for the line that it would answer.
         If many replies are lost, the first reply of the batch decides instead, because the board
@@ -672,10 +674,10 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Give up command lines whose replies were lost, when a reply was read alone.
+        """Return whether the present reply answers the command line that was given up last.
 
-        Return True if the present reply answers the line that was given up last. `delay` is the
-        usual delay, ns.
+        Before that, give up the command lines whose replies were lost. The reply must have been
+        read alone. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

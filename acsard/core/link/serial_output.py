@@ -47,7 +47,10 @@ class SerialOutput:
     """The output of a serial port from its opening to its closing. It has no queue."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
-        """Start. `stop` is the plain stop line. Any other line is dropped after `period_ns` ns."""
+        """Start. `stop` is the plain stop line.
+
+        Any other line is dropped if it is older than `period_ns` ns when it is to be written.
+        """
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
         """The bytes with which every stop line begins, plain or checked."""

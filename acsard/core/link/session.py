@@ -71,7 +71,7 @@ class McuSession:
         self.status = BoardStatus()
         """The last received value of each field of the status lines."""
         self.status_ns: int | None = None
-        """Monotonic time of the last status line, None before the first one."""
+        """Monotonic time of the last status line, ns; None before the first one."""
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
@@ -125,7 +125,7 @@ class McuSession:
         Args:
             now: Both clocks at this step.
             port_open: Whether the port is open.
-            opened: The number of openings of the port. Another number starts a new session.
+            opened: The number of openings of the port. If it has changed, a new session starts.
             received: The bytes since the last update.
             unsent: True if the port did not write the last line.
             late_ns: The time from making the last line to writing it, ns.
@@ -209,9 +209,9 @@ class McuSession:
     # sessions
 
     def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
-        """Record whether the port wrote the last line, `late_ns` after it was made.
+        """Record whether the port wrote the last line. If not, the next one may be sent at once.
 
-        If the port did not write the line, the next one need not wait for the throttle.
+        `late_ns` is the time from making the line to writing it, ns.
         """
         made = self._made
         if made is None:

@@ -37,8 +37,8 @@ ROUNDING = 0.0052
 """Largest rounding error of a speed with two decimals, rad/s."""
 
 MOST_TRIES = 16
-"""Largest number of counts that are tried for the fastest wheel of a line. It bounds the time of a
-control step."""
+"""Largest number of different values of n, the counts of the fastest wheel, that are tried for a
+line. It bounds the time of a control step."""
 
 BY_CHANCE = 0.05
 """Largest accepted probability that random speeds look like whole counts.
@@ -104,14 +104,14 @@ class WholeCounts:
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Filtered share of the lines whose counts include those of the missing line before them.
-        Lines that do not show whether they do are ignored."""
+        """Filtered share of the lines after a missing line whose counts include those of the
+        missing line. A line is ignored if its speeds do not show this."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
         is the filtered error of the host's time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Reset the carried time, because the last line does not show the firmware's time."""
+        """Reset the carried time: the last line does not show for how long the firmware counted."""
         self._apart, self._run = 0.0, 0
 
     @property

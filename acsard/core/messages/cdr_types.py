@@ -45,7 +45,7 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 def builder(info: inspect.StructType) -> Build:
     """Return a function that builds this struct from the values of its fields.
 
-    The values of the fields of nested structs stand in the place of the nested struct.
+    In place of a nested struct, the iterator gives the values of its fields one by one.
     """
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]

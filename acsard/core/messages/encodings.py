@@ -113,7 +113,10 @@ class Decoder(Generic[T]):
         return self.decode_as(detect(encoding, payload), payload)
 
     def decode_as(self, form: Format, payload: bytes) -> T:
-        """Return the message in a payload of a known encoding. Raises `DecodeError`."""
+        """Return the message in a payload with the encoding `form`.
+
+        Raises `DecodeError` if the payload is not valid.
+        """
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S
 
 EXPIRY_DAYS = 30
-"""Number of remaining days below which the end of a certificate is a warning."""
+"""If a certificate expires in fewer days than this, its expiry is a warning."""
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -18,9 +18,9 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     Only the description of level 0 begins with "valid".
 
     Args:
-        ends: the end of each certificate that TLS needs, wall-clock ns since 1970, by the name of
-            its owner. The robot's own certificate has the name "". The mapping is empty if no end
-            is known.
+        ends: the expiry time of each certificate that TLS needs, wall-clock ns since 1970, by the
+            name of its owner. The robot's own certificate has the name "". The mapping is empty if
+            no expiry time is known.
         now_ns: the present time, wall-clock ns since 1970.
     """
     if not ends:
@@ -40,9 +40,10 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 
 
 def first(ends: Mapping[str, int]) -> tuple[str, int]:
-    """Return the owner and the end (wall-clock ns since 1970) of the certificate that ends first.
+    """Return the owner and the expiry time of the certificate that expires first.
 
-    The TLS gateway reports the first end of all certificates under the name "". If a certificate
-    with an owner's name has the same end, return that name.
+    The time is wall-clock ns since 1970. The TLS gateway reports the earliest expiry time of all
+    certificates, stored under the name "". If a certificate with an owner's name has the same time,
+    return that name.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

@@ -245,7 +245,7 @@ TOPICS: tuple[Topic, ...] = (
 FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
-"""The rows of keys that clients can follow: the published keys and the key of the gyro."""
+"""The rows of keys that clients may subscribe to and query: published keys and the gyro's key."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
 """The rows of keys on which the daemon publishes. A query of such a key returns the last
@@ -253,7 +253,7 @@ message."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the table of keys whose keys exist with this configuration."""
+    """Return the rows of the table for the keys that exist with this configuration."""
     simulated, gyro, urdf = config.mcu.simulated, config.odometry.gyro, bool(config.ros.urdf)
     return tuple(
         topic

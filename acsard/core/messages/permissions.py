@@ -23,7 +23,7 @@ MAY: dict[Role, str] = {
     "operator": "this role may drive by the sources in commands.sources, stop and clear",
     "maintainer": "this role has every permission",
 }
-"""The permissions of each role in words, for the error message of a tool that lacks one."""
+"""The permissions of each role in words, for the error message of a tool with too low a role."""
 
 
 def has(role: str, least: Role) -> bool:

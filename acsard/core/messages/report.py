@@ -58,7 +58,7 @@ from acsard.core.values import Twist as BodyTwist
 Look = Callable[[], Snapshot]
 
 BATTERY_HZ = 1.0
-"""Rate of the key `battery`."""
+"""Rate at which `battery` is published, Hz."""
 
 UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
 """Values of `Battery.power_supply_status`."""
@@ -88,10 +88,10 @@ class Report:
         self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
     ) -> None:
         self.certificate_ends = dict(certificate_ends or {})
-        """End of each TLS certificate, wall-clock ns since 1970, by the name of its owner.
+        """Expiry time of each TLS certificate, wall-clock ns since 1970, by the name of its owner.
 
         The robot's own certificate has the name "". If the daemon may not read that certificate,
-        the TLS gateway reports its end.
+        the TLS gateway reports the time.
         """
         self.settings_differ = ""
         """Settings in force that differ from the configuration file, in words; "" if none does."""

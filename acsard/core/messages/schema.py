@@ -323,7 +323,7 @@ class RobotState(Message, frozen=True):
     0 means that the counts are not configured, or that the reported speeds are not whole counts.
     """
     wheel_fault: str = ""
-    """The wheel that the pose leaves out, or the side that slips, in words; else empty."""
+    """The wheel that the odometry leaves out, or the side that slips, in words; else empty."""
     sender: str = ""
     """Public name of the sender of `source` that drives the robot; empty while none drives."""
     effective_track: str = ""
@@ -390,7 +390,8 @@ class GatewayState(Message, frozen=True):
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
     """Number of checks that found all connections in use. There are four checks a second."""
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
-    """End of the certificate, ns since 1970; 0 if the library to read it is missing."""
+    """Time at which the first of the TLS certificates expires, wall-clock ns since 1970; 0 if the
+    library to read certificates is missing."""
 
 
 class String(Message, frozen=True):
@@ -475,7 +476,7 @@ class Release(Message, frozen=True):
     """Payload of the services `clear` and `activate`."""
 
     latch: LatchNumber | None = None
-    """Number of the latch to release, as in `RobotState.latch`; null names no latch."""
+    """Number of the latch to release, as in `RobotState.latch`; null for any number."""
 
 
 class Settings(Message, frozen=True):
@@ -483,7 +484,7 @@ class Settings(Message, frozen=True):
 
     settings: Annotated[dict[str, Plain], FEW]
     keep: bool = False
-    """Whether the daemon also writes them into its configuration file."""
+    """Whether the daemon also writes the new values into its configuration file."""
 
 
 class Info(Message, frozen=True):
@@ -569,5 +570,5 @@ MESSAGES: dict[str, type[Message]] = {
         WhoAmI,
     )
 }
-"""The types that are whole messages and not only parts of one, by name. A query of the key
-`schema/<Type>` returns the schema of each."""
+"""The types of complete messages, by name, without the types that are only parts of a message. A
+query of the key `schema/<Type>` returns the schema of each."""

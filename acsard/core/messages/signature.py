@@ -24,7 +24,7 @@ MAX_SENDER = 64
 """Largest number of characters in a sender id."""
 
 MAX_NAME = 40
-"""Largest number of characters that a public name takes from the name in a sender id."""
+"""Largest number of characters that a public name takes from NAME in a sender id `NAME/SECRET`."""
 
 DIGITS = 16
 """Number of hexadecimal digits of the hash in a public name: 64 bits.
@@ -35,7 +35,7 @@ With so many bits, nobody can find another sender id with the same hash.
 MARKS = " @._-:/+"
 """Characters besides letters and digits that a public name may contain. Others become "?".
 
-So a name cannot contain the characters that separate it from other words in the daemon's texts.
+Brackets and commas are not among them, because they surround and separate names in the log.
 """
 
 
@@ -51,7 +51,7 @@ class Signature(Struct, frozen=True, omit_defaults=True):
     steady: bool = False
     """True if the clock of `stamp` is never adjusted while the sender runs.
 
-    If such a stamp is old, the command itself is late.
+    An old stamp then proves that the command itself is late.
     """
 
     def pack(self) -> bytes:
@@ -83,7 +83,8 @@ def public_name(sender: str, certificate: str = "") -> str:
     name, the public name is the digits alone. Without a certificate there are no brackets.
 
     Args:
-        sender: the sender id, or the id of a Zenoh session, which signs the timestamps of samples.
+        sender: the sender id or, without one, the id of the Zenoh session that set the sample's
+            timestamp.
         certificate: the common name of the certificate with which the sender commands over TLS, or
             "".
     """

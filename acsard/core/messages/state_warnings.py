@@ -1,8 +1,8 @@
 """Lists the warnings about a robot, such as a low battery.
 
 A robot in the mode `ready` may have warnings, too. If nobody reacts to a warning, its cause may end
-the robot's work hours or weeks later. `acsard fleet`, `top` and `echo --short`, the page and
-`/metrics` show the warnings in the same words. Programs find the same facts in `state`.
+the robot's work hours or weeks later. The same words appear in `acsard fleet`, `acsard top`,
+`acsard echo --short`, `/metrics` and on the web page. Programs find the same facts in `state`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class StateWarning(Struct, frozen=True):
 
     what: What
     brief: str
-    """A few words, which a column of a table can hold."""
+    """The warning in a few words, short enough for a column of a table."""
     text: str = ""
     """The details that the robot reports; "" if `brief` already says everything."""
 

@@ -8,8 +8,8 @@ live while one of its senders is.
   of one source.
 - A live source that is not armed yet (`neutral.py`) keeps its priority, and the robot stands still.
   Otherwise a source of lower priority would drive the robot in its place.
-- A source that sends zeros holds the robot still for any length of time. An operator who wants that
-  and a controller that has failed look the same. `state` and the log report such a source.
+- A source that sends zeros holds the robot still for any length of time. The arbiter cannot tell
+  whether an operator wants that or a controller has failed, so `state` and the log report it.
 
 `Objection` lists a short name for each reason to refuse a command, and `arbiter_text.py` contains
 the sentences for people. `values.Command` explains source, sender and clock.
@@ -35,8 +35,8 @@ Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unp
 """The reason to refuse a command, or "" if the arbiter accepts it."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""Durations, s, that `state` reports: the time for which a sender has sent only zeros or has not
-been armed, rounded down to one of these values."""
+"""`state` reports how long a sender has sent only zeros, or has sent without being armed. The time
+is rounded down to one of these durations, s."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -99,17 +99,16 @@ class _Source:
         """Return the rank of a sender. `add` replaces the sender with the lowest rank.
 
         A sender that is armed and live ranks highest. A sender that is only armed comes next, and
-        then all others. Among equals, the sender with the later last message ranks higher.
+        then all others. Among equals, the sender that sent most recently ranks highest.
         """
         sender = self.senders[name]
         armed = sender.armed(now_ns)
         return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """Disarm the sender `name` if it was armed by a zero whose stamp was never proven right.
+        """Disarm the sender `name` if only zeros whose stamps were never proven right armed it.
 
-        If `was_set` is true, the sender's clock was set. The sender must then send a new zero in
-        any case.
+        If `was_set` is true, the sender's clock seems to have been set, so disarm it in any case.
         """
         sender = self.senders.get(name)
         if sender is None:
@@ -153,7 +152,7 @@ class _Source:
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why the source waits although it sends: the stamps of its commands do not count.
+        """Return why the source waits if the stamps of its recent commands were not accepted.
 
         Return None if no recent command was refused because of its stamp.
         """
@@ -230,9 +229,8 @@ class Arbiter:
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
         """Record a message that was lost or could not be used, but that may have been a speed.
 
-        A zero before the message, whose `commands.neutral_pause` is not over yet, then no longer
-        arms its sender. `sender` is "" if it is unknown. The message may then come from any sender
-        of `source`.
+        If an earlier zero is still waiting for the end of `commands.neutral_pause`, that zero then
+        cannot arm its sender. If `sender` is "", the message may come from any sender of `source`.
         """
         known = self._sources.get(source)
         if known is None:
@@ -282,10 +280,10 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return which sender's speeds have no effect because the source `holder` sends zeros.
+        """Return words for a sender whose speeds have no effect because `holder` sends zeros.
 
-        The result is the name of another source, or words for another sender of `holder`. It is ""
-        if no other sender sends speeds.
+        For a sender of another source, the result is the name of that source. It is "" if no other
+        sender sends speeds.
         """
         for source in self._ranking:
             senders = (each for each in source.live(now_ns) if each is not self._followed)
@@ -295,7 +293,7 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the rises of command delays that count as clocks that were set, ns.
+        """Total rise of command delays, ns, that the arbiter took for adjustments of clocks.
 
         It contains only rises without a visible adjustment of the sender's clock (`freshness.py`).
         """

@@ -24,8 +24,8 @@ REFUSED = {
 
 MAX_SENDER = 124
 """Largest number of characters of a sender's name that an event shows. A public name has up to 57
-characters, or 67 with a certificate. A sender without an attachment is named after its key, which
-the sender may choose."""
+characters, and a certificate adds up to 67. If a sender is named after its key, the name may be
+longer, because the sender chooses the key."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` of a speed never sends a zero; "After a clear" in deploy/ros2/README.md '
@@ -89,7 +89,8 @@ def missed(periods: int) -> Event:
 def refused(refusal: Refusal) -> Event:
     """Return the event for a refused command.
 
-    A command of a new sender, whose delays are not proved steady yet, has an event of its own.
+    The event is `new_sender` if the only reason is that a new sender's delays are not proven
+    constant yet. It is `command_refused` for every other reason.
     """
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":

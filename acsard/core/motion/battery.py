@@ -23,19 +23,19 @@ TIME_CONSTANT_S = 10.0
 A battery takes minutes from one level to the next, so the robot reacts soon enough."""
 
 SETTLE_S = 3.0
-"""Time with reports after which the mean decides the level, s. After a silence, this time begins
-again. A motor start within this time lowers the mean by up to a tenth of the voltage drop. A gap
-between two reports counts as at most `LONGEST_NS`."""
+"""The mean decides the level when the times between the reports since the last silence add up to
+this, s. Each of these times counts as at most `LONGEST_NS`. A motor start within this time lowers
+the mean by up to a tenth of the voltage drop."""
 
 SILENT_S = 5.0
 """Age at which the daemon drops a value, s. If a board reports its battery once a second, four
 reports in a row may be lost before that."""
 
 LONGEST_NS = 300_000_000
-"""The mean weights each report by the time since the report before, but at most by this time, ns:
-the duration of a motor start. Otherwise one report from the moment of a motor start would weigh too
-much after a gap, or if reports are rare. If a board reports once a second, its mean is therefore
-about three times as slow."""
+"""Largest weight of a report in the mean, ns. The weight is the time since the previous report, but
+at most this duration of a motor start. Otherwise a report during a motor start would weigh too much
+if it follows a gap or if reports are rare. The mean of a board that reports once a second is
+therefore about three times as slow."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The battery levels without "unknown", from the best to the worst."""
@@ -93,8 +93,8 @@ class Battery:
         """The level in the last event, None before the first one."""
         self._mean: float | None = None
         self._since_ns = self._mean_ns = 0
-        """Monotonic times, ns, since the last silence: of the first report, and of the last report
-        in the mean."""
+        """Monotonic times of the first report since the last silence, and of the last report in the
+        mean, ns."""
         self._stood_ns = 0
         """Sum of the weights of the reports in the mean since the last silence, ns."""
 
@@ -165,7 +165,8 @@ class Battery:
     def _level(self, now_ns: int) -> BatteryLevel | None:
         """Update the level from the mean and return it, or None during the first `SETTLE_S`.
 
-        "unknown" means that the board does not report the quantity of the thresholds.
+        The level is "unknown" if the board does not report the quantity, voltage or charge, for
+        which thresholds are configured.
         """
         measure, values = self._config.measure, self._values
         if measure not in values:

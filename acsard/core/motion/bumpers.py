@@ -81,8 +81,8 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether the bumpers latch a stop: for a press, unless `safety.bumper` is "away", and for
-        silence of the board always."""
+        """Whether bumpers that count as pressed latch a stop. Those of a silent board always do. A
+        reported press does unless `safety.bumper` is "away"."""
         return not self._away or self.state == "silent"
 
     @property
@@ -114,10 +114,10 @@ class Bumpers(BoardInput):
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return whether each bumper is pressed according to a status line.
 
-        Return None if the line reports no bumpers, or another number of them than configured (or,
-        without configured places, than before). Such a line may lack a bumper that is pressed, so
-        it must not release any bumper. If no places are configured and a bumper is pressed, any
-        number is accepted.
+        Return None if the line reports no bumpers or an unexpected number of them. Such a line may
+        lack a bumper that is pressed, so it must not release any. The expected number is that of
+        the configured places. Without configured places, it is the number in the previous report,
+        and a line that reports a press is accepted with any number.
         """
         bumpers = status.bumpers
         if bumpers is None:

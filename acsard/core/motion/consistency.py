@@ -61,8 +61,8 @@ class ConsistencyChecks:
         """Turn of the robot during the last feedback line according to the gyro. None means that
         the odometry must use the turn of the wheels."""
         self.on_trial = False
-        """Whether the turn of the last feedback line came from the wheels only because the gyro is
-        not proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
+        """Whether the wheels provided the turn of the last feedback line because the gyro is not
+        proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
         self.slips = False
         """Whether the wheels slip: they contradict each other or the gyro."""
         self.events: list[Event] = []
@@ -106,10 +106,10 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Record that the odometry recomputed `on_trial` lines, whose turn changed by `turn` rad.
+        """Record that recomputing the `on_trial` lines changed their total turn by `turn` rad.
 
-        Return `turn` if the gyro is proven by now and so has corrected the pose already, otherwise
-        0.
+        Return the angle that the caller must subtract from the heading, rad. It is `turn` if the
+        gyro is proven by now, because the gyro has then already corrected the heading, otherwise 0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 

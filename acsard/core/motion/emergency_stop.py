@@ -64,8 +64,7 @@ MISSING = (
 
 DRIVER_FAULT = "the board reports a fault of a motor driver"
 DRIVER_MEND = "repair the driver, or switch the robot off and on"
-"""`DRIVER_FAULT` is the reason of the fault that the board reports with `driver=fault`, and
-`DRIVER_MEND` is what the operator must do before the call `clear`."""
+"""What the operator must do before the call `clear` if the board reports `driver=fault`."""
 
 
 class BoardInput(ABC):

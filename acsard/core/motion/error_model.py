@@ -121,7 +121,7 @@ class ErrorModel:
         self.noise = Noise(odometry, self.track)
 
     def turn_by(self, learned: Track | None) -> None:
-        """Use this effective track from now on; None if `[odometry] learned_track` is off."""
+        """Use this effective track from now on; if it is None, use the configured one."""
         self.track = self._kinematics.track * (learned or CONFIGURED).share
         """Effective track in use, m."""
         self.columns = columns(self._declared, self._kinematics, learned)

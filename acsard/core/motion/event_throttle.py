@@ -18,8 +18,8 @@ BURST = 5
 presses buttons."""
 
 MOST = 8
-"""Largest number of kinds of events, and of clients' names, that one log line lists. A client may
-use any number of names."""
+"""Largest number of kinds, and of clients' names, that one log line lists. It combines the rest as
+"others", because a client may use any number of names."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -56,8 +56,8 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._free_ns: dict[EventName, int] = {}
-        """For each event name, the monotonic time, ns, at which the lines so far would be over if
-        they were written one per second."""
+        """A monotonic time, ns, for each event name. Each written line moves it on by one second,
+        from the present time if it lies in the past. `_may` compares it with the present time."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
         """Add new events, and return the events to log now.
@@ -74,8 +74,8 @@ class EventThrottle:
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line of this name may be written now, and if so, count it as written.
 
-        `news` is true if any of the waiting events is marked as news. Only then may up to `BURST`
-        lines be written at once.
+        `news` is true if at least one waiting event does not only repeat an earlier one
+        (`Event.news`). Only then may up to `BURST` lines be written at once.
         """
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:

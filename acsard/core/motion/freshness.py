@@ -1,10 +1,10 @@
 """Decides whether a stamped command is fresh, although the sender's clock is not synchronized.
 
-The stamp is the time of sending by the sender's clock. The arrival by our clock minus the stamp is
-the delay plus an unknown offset, which is here called the delay too. The offset cancels out if each
-delay is compared with the minimum of all delays. A command is stale if its delay exceeds the
-minimum by more than the timeout of its source, or if its stamp is earlier than that of an accepted
-command. The clock of a sender is in one of two states:
+The stamp is the time of sending by the sender's clock. The time of arrival by our clock minus the
+stamp is the true delay plus the unknown offset of the two clocks. This module calls that sum the
+delay. The offset cancels out in a comparison with the minimum of all delays. A command is stale if
+its delay exceeds the minimum by more than the timeout of its source, or if its stamp is earlier
+than that of an accepted command. The clock of a sender is in one of two states:
 
     new      the minimum is not known: a test of several commands, the proof, must first show that
              the delays no longer fall, as they do while a backlog arrives
@@ -54,7 +54,8 @@ EVEN, CREPT = 200, 20
 """A proof (a test whether the delay is constant) compares the minimum delays of its two halves.
 They may differ by the duration of the proof divided by `EVEN`, or divided by `CREPT` if the delay
 creeps (see `CREEP`). The centres of the halves are half a duration apart, so the delay may change
-by 1 % or 10 % of the time. NTP slews a clock by up to 8.3 %."""
+by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock by up to 83 ms per
+second."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if its change between two commands is at most the time between them divided by
@@ -62,11 +63,11 @@ CREEP, JITTER_NS = 10, NS_PER_S // 200
 
 LONGEST_PROOF_NS = 2 * NS_PER_S
 """Longest nominal duration of a proof (a test whether the delay is constant), ns. If the timeout of
-the source is shorter, the proof takes that time."""
+the source is shorter, the timeout is the nominal duration."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Shortest time for which the delay must be constant after it has jumped, ns. A jump comes more
-likely from a backlog that arrives in bursts than from a clock that was set."""
+"""Shortest time for which the delay must be constant after it has jumped, ns. The jump is more
+likely a backlog that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
 """Silence of a sender, ns, that ends a proof. If both the stamps and the arrivals show a pause of
@@ -74,10 +75,10 @@ this length, a foreign clock may have been set by any amount during the pause. S
 distinguish a pause from lost commands."""
 
 STANDS_NS = 10_000
-"""If two successive commands arrive apart, but their stamps differ by at most this, ns, the clock
-was set back by about the time between the arrivals. The second stamp may be slightly later, because
-Zenoh's own clock never goes back: it advances by a fraction of a microsecond for each message until
-the wall clock has caught up."""
+"""If two successive commands arrive more than `APART_NS` apart, but the second stamp is later by at
+most this, ns, the clock was set back by about the time between the arrivals. The second stamp may
+be slightly later, because Zenoh's own clock never goes back: it advances by a fraction of a
+microsecond for each message until the wall clock has caught up."""
 
 APART_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
@@ -88,8 +89,9 @@ proof waits for the last of them before it compares delays. No sender may send m
 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
-"""Budget, ns, for rises of the delay that count as a clock that was set, although no adjustment was
-visible. Only a foreign clock has it. `FORGIVE_RATE` seconds refill it by one second."""
+"""Budget, ns, for rises of the delay that are trusted although no adjustment of the clock was
+visible. Only a foreign clock (one that may be adjusted) has a budget. It is refilled by one second
+in `FORGIVE_RATE` seconds."""
 
 MAX_CLOCKS = 1024
 """Largest number of clocks that are remembered. If there are more, usually the one that was silent
@@ -118,9 +120,9 @@ class _Proof:
     - For a known clock (`again`), the test compares the first half with the second. If it fails, it
       begins again with its second half.
     - For a new clock, it compares the first two halves. If they differ, it compares the last eight
-      halves in four pairs. The minima of the pairs must be as even as those of two halves, or
-      differ by at most `EARLY_NS` without a trend. The minima fall while a backlog arrives, and
-      rise while a queue grows.
+      halves in four pairs. The minima of the pairs must keep within the same limit (`EVEN`), or
+      differ by at most `EARLY_NS` without a trend. A trend means that the minima only fall, as
+      while a backlog arrives, or only rise, as while a queue grows.
     """
 
     def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
@@ -134,7 +136,7 @@ class _Proof:
         """Add a command, and return whether the delays are proven constant.
 
         "open" means that the test goes on. "failed" means that a new test must begin with this
-        command. A command that is later than the lowest delay by more than the timeout cannot
+        command. A command whose delay exceeds the lowest one by more than the timeout cannot
         complete the test.
 
         Args:
@@ -184,8 +186,8 @@ class _Clock:
         self.at_ns = at_ns
         """Arrival of the last command, monotonic ns."""
         self.forgiven_ns = 0
-        """Rise of the delay, ns, that the last verdict `set` trusted beyond the visible adjustments
-        of the clock."""
+        """Rise of the delay, ns, that the last verdict `set` trusted although visible adjustments
+        of the clock do not explain it."""
         self._stamp_ns = 0
         self._delay = 0
         self._number: int | None = None
@@ -198,17 +200,17 @@ class _Clock:
         """Lowest delay of a steady (never adjusted) clock, ns. It rises with time by the largest
         possible drift. None for a foreign clock."""
         self._before: int | None = None
-        """Delay before the first visible adjustment since a command was last on time, ns; None
-        without one."""
+        """Delay just before the first visible adjustment of the clock, ns; None if none was visible
+        since the last command that was on time."""
         self._shown = 0
-        """Sum of the visible adjustments of the clock since a command was last on time, ns."""
+        """Sum of the clock's visible adjustments since the last command that was on time, ns."""
         self._doubted: tuple[int, int, int] | None = None
         """An adjustment of the clock that the next command must confirm, because the network may
         have swapped or repeated a command. The numbers are the delay before the adjustment, its
         amount, and the stamp before it, all in ns."""
         self._paused = False
-        """Whether the sender has paused since a command was last on time. Its clock may then have
-        been set by any amount."""
+        """Whether the sender has paused since the last command that was on time. Its clock may then
+        have been set by any amount."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
         self._accepted: tuple[int, int] | None = None
@@ -268,11 +270,11 @@ class _Clock:
         return delay - self._floor
 
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int | None) -> None:
-        """Record a pause of the sender, or an adjustment: stamps that go back or stand still.
+        """Record a pause of the sender, or an adjustment of its clock.
 
-        The next command must confirm an adjustment: its stamp also goes back or stands still, or is
-        not later than the stamp before the adjustment. Nothing is recorded if the sequence numbers
-        show that commands were lost.
+        A stamp that goes back or stands still shows an adjustment. The next command must confirm
+        it: its stamp must do so too, or must not be later than the stamp before the adjustment.
+        Nothing is recorded if the sequence numbers show that commands were lost.
 
         Args:
             stamp_ns: Stamp of this command, ns.
@@ -376,8 +378,8 @@ class Freshness:
         """Sequence number and monotonic arrival, ns, of the last command of each sender whose
         commands have numbers but no stamps."""
         self.forgiven_ns = 0
-        """Sum of the rises of the delay that count as clocks that were set, although no adjustment
-        of the clock was visible, ns."""
+        """Sum of the rises of the delay that were trusted although no adjustment of the clock was
+        visible, ns."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
         """Return the verdict on a command, and remember its stamp and sequence number.

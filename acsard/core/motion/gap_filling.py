@@ -23,9 +23,9 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Limits for implausible lines in a row, during which the robot is assumed to have moved at the
-speed of the next plausible line. The lines must last at most `MAX_LOST_S` s together, or there must
-be at most `MAX_LOST` of them. The motion during longer ones is unknown."""
+"""Limits for implausible lines in a row that have no encoder counts. If they last at most
+`MAX_LOST_S` s in total, or if there are at most `MAX_LOST` of them, the robot is assumed to have
+moved at the speed of the next plausible line. Otherwise, its motion during them is unknown."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
@@ -39,8 +39,8 @@ SPAN = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Weight of `GUESS` and largest weight of the mean of all measurements, each as a number of spans
-of `SPAN` s. 300 spans are a minute of driving."""
+"""Weights in numbers of spans of `SPAN` s. `FIRST` is the weight of `GUESS`, and `MOST` is the
+largest weight of the mean of all measurements. 300 spans are a minute of driving."""
 
 GROWTH = 5
 """Exponent in the growth of a gap's variance with the duration of the gap (`Gaps`)."""
@@ -69,7 +69,7 @@ class Rolled(Struct, frozen=True, gc=False):
 
 
 class Rolling:
-    """Computes the wheel angles up to each plausible line, over implausible ones before it."""
+    """Computes by how much the wheels turned from one plausible feedback line to the next."""
 
     def __init__(self, quiet: float = math.inf) -> None:
         """Start. The daemon commands rest after `quiet` s without feedback."""
@@ -166,7 +166,7 @@ class Gaps:
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """Measure the acceleration with a further line. It reports `twist` for the last `dt` s."""
+        """Measure the acceleration with a new line, which reports `twist` for the last `dt` s."""
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)
         self._seconds += dt

@@ -46,7 +46,8 @@ jitter.
 """
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
-"""Least and greatest delay of the gyro relative to the wheels, ns."""
+"""Least and greatest delay of the gyro relative to the wheels, ns. An early gyro has a negative
+delay."""
 
 LEAST_DELAY_S = 0.002
 """Smallest correction of the delay that is applied, s."""
@@ -109,8 +110,8 @@ class Gyro:
         self._learned: Track | None = None
         """The effective track that was learned with an earlier gyro, None without one."""
         self.owes = False
-        """Whether the turn of the last feedback line came from the wheels only because the gyro is
-        not proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
+        """Whether the wheels provided the turn of the last feedback line because the gyro is not
+        proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Events of the last `turn`, for the log."""
@@ -136,9 +137,10 @@ class Gyro:
         """Variance of the angle that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
-        """Variance of the rate now, rad2/s2."""
+        """Variance of the present rate, rad2/s2."""
         self._hole = False
-        """Whether samples are missing since the last feedback line, or the gyro was silent then."""
+        """Whether samples are missing since the last feedback line, or the gyro was silent at that
+        line."""
         self.forgive()
 
     @property
@@ -212,10 +214,10 @@ class Gyro:
         gyro was not proven, rad, and its variance, rad2. It is applied once the gyro is proven."""
 
     def taken_back(self, turn: float) -> float:
-        """Record that the odometry recomputed lines with `owes`, whose turn changed by `turn` rad.
+        """Record that recomputing the lines with `owes` changed their total turn by `turn` rad.
 
-        Return `turn` if the gyro is proven by now and so has corrected the pose already, otherwise
-        0.
+        Return the angle that the caller must subtract from the heading, rad. It is `turn` if the
+        gyro is proven by now, because the gyro has then already corrected the heading, otherwise 0.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -227,8 +229,8 @@ class Gyro:
     def _time_of(self, sample: GyroSample) -> int:
         """Return the monotonic time at which a sample was measured, plus a constant delay, ns.
 
-        This is the time of arrival without the jitter of the network. The sample's stamp shows this
-        jitter. A sample without a stamp keeps its time of arrival.
+        This is the time of arrival minus the jitter of the network, which the sample's stamp
+        reveals. For a sample without a stamp, it is the time of arrival.
         """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
@@ -264,7 +266,7 @@ class Gyro:
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
         """Test the gyro if it is not proven yet, and return whether the wheels provide this turn.
 
-        The wheels provide it while the gyro is not proven. At rest the gyro provides it, because
+        They do until the gyro is proven, except at rest. There the gyro provides the turn, because
         the wheels do not show whether a person turns the robot.
         """
         trial, known = self._trial, self._bias.known
@@ -292,7 +294,10 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """Correct the assumed delay of the gyro. At rest, this does not change the heading."""
+        """Correct the assumed delay of the gyro.
+
+        Call this only at rest, when a new delay does not change the heading.
+        """
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:
             earliest, latest = DELAYS_NS

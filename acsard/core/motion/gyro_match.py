@@ -10,7 +10,7 @@ The fit forgets old data only while the robot turns.
 
 Rounding to encoder counts causes an error of w, and the same error appears again in dw/dt. On a
 straight drive with coarse counts, this would look like a delay of half a block. Therefore dw/dt
-counts as 0 unless the gyro's rate also changes, within the longest delay of a gyro.
+counts as 0 unless the gyro's rate also changes at about the same time (`BEFORE`, `BEHIND`).
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
 """Initial values of the three least-squares sums from which the delay is computed."""
 
 BEFORE, BEHIND = 2, 3
-"""Numbers of blocks before and after a block in which the gyro's rate may show the change of the
-wheels' rate in this block. The gyro is 0.1 s early to 0.3 s late (`gyro.DELAYS_NS`)."""
+"""If the wheels' rate changes in a block, the gyro may show that change up to `BEFORE` blocks
+earlier or `BEHIND` blocks later. This covers every delay in `gyro.DELAYS_NS`."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 """Standard deviation of a block's mean turn rate: a constant in rad/s, plus a fraction of the rate.
@@ -69,7 +69,7 @@ CERTAIN_S = 0.004
 """`Match.delay` returns a delay only if its standard deviation is below this, s."""
 
 WINDOW_S = 0.2
-"""Gyro and wheels contradict each other if their turns over this time differ too much, s."""
+"""Time over which the turns of gyro and wheels are compared to find a contradiction, s."""
 
 LEAST_SLIP = 0.015
 """Standard deviation, rad, of the difference between the turns of gyro and wheels over `WINDOW_S`
@@ -108,8 +108,8 @@ class Match:
         predicted, and the turn of the wheels, rad."""
         self._ways = PRIOR * STRETCH**2
         self._offs = ROUGH**2 * self._ways
-        """Weighted sums of `_way` squared and of `_off` squared over the completed stretches, rad2.
-        """
+        """Weighted sum of `_off` squared over the completed stretches, rad2. `_ways` is that of
+        `_way` squared."""
         self._lag = LAG_S
         self.blocks = 0.0
         """Number of blocks in which the robot turned; older blocks count less (`MEMORY`)."""
@@ -130,8 +130,8 @@ class Match:
     def delay(self) -> float | None:
         """Return the delay of the gyro minus the assumed delay, s, or None if it is uncertain.
 
-        A number restarts the measurement of the delay, so the caller must add the number to the
-        assumed delay.
+        The caller must add a returned number to the assumed delay, because the measurement of the
+        delay then starts over.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww

@@ -11,13 +11,14 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate according to the wheels, rad/s. If a line shows at least this rate to the other side
-than before, a new turn begins. A lower rate may come from a single encoder count."""
+"""Turn rate according to the wheels, rad/s. If a line shows at least this rate in the opposite
+direction, a new turn begins: a lower rate may come from a single encoder count. A gyro that reads
+zero is called dead only above this rate, because wheels with unequal tyres report a slow turn on a
+straight drive."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
-"""Smallest mean turn rate according to the wheels, rad/s, and the time over which the mean is
-taken, s. A slower motion is not a turn. With unequal tyres the wheels report a turn while the robot
-drives straight. Therefore a gyro that reads zero is called dead only above `LEAST_RATE`."""
+"""Smallest mean turn rate according to the wheels, rad/s, that counts as a turn, and the time over
+which the mean is taken, s."""
 
 PROPORTIONS = (0.25, 2.5)
 """Range of the robot's true turn divided by the turn according to the wheels, on any floor."""

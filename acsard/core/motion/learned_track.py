@@ -29,9 +29,10 @@ slippery ones. Beyond the range, one of the two tracks must be wrong.
 """
 
 INWARDS = 1.05
-"""A learned track is used only if it is inside `BOUNDS` by this factor, and until it leaves them.
+"""A learned track comes into use only if it is inside `BOUNDS` by this factor.
 
-Without this hysteresis, a track near a bound could be used and not used in turn.
+It stays in use until it leaves `BOUNDS`. Without this hysteresis, a track near a bound could go in
+and out of use again and again.
 """
 
 NOTES: dict[TrackUse, str] = {

@@ -1,7 +1,7 @@
 """Limits a requested twist: speed, wheel saturation, acceleration, deceleration and jerk.
 
-There are two ways to move. `follow` obeys a command and limits each axis, linear and angular, by
-itself. `coast` brings the robot to rest without a command. It reduces both axes in the same
+There are two ways to move. `follow` obeys a command and limits the linear and the angular axis
+separately. `coast` brings the robot to rest without a command. It reduces both axes in the same
 proportion, so that no wheel speeds up in the process (rule 2 of `acsard/README.md`). The jerk limit
 applies only to speeding up, because comfort must not delay braking.
 """

@@ -5,9 +5,10 @@ does not. The sender stays armed until `require_neutral` or `unlearn` is called.
 
 - If no other program shares the sender's identity, a zero arms the sender at once, even directly
   after speeds.
-- Several programs may share an identity (a bridge, a plain key). Then a zero arms the identity only
-  if no speed follows for `commands.neutral_pause`. Further zeros and silence do not restart this
-  time. Without the pause, the zero of one program would arm another program that never stopped.
+- Programs share an identity if they send through one bridge, or on one key without a sender id.
+  Then a zero arms the identity only if no speed follows for `commands.neutral_pause`. Further zeros
+  and silence do not restart this time. Without the pause, the zero of one program would arm another
+  program that never stopped.
 
 This module holds one sender's last command, and whether the sender is armed. `arbiter.py` decides
 which sender is followed and when a sender must be armed again. `freshness.py` decides whether a
@@ -84,8 +85,8 @@ class Sender:
     def notice(self, at_ns: int) -> None:
         """Record a message that was refused, but that may have been a speed.
 
-        A zero that has not armed a shared identity yet then no longer does. `at_ns` is the
-        monotonic time at which the message arrived, ns.
+        If a shared identity's zero is still waiting for the end of `commands.neutral_pause`, that
+        zero then cannot arm it. `at_ns` is the monotonic time at which the message arrived, ns.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
@@ -94,7 +95,8 @@ class Sender:
     def missed(self) -> None:
         """Record that messages of this sender were lost, each of which may have been a speed.
 
-        A zero that has not armed a shared identity yet then no longer does.
+        If a shared identity's zero is still waiting for the end of `commands.neutral_pause`, that
+        zero then cannot arm it.
         """
         self._zero_ns = self._proven_zero_ns = None
 

@@ -129,7 +129,7 @@ class Odometry:
         self._errors.use(odometry)
 
     def turn_by(self, track: Track) -> None:
-        """Compute the turns of the wheels with this effective track from now on."""
+        """Use this effective track from now on to compute the robot's turns from the wheels."""
         if track != self._track:
             self._track = track
             self._errors.turn_by(track)

@@ -33,8 +33,8 @@ STEPS = 2
 report may be wrong by one count."""
 
 SHORTEST_S = 0.004
-"""Shortest time between two lines, s, which occurs while a host catches up after a stall. A single
-count in this time looks like a high speed."""
+"""Shortest time that is expected between two lines, s. Lines follow each other this quickly while a
+host catches up after a stall, and a single count in so short a time looks like a high speed."""
 
 
 class Sanity:

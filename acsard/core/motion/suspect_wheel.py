@@ -28,8 +28,9 @@ FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
 counts plus an angle in rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""A number of encoder counts plus an angle in rad. After a change of the command, a wheel is called
-stuck only when a healthy wheel must have turned by this angle more or less than at the old speed.
+"""After a change of the command, a wheel is called stuck only when the expected angle of a healthy
+wheel differs enough from its angle at the old speed: by this number of encoder counts plus this
+angle in rad.
 """
 
 LEAVES = 0.05
@@ -44,8 +45,9 @@ HAND_S = 0.3
 hand cannot turn a wheel as evenly as this."""
 
 DEAD, REVERSED = 0.1, 0.3
-"""Shares of the other wheel's turn. A wheel that turns by less than the first share is dead. A
-wheel whose turn differs from the opposite of that turn by less than the second share is reversed.
+"""Shares of the turn of the other wheel on the same side. A wheel is dead if it turns by less than
+the first share. It is reversed if it turns in the opposite direction and the sizes of the two turns
+differ by less than the second share.
 """
 
 STUCK = 0.3

@@ -104,11 +104,10 @@ class PoseUncertainty:
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
-        """Set the angle of one encoder count, rad.
+        """Set the angle of one encoder count, rad, and compute two effects of this angle.
 
-        This angle determines the dead band of the heading. It also makes the pose uncertain,
-        because each wheel may stand anywhere between two counts. Each side is the mean of two
-        wheels.
+        One is the dead band of the heading. The other is the uncertainty of the pose, because each
+        wheel may stand anywhere between two counts.
         """
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
@@ -224,10 +223,10 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Publish that the whole pose is unknown if the robot moves.
+        """Make the whole pose unknown if the robot moves.
 
-        Call this when the position or the heading is unknown already. A motion then makes both
-        unknown.
+        Call this only if the position or the heading is unknown already, because any motion then
+        makes the other one unknown too.
         """
         if distance or turn:
             self.covariance = NOWHERE

@@ -126,7 +126,7 @@ class _Side:
         Args:
             seen: The reported speeds of all wheels, rad/s.
             dt: Time since the line before, s.
-            most: Largest duration for which one line is evidence, s.
+            most: Longest time for which one line counts as evidence, s.
             count: Angle of an encoder count, rad.
             still: Whether all wheels are commanded to stand.
         """
@@ -365,7 +365,7 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Set `pushed` if wheels turn after a rest without a command, at most each `REPEATED_S`."""
+        """Set `pushed` if uncommanded wheels turn after a rest, at most once per `REPEATED_S`."""
         fastest = 0.0
         if still:
             fastest = max([

@@ -22,7 +22,7 @@ of the side, rad/s. This term is the effect of a motor that reacts later.
 
 Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction s
 at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per turn, a slip of a tenth at
-10 rad/s is certain after 0.13 s, or after 0.26 s if the tyres may cause the fraction SHARE of it.
+10 rad/s is certain after 0.13 s, or after 0.26 s if unequal tyres may cause the difference SHARE.
 With the limit COUNTS, and with sums that forget old angles, a slip of a tenth is found within 0.2 s
 above 22 rad/s, and never below 11.5 rad/s.
 """
@@ -51,15 +51,15 @@ UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
-"""Time constants, s, of learning by what fraction the wheels differ: while they agree, and while
-they contradict each other."""
+"""While the wheels agree, the fraction by which they differ is learned with the time constant
+`LEARNING_S`, s. While they contradict each other, it changes by `WILD` in `DOUBTED_S`, s."""
 
 SLOWEST = 1.0
 """Wheel speed, rad/s, below which the difference of the wheels is not learned."""
 
 WILD = 0.1
-"""Change of the learned fraction in `DOUBTED_S` of contradiction between the wheels. Slip ends
-before that, but the effect of a flat tyre stays and so is learned."""
+"""Change of the learned fraction while the wheels contradict each other for `DOUBTED_S`. A slip
+ends sooner, but a tyre stays flat, so its effect is learned."""
 
 
 class Residual:

@@ -133,7 +133,7 @@ class Witness:
             seen: The reported speed of this wheel, rad/s.
             expected: The expected speed of the wheels of this side.
             dt: Time since the line before, s.
-            most: Largest duration for which one line is evidence, s.
+            most: Longest time for which one line counts as evidence, s.
             count: Angle of an encoder count, rad.
             still: Whether all wheels are commanded to stand.
         """

@@ -118,7 +118,7 @@ Some = Annotated[list[T], Meta(max_length=128)]
 Decoding a longer list would take too much of the time of a control step.
 """
 Many = Annotated[list[T], Meta(max_length=256)]
-"""List of names. It may be longer than `Some`, because names take less time to decode."""
+"""List of at most 256 names. It may be longer than `Some`, because names are decoded faster."""
 
 MAX_REQUEST_BYTES = 16384
 """Largest size of a request, bytes. A list of all names fits."""

@@ -1,6 +1,6 @@
-"""Converts acsard's messages to ROS messages with other fields: events, commands and `state`.
+"""Converts events, commands and `state` to ROS messages, whose fields differ from acsard's own.
 
-CDR has no maps, so the counters are a list. Null is encoded as NaN (`cdr_types.py`).
+CDR has no maps, so the counters become a list. Null becomes NaN (`cdr_types.py`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""Pattern of an event's text that begins with the number of events, such as "3 x"."""
+"""Matches an event's text that begins with the number of events, such as "3 x" or "3 times"."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""
@@ -72,7 +72,7 @@ def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
 
 
 class Counter(Struct, frozen=True):
-    """A counter since the start of the daemon."""
+    """The name of a counter, and its count since the start of the daemon."""
 
     name: str
     count: Whole

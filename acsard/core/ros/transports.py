@@ -39,14 +39,14 @@ Transport = Literal["bridge", "rmw"]
 
 
 class RosName(Struct, frozen=True):
-    """A ROS topic or service, and acsard's own (native) key that it stands for."""
+    """A ROS topic or service, with the native key (acsard's own) for the same messages."""
 
     name: str
     """Name relative to the namespace."""
     native: str
     """Native key, below the robot's id."""
     direction: Direction
-    """Direction of the native key. A query is a service in ROS."""
+    """Direction of the native key. In ROS, both "query" and "service" are services."""
     type: str
     qos: Qos = Qos()
 
@@ -56,11 +56,12 @@ class Endpoint(Struct, frozen=True):
 
     transport: Transport
     native: str
-    """Native key that the ROS key stands for."""
+    """Native key for the same messages."""
     direction: Direction
     key: str
     token: str
-    """Liveliness token, or "" if the endpoint is not announced. The endpoint's GID is its hash."""
+    """Liveliness token that announces the endpoint, or "" if it is not announced. The GID, by which
+    rmw_zenoh identifies an endpoint, is a hash of this token."""
     latched: bool
     """True if a new subscriber receives the last message at once."""
     type: str
@@ -93,8 +94,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Prefix of the parameter services in `RosName.native`, because they have no native key. The native
-key `config` returns the same settings."""
+"""Prefix in `RosName.native` for ROS's parameter services, which have no native key. The native key
+`config` returns the same settings."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),

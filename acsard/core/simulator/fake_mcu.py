@@ -1,9 +1,9 @@
 """Simulates the board: its side of the serial protocol, with the time of each byte on the wire.
 
 Without faults the simulated board does what the daemon expects of a board. It boots with stopped
-motors, obeys only complete valid lines, stops the motors after 300 ms without a valid line, and
-answers a checked line with a checked one. It has its own parser, so that an error in the daemon's
-parser is not hidden by the same error here.
+motors, obeys only complete valid lines, and stops the motors after 300 ms without a valid line. It
+answers a checked line, which is a line with a checksum, with a checked reply. It does not use the
+daemon's parser, so that the tests show an error of that parser.
 
 A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The faults that
 `[sim] faults` lists are always on.
@@ -46,21 +46,21 @@ STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
-"""The battery has six cells. The values are its voltage when empty, V, the additional voltage when
-full, V, and its internal resistance, ohm."""
+"""Battery of six cells: voltage when empty, V; additional voltage when full, V; and internal
+resistance, ohm."""
 
 REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
 """Battery current at rest, A, and additional current for each rad/s of each wheel, A."""
 
 START_AMPS, START_NS = 10.0, 300 * MS
-"""Additional battery current while the motors start, A, and its duration, ns. The battery voltage
-then drops by 2 V."""
+"""Additional battery current while the motors start, A, and the duration of the start, ns. This
+current lowers the battery voltage by 2 V."""
 
 NEVER_NS = 2**62
 """Monotonic time that is never reached, ns."""
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Times from the end of a line to the start of its answer, ms. The board uses one after another."""
+"""Times from the end of a line to the start of its answer, ms. The board uses them in turn."""
 
 
 class FakeMcu(Faults):
@@ -89,7 +89,7 @@ class FakeMcu(Faults):
         self._on_ns = self._boot_until_ns
         self._angles: list[float] = []
         self._seen: list[int] = []
-        """The last counts of the encoders."""
+        """The encoder counts that belong to the wheel angles in `_angles`."""
         self._window = (now_ns, self._encoders())
         self._measured = [0.0] * 4
         self._moved = [0] * 4
@@ -100,15 +100,15 @@ class FakeMcu(Faults):
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False
-        """Whether the host has sent a checked line, so that status lines have a checksum too."""
+        """Whether the host has sent a checked line. Status lines then have a checksum too."""
         self._bumpers = "." * (len(config.safety.bumpers) or 4)
-        """The bumpers in a status line while none is pressed."""
+        """Field `bumpers` of a status line while none is pressed: a dot for each bumper."""
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
         """The faults of the inputs: begin (ns), end (ns), field of the status line, and its value.
 
         The status line contains only the fields that a fault names. The value `silent` leaves the
-        field out of the line. If several faults of a field are on, the last one decides, but
-        several bumpers may be pressed at once.
+        field out of the line. If several faults of one field are on, the last one decides. Faults
+        that press bumpers are an exception: all of these bumpers count as pressed.
         """
         self._inputs_clock = b""
         self._battery_clock = b""
@@ -316,7 +316,7 @@ class FakeMcu(Faults):
         return self._seen
 
     def _speeds(self, now_ns: int) -> list[float]:
-        """Return the speeds of the motors a to d: encoder counts divided by the time they took."""
+        """Return the speeds of the motors a to d, rad/s: the turned angle divided by the time."""
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -346,7 +346,7 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
-        """Return the ms from power-on to the last reading of the encoders, and their counts."""
+        """Return the time of the last encoder reading, ms since power-on, and the counts."""
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
@@ -389,52 +389,52 @@ class FakeMcu(Faults):
     # These faults are here because they need the events of the board.
 
     def estop(self) -> Fault:
-        """Report ten times a second that the emergency stop is released."""
+        """Make the board report ten times a second that the emergency stop is released."""
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Report an emergency stop that is pressed after `after_s` s, for `length_s` s.
+        """Make the board report the emergency stop as pressed after `after_s` s, for `length_s` s.
 
-        Before and after that it is released. With a length of 0 it stays pressed.
+        Otherwise the board reports it as released. If `length_s` is 0, it stays pressed.
         """
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Report a released emergency stop, but stop reporting it after `after_s` s.
+        """Make the board report a released emergency stop only until `after_s` s have passed.
 
         The board reports it again `length_s` s later, or never if `length_s` is 0.
         """
         return self._input("estop", "silent", after_s, length_s)
 
     def bumpers(self) -> Fault:
-        """Report released bumpers: those of `safety.bumpers`, or four if that setting is empty."""
+        """Make the board report the bumpers of `safety.bumpers`, or else four, as released."""
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Report that bumper `number` is pressed after `after_s` s, for `length_s` s.
+        """Make the board report bumper `number` as pressed after `after_s` s, for `length_s` s.
 
-        The first bumper of the board has the number 1. With a length of 0 it stays pressed.
+        The first bumper of the board has the number 1. If `length_s` is 0, it stays pressed.
         """
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Report released bumpers, but stop reporting them after `after_s` s.
+        """Make the board report released bumpers only until `after_s` s have passed.
 
         The board reports them again `length_s` s later, or never if `length_s` is 0.
         """
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Report a fault of a motor driver after `after_s` s, for `length_s` s.
+        """Make the board report a fault of a motor driver after `after_s` s, for `length_s` s.
 
-        Before and after that the motor drivers have no fault. With a length of 0 the fault stays.
+        Otherwise the board reports no fault. If `length_s` is 0, the fault stays.
         """
         return self._input("driver", "fault", after_s, length_s)
 
     @contextmanager
     def battery(self, percent: float, minutes: float) -> Iterator[None]:
-        """Report a battery ten times a second. At first its charge is `percent` %.
+        """Make the board report a battery ten times a second. The charge begins at `percent` %.
 
         A full battery lasts `minutes` minutes while the robot stands, and less while it drives.
         """
@@ -467,9 +467,9 @@ class FakeMcu(Faults):
 
     @contextmanager
     def free_running(self, period_s: float = 0.1) -> Iterator[None]:
-        """Report every `period_s` s instead of answering lines.
+        """Make the board report every `period_s` s instead of answering lines.
 
-        The reports have unpadded speeds and a trailing comma.
+        The reports end with a comma, and have unpadded speeds (`3.14` instead of `03.14`).
         """
         period_ns = int(period_s * NS_PER_S)
         # The name of the clock is new, so that events of an older clock are ignored.

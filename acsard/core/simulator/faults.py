@@ -17,7 +17,7 @@ from acsard.core.values import NS_PER_S
 Fault = AbstractContextManager[None]
 
 USB_PACKET = 62
-"""Number of bytes at which an FTDI adapter sends a full packet without waiting for its timer."""
+"""Size of a full packet, bytes. An FTDI adapter sends it without waiting for its timer."""
 
 WATCHDOG_NS = 300_000_000
 """Silence of the host after which the board stops the motors, ns."""
@@ -47,7 +47,7 @@ class Faults:
         self.drivers = [0, 1, 2, 3]
         """The motor that each channel drives. Channels 0 to 3 are the board's outputs a to d."""
         self.drives = [1.0] * 4
-        """Factor between the command of a channel and its motor: 1, -1 if reversed, 0 if dead."""
+        """Factor from a channel's command to its motor's speed: 1, -1 if reversed, 0 if dead."""
         self.push: float | None = None
         """Speed at which a person pushes the robot, m/s; None if nobody pushes it."""
         self.encoders = [0, 1, 2, 3]
@@ -103,27 +103,27 @@ class Faults:
         return block
 
     def mute(self) -> Fault:
-        """Receive lines and drive, but send no reply and no status line."""
+        """Make the board obey lines without sending any reply or status line."""
         return self._with(muted=True)
 
     def noise(self, data: bytes = b"\x00\xff~") -> Fault:
-        """Send the bytes `data` in front of each reply."""
+        """Make the board send the bytes `data` in front of each reply."""
         return self._with(noise_bytes=data)
 
     def partial_line(self) -> Fault:
-        """Send only the first half of every reply."""
+        """Make the board send only the first half of every reply."""
         return self._with(cut_replies=True)
 
     def bias(self, wheel: int, gain: float) -> Fault:
-        """Report `gain` times the true speed and counts of motor `wheel` (0 to 3 for a to d)."""
+        """Multiply the reported speed and counts of motor `wheel` (0 to 3 for a to d) by `gain`."""
         return self._with(gains=[gain if i == wheel else g for i, g in enumerate(self.gains)])
 
     def stuck_encoder(self, wheel: int) -> Fault:
-        """Report that motor `wheel` (0 to 3 for a to d) stands still although it may turn."""
+        """Make the board report motor `wheel` (0 to 3 for a to d) as still, even while it turns."""
         return self._with(stuck=wheel)
 
     def frozen_encoder(self, wheel: int) -> Fault:
-        """Report that motor `wheel` (0 to 3 for a to d) keeps its last measured speed."""
+        """Make the board repeat the last measured speed of motor `wheel` (0 to 3 for a to d)."""
         return self._with(frozen=wheel)
 
     @contextmanager
@@ -160,62 +160,62 @@ class Faults:
         return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
 
     def pushed(self, speed: float) -> Fault:
-        """Push the robot straight ahead by hand at `speed` m/s, against its motors."""
+        """Simulate a person who pushes the robot straight at `speed` m/s, against its motors."""
         return self._with(push=speed)
 
     def slow_reply(self, delay_s: float = 0.03) -> Fault:
-        """Obey and answer each line `delay_s` s later."""
+        """Make the board obey and answer each line `delay_s` s later."""
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
 
     def sparse_replies(self, period_s: float = 0.1) -> Fault:
-        """Answer at most one line every `period_s` s."""
+        """Make the board answer at most one line every `period_s` s."""
         return self._with(reply_gap_ns=int(period_s * NS_PER_S))
 
     def wrong_baud(self, baud_rate: int) -> Fault:
-        """Send and receive at another baud rate than the configured one."""
+        """Make the board use `baud_rate` instead of the configured baud rate."""
         return self._with(baud_rate=baud_rate)
 
     def unpadded(self) -> Fault:
-        """Write speeds below ten with one integer digit."""
+        """Make the board write speeds below ten with one integer digit, such as `3.14`."""
         return self._with(unpadded_replies=True)
 
     def spaces(self) -> Fault:
-        """Write a space after every comma."""
+        """Make the board write a space after every comma."""
         return self._with(separator=", ")
 
     def trailing_comma(self) -> Fault:
-        """End the replies with a comma."""
+        """Make the board end its replies with a comma."""
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Obey each value as soon as the comma after it arrives, as old firmware does.
+        """Make the board obey each value that has a comma after it, as old firmware does.
 
         Such firmware ignores checksums.
         """
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
-        """Ignore the text after the fourth value: obey checked lines, but send plain replies."""
+        """Make the board ignore checksums: it obeys checked lines, but sends plain replies."""
         return self._with(understand=protocol.prefix)
 
     def plain_only(self) -> Fault:
-        """Obey only plain lines, and treat a checked line as invalid."""
+        """Make the board obey only plain lines, and treat a line with a checksum as invalid."""
         return self._with(understand=protocol.plain_only)
 
     def no_sample(self) -> Fault:
-        """Answer with the checksum, but without the sample fields."""
+        """Make the board reply with a checksum, but never with its time and encoder counts."""
         return self._with(samples=False)
 
     def no_watchdog(self) -> Fault:
-        """Keep the motors running when the host is silent."""
+        """Let the motors run on when the host is silent."""
         return self._with(watchdog=False)
 
     def late_watchdog(self, time_s: float = 1.0) -> Fault:
-        """Stop the motors only after the host was silent for `time_s` s."""
+        """Make the board stop the motors only after the host was silent for `time_s` s."""
         return self._with(watchdog_ns=int(time_s * NS_PER_S))
 
     def watchdog_fed_by_bad_lines(self) -> Fault:
-        """Keep the motors running while invalid lines arrive, although they are not obeyed."""
+        """Let invalid lines reset the watchdog too, although the board does not obey them."""
         return self._with(any_feeds=True)
 
     def lost_replies(self, every: int = 5) -> Fault:
@@ -234,7 +234,7 @@ class Faults:
         return self._with(bit_error=every)
 
     def ftdi(self, latency_s: float = 0.016) -> Fault:
-        """Send through a USB adapter that waits until a packet is full or its timer expires.
+        """Send replies through a USB adapter that waits for a full packet or for its timer.
 
         Bytes arrive up to `latency_s` s late, and several lines arrive at once.
         """

@@ -33,7 +33,7 @@ class Command(Struct, frozen=True):
     sequence: bytes = b""
     """The two digits of the sequence number of a checked line; b"" for a plain line."""
     wants_sample: bool = False
-    """Whether the line asks for the sample fields."""
+    """Whether the line asks for a reply with the board's time and encoder counts."""
 
 
 def whole(line: bytes) -> Command | None:
@@ -68,7 +68,7 @@ def prefix(line: bytes) -> Command | None:
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line like old firmware, which obeys every value before a comma in any line."""
+    """Decode a line like old firmware: it obeys each value before a comma, even in a bad line."""
     values = {}
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]
@@ -146,8 +146,8 @@ def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
     `counts` is the number of encoder counts per wheel turn. `watchdog_ms` is the silence after
-    which the board stops the motors, ms. `sample` says whether the firmware can add sample fields
-    to its replies.
+    which the board stops the motors, ms. `sample` says whether the firmware can add its time and
+    encoder counts to its replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

@@ -7,7 +7,7 @@ from acsard.core.messages.schema import Header, Imu, Pose, PoseStamped, Quaterni
 from acsard.core.simulator.simulated_robot import Sight
 
 FRAME = "sim"
-"""Frame of the true pose: the pose at the start of the simulator.
+"""Frame of the true pose. Its origin is the robot's pose at the start of the simulator.
 
 No transform connects it with `odom`, so no program can mistake the true pose for odometry.
 """

@@ -26,7 +26,7 @@ from acsard.core.simulator.noise import uniform
 from acsard.core.values import Pose
 
 GRIP_S = 0.25
-"""Time after which the random grip of the wheels on the floor changes, s."""
+"""Interval at which the random grip of the wheels on the floor changes, s."""
 
 HANDS_S = 0.1
 """Time constant with which the speed of the robot changes when a person pushes it, s."""
@@ -50,7 +50,7 @@ class Vehicle:
         self.pose = Pose()
         """The true pose of base_link relative to its start."""
         self.turned = 0.0
-        """Angle that the robot has turned since the start, with whole turns, rad to the left."""
+        """Angle by which the robot turned left since its start, rad; each full turn adds 2 pi."""
         self.turn_slip = 0.0
         """Fraction of each turn that is lost because wheels skid, 0 to 1."""
         self.load = 0.0
@@ -95,7 +95,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that skidding wheels leave at present, 0 to 1."""
+        """Return the fraction of a turn that remains at present, although wheels skid, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

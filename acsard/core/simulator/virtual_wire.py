@@ -13,7 +13,7 @@ Piece = tuple[int, bytes]
 
 
 class VirtualWire:
-    """The host's end of the connection."""
+    """The host's end of a serial connection to the simulated board, in virtual time."""
 
     def __init__(self, mcu: FakeMcu, now_ns: int = 0) -> None:
         self.mcu = mcu

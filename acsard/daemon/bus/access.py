@@ -2,8 +2,8 @@
 
 Zenoh denies every message that no rule allows.
 
-- Zenoh checks the rules at the end of a link: at the daemon's session or, over TLS, at the session
-  of the TLS gateway. That session knows only the neighbour on the link, so a client that connects
+- Zenoh checks the rules where a client's link ends: in the daemon's session or, over TLS, in that
+  of the TLS gateway. This session knows only the neighbour on the link, so a client that connects
   through a router has the permissions of the router.
 - A rule allows a message only if one of the rule's key expressions includes the whole key
   expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
@@ -64,17 +64,17 @@ DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_RO
 
 
 def _grants(role: Role) -> tuple[str, ...]:
-    """Return the names of a role's rules: those for its own keys and for those of lower roles.
+    """Return the names of a role's rules. A role may also use the keys of the lower roles.
 
-    Only a maintainer may forward the liveliness tokens of other daemons. Routers do so, and they
-    have this role.
+    Only a maintainer may forward the liveliness tokens of other daemons. Routers have this role,
+    because they forward tokens.
     """
     own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
     return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))
 
 
 USES = ("subscribes", "queries", "publishes")
-"""The last words in the names of the rules for a role's keys, as in "viewer queries"."""
+"""Uses of keys. Each is the last word in the name of a rule, as in "viewer queries"."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
 """The names of the rules of each role. `_rules` defines the rules."""

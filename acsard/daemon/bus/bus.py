@@ -67,7 +67,7 @@ class ZenohBus:
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` + 1 queries."""
+        """Return the input since the last call, with at most `queries` queries and a slow one."""
         taken = self._inbox.take(queries)
         routers = self._links.changed()
         if routers is not None:
@@ -82,9 +82,9 @@ class ZenohBus:
         self._outlets.publish(key, message)
 
     def flush(self) -> None:
-        """Wake the thread that sends the queued messages. Never wait for it.
+        """Wake the thread that sends the queued messages, without waiting for it.
 
-        Raise the error that has ended a thread of the bus, if there was one.
+        Raises the error of a thread of the bus if this error has ended the thread.
         """
         self._outlets.flush()
         self._replies.check()

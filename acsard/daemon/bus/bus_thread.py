@@ -25,6 +25,6 @@ class BusThread(Thread):
             self._error = error
 
     def check(self) -> None:
-        """Raise the exception that has ended this thread, if there was one. Never wait."""
+        """Raise the exception that has ended this thread, if any, without waiting."""
         if self._error is not None:
             raise self._error

@@ -5,8 +5,8 @@ connection only when it connects. A process that listens must therefore know whe
 been replaced. `CertificateFiles.renewed` reports this. Three files cannot be replaced at the same
 moment. So new files are reported only when they belong together and no longer change.
 
-The watched expiry times are those of three kinds of certificates: the robot's own, its authority's
-and the routers'. They are read in a thread, because a disk or a router may not answer.
+The module also reads when three kinds of certificates expire: those of the robot, of its authority
+and of the routers. A thread reads them, because a disk or a router may not answer.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Signature = tuple[tuple[int, int, int], ...]
 
 
 class CertificateFiles:
-    """The three files of a process that listens: its authority, its certificate and its key."""
+    """The three TLS files of a process that listens: authority, certificate and key."""
 
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
-        """Record the present files. Call this before the process itself reads the files."""
+        """Record the present files. Create the object before the process itself reads them."""
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
         self._due_ns = clock.mono_ns() + FILES_LOOK_NS
@@ -73,7 +73,7 @@ ENDS_LOOK_S = 60.0
 """Pause between two readings of the expiry times, s."""
 
 ROUTER_LOOKS = 60
-"""Number of readings of the robot's files for each reading of the routers' certificates.
+"""The routers' certificates are read only at every n-th reading of the robot's files. This is n.
 
 Each reading of a router's certificate takes one of the router's connections. If a router did not
 answer, all routers are tried again at the next reading of the robot's files.

@@ -162,16 +162,16 @@ class Inbox:
         self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
-        """The id of the daemon's own session in timestamps.
+        """The id that the daemon's session writes into timestamps.
 
         A timestamp with this id is not from the sender: the session has stamped a sample that came
         without a timestamp.
         """
         self.routers: frozenset[str] = frozenset()
-        """The ids of the connected routers in timestamps. A router stamps samples without a
-        timestamp.
+        """The ids that the connected routers write into timestamps.
 
-        Such a timestamp says when the sample passed the router, and does not identify its sender.
+        A router stamps a sample that came without a timestamp. Such a timestamp says when the
+        sample passed the router, and does not identify its sender.
         """
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
@@ -204,8 +204,8 @@ class Inbox:
         """Return the samples since the last call, and some of the waiting queries.
 
         The stops come first, then the other samples in the order of their arrival. The queries are
-        at most `queries` service calls, one slow query even beyond that number, and other queries
-        for the rest of the number.
+        service calls first, then one slow query, then others, at most `queries` in all. The slow
+        query is taken even if the service calls already reach this number.
         """
         if not self._any:
             return NOTHING

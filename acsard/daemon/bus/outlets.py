@@ -117,7 +117,7 @@ class Outlets:
         self._waiting = True
 
     def flush(self) -> None:
-        """Wake the thread that sends the messages; raise the error that has ended it."""
+        """Wake the thread that sends the messages. If the thread has failed, raise its error."""
         self._thread.check()
         if self._waiting:
             self._waiting = False
@@ -125,7 +125,7 @@ class Outlets:
 
     @property
     def behind(self) -> bool:
-        """True if `losses` may have dropped messages or a blocked bus to report."""
+        """True if `losses` may have something to report: dropped messages or a blocked bus."""
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
@@ -192,7 +192,7 @@ class Outlets:
             latched: whether the publisher keeps its last sample for late subscribers.
             gid: identity of a ROS publisher, or b"". With it, the samples carry an attachment of
                 rmw_zenoh.
-            signed: attachment of the samples without a `gid`, or b"" for none.
+            signed: attachment of the samples if there is no `gid`; b"" for no attachment.
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(

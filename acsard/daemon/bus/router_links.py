@@ -38,7 +38,7 @@ class RouterLinks:
         self._session: zenoh.Session
 
     def changed(self) -> RoutersStatus | None:
-        """Return the status if it has changed since the last call, else None. Never wait."""
+        """Return the status if it has changed since the last call, else None. This never waits."""
         return self._changes.pop()
 
     def check(self) -> None:
@@ -46,7 +46,7 @@ class RouterLinks:
         self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
-        """Start polling, even if `bus.connect` is empty: a router may connect to the daemon.
+        """Start polling, even if `bus.connect` is empty, as a router may connect to the daemon.
 
         `session` is the daemon's Zenoh session.
         """
@@ -54,7 +54,7 @@ class RouterLinks:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop polling. Do not wait for a name lookup that is under way."""
+        """Stop polling, without waiting for a name lookup that is under way."""
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(STOP_S)

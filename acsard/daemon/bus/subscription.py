@@ -27,7 +27,7 @@ class Arrivals(Mailbox[zenoh.Sample]):
         """The Zenoh subscribers that fill this queue."""
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None; raise `ZError` at the end of the session."""
+        """Return the next sample, None if none waits; raise `ZError` if the session has closed."""
         sample = self.pop()
         if sample is None and self.closed and not self.waiting:
             raise zenoh.ZError("the session has been closed")
@@ -50,7 +50,7 @@ class Subscription:
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None; raise `ZError` at the end of the session."""
+        """Return the next sample, None if none waits; raise `ZError` if the session has closed."""
         # The loop is bounded, because a flood of samples on other keys must not block the caller.
         for _ in range(QUEUED):
             sample: zenoh.Sample | None = self._queue.try_recv()
@@ -59,7 +59,7 @@ class Subscription:
         return None
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Call `wake` on Zenoh's thread whenever a sample arrives or the subscription ends."""
+        """Let Zenoh's thread call `wake` whenever a sample arrives or the subscription ends."""
         self._queue.wakes(wake)
 
     def add(self, sample: zenoh.Sample) -> None:
@@ -69,8 +69,8 @@ class Subscription:
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
         """Yield samples until the session closes or no sample arrives for `timeout` s.
 
-        If `timeout` is None, wait for each sample without a time limit. Undeclare the subscribers
-        at the end.
+        If `timeout` is None, there is no time limit. The subscribers are undeclared when the
+        iteration ends.
         """
         quiet_since_ns = clock.mono_ns()
         try:
@@ -92,7 +92,7 @@ class Subscription:
             self.undeclare()
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
-        """Yield samples until the session closes. Undeclare the subscribers at the end."""
+        """Yield samples until the session closes, and finally undeclare the subscribers."""
         arrived, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:

@@ -1,7 +1,7 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-This module contains the settings of these sessions, and the reason for each setting. Of the robot's
-keys, it names only those with a rate limit.
+This module contains the settings of these sessions, and the reason for each setting. The only keys
+of the robot that it names are the keys with a rate limit.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
 def _listening() -> dict[str, object]:
-    """Return the settings that limit clients that send nothing after connecting, or too much."""
+    """Return the settings that limit clients that stay silent, send too much or do not read."""
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,

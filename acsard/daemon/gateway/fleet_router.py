@@ -30,13 +30,13 @@ EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
 IS_FOR = "// It is for {}. For yours:\n"
-"""Line at the head of the template. In the file, the ids of the robots replace {}."""
+"""Line at the head of the template and of the router's file. The ids of the robots replace {}."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
 
 PERSON: Role = "operator"
-"""Common name of the certificate in the template's lines between PERSON and END PERSON."""
+"""Example name in the template's lines between PERSON and END PERSON. Real names replace it."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
 # Match a whole name, or the last part of a key, because a robot may be called operator-1.
@@ -127,7 +127,7 @@ def reason(error: zenoh.ZError) -> str:
 
 
 class Router(Listener):
-    """The router of a fleet: zenohd with the same configuration file, but without plugins."""
+    """The router of a fleet. It reads a file for zenohd and works like zenohd, without plugins."""
 
     events = ROUTER_EVENTS
 

@@ -37,9 +37,10 @@ An observation takes a millisecond.
 """
 
 FIRST_NS = 5 * NS_PER_S
-"""Time within which the daemon must connect after the opening, ns. Otherwise the process restarts.
+"""Time from the opening of the session within which the daemon must connect, ns.
 
-It is longer than `ALONE_NS`, because the other clients connect at the same time.
+Otherwise the process restarts. The time is longer than `ALONE_NS`, because the other clients
+connect at the same time.
 """
 
 ALONE_NS = NS_PER_S
@@ -82,7 +83,7 @@ class Observation(Struct, frozen=True):
     at_ns: int
     """Monotonic time of the observation, ns."""
     holders: tuple[str, ...] = ()
-    """Common name in the certificate of each connection from the network.
+    """For each connection from the network, the common name in the client's certificate.
 
     It is "" if Zenoh does not report the name.
     """
@@ -161,7 +162,7 @@ def connection_counts(holders: Sequence[str]) -> str:
 
 
 PERIOD_S = 0.25
-"""Time between two observations of the session, and between two checks of the main thread, s."""
+"""Time between two observations of the session, and between two checks by the main thread, s."""
 
 MEMORY_BYTES = 192 << 20
 """Limit of the data memory of the process, bytes.

@@ -37,10 +37,10 @@ PROBE_NS = NS_PER_S
 counts as unanswered."""
 
 QUERY_TIMEOUT_S = 60.0
-"""Time after which Zenoh itself ends a query, s. Such an end is not an answer.
+"""Time after which Zenoh itself ends a query to the daemon, s.
 
-The time is much longer than `PROBE_NS`. So the query counts as unanswered long before its end, even
-if the gateway has to wait for a processor.
+The time is much longer than `PROBE_NS`. So the query has counted as unanswered long before Zenoh
+ends it, even if the gateway has to wait for a processor.
 """
 
 

@@ -27,7 +27,10 @@ CLOSE_S = 1.0
 
 
 class BlockingPort:
-    """One serial device that implements `checkup.board.Wire`. The first `open` opens it."""
+    """Blocking access to one serial device, with the interface `checkup.board.Wire`.
+
+    The device is not opened before the first call of `open`.
+    """
 
     def __init__(self, path: str) -> None:
         self._path = path

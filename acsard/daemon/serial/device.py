@@ -26,7 +26,8 @@ _left_open: list[int] = []
 """Descriptors that could not be closed because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
-"""Time between two checks for unsent bytes, s. A line takes longer at every baud rate."""
+"""Time between two checks for unsent bytes, s. It is shorter than the wire time of a line at every
+baud rate."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
@@ -98,7 +99,10 @@ def _set_up(device: serial.Serial) -> None:
 
 
 def unsent(fd: int) -> int:
-    """Return how many bytes the driver has not sent, or 0 if it cannot say, like that of a pty."""
+    """Return how many bytes the driver has not sent yet.
+
+    The result is 0 if the driver does not report this number, for example for a pty.
+    """
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -108,9 +112,9 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield each pause to make, s, until the driver has sent all bytes or the deadline has passed.
+    """Yield pauses, s, for which the caller sleeps until the driver has sent all bytes.
 
-    `deadline_ns` is a monotonic time.
+    The iteration also ends at the monotonic time `deadline_ns`.
     """
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
@@ -132,11 +136,13 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
     """Discard unsent bytes, and unlock and close the device in a thread.
 
     The thread is needed because a driver may drain for 30 s. This call waits for the thread for at
-    most `wait_s` seconds. After the call, the descriptor of `device` refers to /dev/null, so its
-    owner can drain and close it without delay. If no thread can be started, the next `open_raw`
-    closes the device.
+    most `wait_s` seconds. If no thread can be started, the next `open_raw` closes the device.
 
-    `lost` is true if the device has failed. The buffers are then discarded in any case.
+    After the call, the descriptor of `device` refers to /dev/null. So the owner of `device` can
+    drain and close it without delay.
+
+    If `lost` is true, the device has failed. Its output buffer is then discarded even if the driver
+    reports no unsent bytes.
     """
     fd = device.fileno()
     if lost or unsent(fd):

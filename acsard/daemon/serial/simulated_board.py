@@ -119,7 +119,10 @@ class SimPty:
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the host's baud rate. If no board has that rate, return the board's own."""
+        """Return the baud rate that the host has set.
+
+        If acsard does not support that rate, return the board's baud rate instead.
+        """
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
@@ -154,7 +157,10 @@ class Simulated(SimPty):
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
-        """Return the present value of a key that the simulator publishes, else None."""
+        """Return the newest true pose if `key` is `sim/pose`.
+
+        Return None for every other key, and before the first pose.
+        """
         return true_pose(*self._last) if key == POSE and self._last is not None else None
 
     def _see(self, sight: Sight) -> None:
