@@ -182,7 +182,7 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether several restarts each followed a pause of at least `SILENT_S` in the lines."""
+    """Return whether there are several restarts, and no line came for `SILENT_S` before each."""
     return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
 
 

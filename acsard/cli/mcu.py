@@ -136,8 +136,8 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
     if not args.yes:
         if not sys.stdin.isatty():
             raise UsageError(
-                "mcu check turns the wheels and asks a person who sees them: run it in a "
-                "terminal; `--yes` without one is for the simulator (--port sim)",
+                "mcu check turns the wheels and asks what you see, so run it in a terminal; with "
+                "the simulator (--port sim) you can give `--yes` instead",
             )
         return TerminalPrompt(args.json)
     if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):

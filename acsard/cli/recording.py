@@ -418,9 +418,9 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
     parts = _parts(args)
     if args.new is not None and len(parts) > 1:
         raise UsageError(
-            f"that time has {len(parts)} parts, because the daemon restarted or steps are missing, "
-            "and each part becomes a file of its own: leave out NEW, or choose a shorter time with "
-            "--from and --to"
+            f"the recording of that time has {len(parts)} parts, because the daemon restarted or "
+            "steps are missing, and each part becomes a file of its own: leave out NEW, or choose "
+            "a shorter time with --from and --to"
         )
     return parts
 

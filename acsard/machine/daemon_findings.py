@@ -357,8 +357,8 @@ START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon
 
 
 PUT_ROUTER = (
-    "daemons that are connected directly forward no messages: `acsard fleet` and `acsard call "
-    "stop --id '*'` miss the others; a router between all of them solves that "
+    "a daemon does not forward the messages of other daemons, so `acsard fleet` and `acsard call "
+    "stop --id '*'` do not reach the robots behind it: connect all robots to a router "
     "(deploy/zenoh/README.md)"
 )
 

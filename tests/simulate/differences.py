@@ -54,6 +54,14 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ),
     ("reports one and the same speed", "reports a speed that never changes"),
     (
+        "reported no emergency-stop input for 0.5 s, which counts",
+        "has not reported its emergency stop for 0.5 s, so it counts",
+    ),
+    (
+        "reported no bumpers for 0.5 s, which counts",
+        "has not reported its bumpers for 0.5 s, so they count",
+    ),
+    (
         r"(\w+) from (\S+) to (\S+) rad/s is over",
         r"\1 jumps from \2 to \3 rad/s, which is over",
     ),

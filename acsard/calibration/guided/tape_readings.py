@@ -47,10 +47,8 @@ UNKNOWN = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Weight of the assumed skidding when it is averaged with the scatter of the readings.
-
-With this number of readings beyond the necessary ones, both have the same weight.
-"""
+"""Weight of the assumed noise in its average with the scatter of the readings. The weight of the
+scatter is the number of readings beyond those that the fit needs."""
 
 MOST_STEPS = 50
 SMALL = 1e-9

@@ -43,10 +43,10 @@ class MinimumDelay:
         return later
 
     def measure(self, ours: float, theirs: float) -> float:
-        """Return the delay of an event in excess of the minimum, less the allowed drift.
+        """Return by how much the delay of an event exceeds the minimum and the allowed drift.
 
-        This method does not change the minimum. If the result is negative, the delay is below the
-        minimum, and a call of `believe` makes it the new one. The arguments are those of `add`.
+        If the result is negative, the delay is less than the minimum. This method does not change
+        the minimum; `believe` does. The arguments are those of `add`.
         """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late

@@ -503,8 +503,8 @@ class PromptedTimes:
         self._lost = False
         """Whether the last reply that was read alone showed that an earlier reply was lost."""
         self._given: list[int] = []
-        """Times (ns) of the command lines whose replies the last read of a batched link counted as
-        lost, in order. An adapter that stalled may still bring these replies."""
+        """Times (ns), oldest first, of the command lines whose replies count as lost since the last
+        read of a batched link. An adapter that stalled may still deliver these replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         """For a batched link: `_base` is the least reply delay and `_batch` the usual time between

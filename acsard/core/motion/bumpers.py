@@ -30,7 +30,7 @@ DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
-SILENT = f"the board reported no bumpers for {SILENT_S:g} s, which counts as pressed"
+SILENT = f"the board has not reported its bumpers for {SILENT_S:g} s, so they count as pressed"
 
 
 def missing(safety: SafetyConfig) -> str:

@@ -50,7 +50,9 @@ daemon reads the lines that have arrived meanwhile. It grants the extra time onl
 reports, so a computer that is always late does not delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
-SILENT = f"the board reported no emergency-stop input for {SILENT_S:g} s, which counts as pressed"
+SILENT = (
+    f"the board has not reported its emergency stop for {SILENT_S:g} s, so it counts as pressed"
+)
 
 RELEASE, CHECK = "release it at the robot", "check the board and its cable"
 """What the operator must do before the call `clear`: the first if an input is pressed, the second

@@ -160,7 +160,7 @@ class Lifecycle:
         if self._shutting_down:
             return f"stopped and latched; {GOING_DOWN}"
         if self.latches.fault is not None:
-            return "stopped and latched; srv/clear releases the fault first, then the stop"
+            return "stopped and latched; call srv/clear twice: for the fault, then for the stop"
         return "stopped and latched; srv/clear releases it"
 
     def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:

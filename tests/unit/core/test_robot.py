@@ -527,7 +527,7 @@ def test_silent_bumpers_latch_a_stop_also_if_a_press_would_only_limit() -> None:
     for _ in range(51):
         out = bench.step(GO)
     assert out.mode == "stopped"
-    assert out.reason.startswith("the board reported no bumpers for 0.5 s, which counts as pressed")
+    assert out.reason.startswith("the board has not reported its bumpers for 0.5 s, so they")
     assert bench.robot.snapshot(bench.now_ns).bumpers == (True, True)
 
 

@@ -325,7 +325,7 @@ def test_a_wheel_that_is_left_out_is_reported() -> None:
     ("state", "level", "text"),
     [
         ("pressed", "warning", "emergency stop pressed at the robot"),
-        ("silent", "failure", "the board reported no emergency-stop input for 0.5 s"),
+        ("silent", "failure", "the board has not reported its emergency stop for 0.5 s"),
         ("released", "ok", "the board reports it, and it is released"),
     ],
 )

@@ -372,7 +372,7 @@ def test_a_stop_keeps_the_fault() -> None:
     life = ready()
     life.fault("a wheel is dead", at(1.0))
     said = stop(life, 2.0)
-    assert said == "stopped and latched; srv/clear releases the fault first, then the stop"
+    assert said == "stopped and latched; call srv/clear twice: for the fault, then for the stop"
     assert mode(life) is Mode.FAULT
     clear(life, 5.0)
     assert mode(life) is Mode.STOPPED
