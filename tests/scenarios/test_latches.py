@@ -228,7 +228,8 @@ def test_a_stop_during_a_fault_is_latched_as_well(world: World) -> None:
     runaway(world)
     fault = world.state.latch
     reply = call(world, "stop", "joe")
-    assert reply.message == "stopped and latched; srv/clear releases the fault first, then the stop"
+    twice = "call srv/clear twice: for the fault, then for the stop"
+    assert reply.message == f"stopped and latched; {twice}"
     assert world.state.latch == fault
     assert call(world, "clear", "ann", fault).success
     assert world.state.mode == "stopped"
