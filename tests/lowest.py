@@ -1,8 +1,7 @@
 """`python -m tests.lowest`: print pip constraints for the lowest allowed versions.
 
 It writes one `name==version` per line: for each dependency the lowest version that
-`pyproject.toml` allows. The output is for `pip install
---constraint`.
+`pyproject.toml` allows. The output is for `pip install --constraint`.
 """
 
 from __future__ import annotations

@@ -468,7 +468,7 @@ def test_who_drives_in_vain_is_told_why_until_it_is_over(viewer: Viewer, bus: Bu
 def test_input_that_is_not_a_command_is_reported(viewer: Viewer) -> None:
     send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
     send(b'{"linear": {"x": 1}}')
-    viewer.status("refused: needs both `linear` and `angular`")
+    viewer.status("refused: the message needs both `linear` and `angular`")
     send, _ = viewer.publish_on("/initialpose", "json", "geometry_msgs/Twist")
     send(speed(1.0))
     viewer.status("no program listens on /initialpose: send commands to /cmd_vel instead")

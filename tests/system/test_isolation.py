@@ -323,13 +323,13 @@ Forms = Mapping[Identity, Sequence[str]]
 def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
     """Each attack takes half a minute in the long runs.
 
-    The most different ones run briefly: every second one each time, the others at night.
+    The most different ones run briefly: every fourth one each time, the others at night.
     """
     brief = [(form, who) for who in a_moment for form in a_moment[who]]
     nightly, soak = pytest.mark.nightly, pytest.mark.soak
     return [
         *(
-            pytest.param(*attack, 1.5, marks=nightly if n % 2 else ())
+            pytest.param(*attack, 1.5, marks=nightly if n % 4 else ())
             for n, attack in enumerate(brief)
         ),
         *(

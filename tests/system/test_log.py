@@ -75,7 +75,7 @@ def test_a_day_is_described_from_its_start_to_its_totals(tmp_path: Path, peer: P
     assert modes[-2] in ("driving -> stopped", "ready -> stopped")
     assert modes[-1] == "stopped -> shutdown"
     assert commander["text"].startswith("nobody -> app (")
-    assert refused["text"].startswith("wrong_shape: cmd/app: needs both")
+    assert refused["text"].startswith("wrong_shape: cmd/app: the message needs both")
     assert refused["level"] == "warning"
     assert '"ended"' in last
     assert ended["seconds"] > 0.1

@@ -498,6 +498,7 @@ LOCKS = """
 """
 
 
+@pytest.mark.nightly
 def test_the_screen_stays_on_while_the_stick_is_held_and_no_longer(page: Phone) -> None:
     browser = page.browser
     browser.js(LOCKS)
@@ -960,6 +961,7 @@ OFF_THE_MAP = """[...document.querySelectorAll('.tools button')]
 """The buttons of the map that cover something below it."""
 
 
+@pytest.mark.nightly
 def test_every_state_is_fit_for_a_screen_reader_and_the_map_keeps_its_buttons() -> None:
     seen: list[str] = []
 

@@ -368,6 +368,9 @@ WAYS: tuple[Way, ...] = (
     server_killed, server_frozen,
 )  # fmt: skip
 
+IN_CI = (finger_lifted, tab_killed, network_gone, server_frozen)
+"""The most different ways. The nightly job tries the others."""
+
 
 def wait_until(at: float) -> None:
     time.sleep(max(0.0, at - time.monotonic()))
@@ -417,7 +420,13 @@ TIMES = pytest.mark.parametrize(
 
 
 @TIMES
-@pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
+@pytest.mark.parametrize(
+    "way",
+    [
+        pytest.param(way, id=way.__name__, marks=() if way in IN_CI else pytest.mark.nightly)
+        for way in WAYS
+    ],
+)
 def test_whoever_lets_go_in_whatever_way_the_robot_brakes(
     field: Field, way: Way, times: int
 ) -> None:

@@ -245,6 +245,7 @@ def of_a_stranger(**more: str) -> dict[str, str]:
 
 
 @pytest.mark.network
+@pytest.mark.nightly
 @pytest.mark.timeout(2 * INSTALL_S)
 def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: Path) -> None:
     endpoint = free_endpoint()  # port 7448 may be in use here

@@ -267,7 +267,10 @@ def _stopped(connect: Callable[[], http.client.HTTPConnection], told: dict[str, 
 
 
 @pytest.mark.parametrize("most", [1024, pytest.param(65536, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("crowd", CROWDS)
+@pytest.mark.parametrize(
+    "crowd",
+    [pytest.param(crowd, marks=pytest.mark.nightly if n else ()) for n, crowd in enumerate(CROWDS)],
+)
 def test_a_crowd_costs_little_and_keeps_no_stop_and_no_phone_out(
     hosts: Hosts, robot: Daemon, where: Path, crowd: str, most: int, tmp_path: Path
 ) -> None:
